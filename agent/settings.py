@@ -62,7 +62,7 @@ class TrackingSettings:
             first may all be on the side that the robot turns away from.
         patience: images in a row that show other things than they should before the robot takes itself for
             carried off. A person who walks by is gone by then.
-        blank_patience: the same for images that show nothing: somebody has switched off the light.
+        blank_patience: the same for images that show nothing: the light was switched off.
     """
 
     filtered: Annotated[int, Meta(ge=4)] = 36
@@ -98,8 +98,8 @@ class NavigatorSettings:
         speed: speed between nodes, m/s.
         turn_rate: largest rate of turns between nodes, rad/s.
         blind_distance: way without any landmark in sight after which the robot must find itself again, m.
-        looks: how often in a row it looks in vain and drives on by wheels before it is lost.
-        further: how far it drives on by wheels after a look in vain, m: they are off by a few percent, and to
+        looks: failed views in a row after which it is lost; in between it drives on by odometry.
+        further: how far it drives on by odometry after a failed view, m: it is off by a few percent, and to
             turn back to what it knows, and about again, takes longer.
         parking_patience: time without getting nearer to the goal's pose after which it is blocked, s.
         blocked_first: how long it avoids an edge that was blocked for the first time, s: people walk on.

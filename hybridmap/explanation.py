@@ -46,7 +46,7 @@ DOUBLES = "doubles"
 is known (see mapweave.merge.outlier_rejection.distinctness)."""
 
 
-MAX_MAPS_TOLD = 256
+MAX_MAPS_LISTED = 256
 """Pairs of maps in one answer."""
 
 
@@ -196,7 +196,7 @@ class MapsExplanation:
 class FleetExplanation:
     """Of some two maps each, why they are one or are not."""
 
-    maps: Annotated[tuple[MapsExplanation, ...], Meta(max_length=MAX_MAPS_TOLD)]
+    maps: Annotated[tuple[MapsExplanation, ...], Meta(max_length=MAX_MAPS_LISTED)]
 
 
 @dataclass(frozen=True, slots=True)

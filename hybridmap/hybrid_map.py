@@ -28,9 +28,9 @@ class HybridMap:
         for body in changes:
             self.apply(body)
 
-    def apply(self, body: ChangeBody) -> None:
+    def apply(self, change: ChangeBody) -> None:
         """Apply one change. Retiring what is not there is no error: a log may be replayed from anywhere."""
-        match body:
+        match change:
             case NodePut(node):
                 self.nodes[node.id] = node
                 self.graph.add_node(node.id)

@@ -203,7 +203,7 @@ class Node:
         radius: of the robot's footprint, m: two robots are never nearer to each other than both of theirs. 0
             if unknown.
         ranges: what the proximity sensors saw from there at that time; empty if it has none.
-        wake: where the robot was before and after, and what the same sensors saw there.
+        wake: trajectory segment: where the robot was before and after, with its sensor readings.
     """
 
     id: NodeId
@@ -217,18 +217,20 @@ class Node:
     wake: TrajectorySegment = field(default_factory=TrajectorySegment)
 
     def __post_init__(self) -> None:
-        """Refuse a wake of other sensors.
+        """Refuse a trajectory segment of other sensors.
 
         Raises:
-            InvalidValue: the wake has readings of more or fewer sensors, or beyond their reach.
+            InvalidValue: the segment has readings of more or fewer sensors, or beyond their reach.
         """
         if not len(self.wake):
             return
         distances = self.wake.distances
         if distances.shape[1] != len(self.ranges):
-            raise InvalidValue(f"wake: {distances.shape[1]} sensors, where the node has {len(self.ranges)}")
+            raise InvalidValue(
+                f"trajectory: {distances.shape[1]} sensors, where the node has {len(self.ranges)}"
+            )
         if not ((distances >= 0.0) & (distances <= self.ranges.reach + 1e-9)).all():
-            raise InvalidValue(f"wake: a distance is not within 0 to {self.ranges.reach:g} m")
+            raise InvalidValue(f"trajectory: a distance is not within 0 to {self.ranges.reach:g} m")
 
     @property
     def points_in_robot(self) -> Array:

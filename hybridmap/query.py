@@ -127,13 +127,13 @@ class KnownAnswer:
     reason: Words
 
     def __post_init__(self) -> None:
-        """Refuse what nobody can have mapped.
+        """Refuse impossible views.
 
         Raises:
-            InvalidValue: more views than are told at once, or a number out of range.
+            InvalidValue: more views than a message holds, or a number out of range.
         """
         if self.views.shape != (len(self.views), 4) or len(self.views) > MAX_KNOWN:
-            raise InvalidValue(f"views of shape {self.views.shape}; at most ({MAX_KNOWN}, 4) are told")
+            raise InvalidValue(f"views of shape {self.views.shape}; at most ({MAX_KNOWN}, 4) are sent")
         # A comparison with what is no number is false.
         bounded = (np.abs(self.views) <= [MAX_POSITION, MAX_POSITION, 4.0, 4.0]).all()
         if not bounded or (self.views[:, 3] < 0.0).any():

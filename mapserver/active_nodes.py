@@ -63,8 +63,8 @@ class ActiveNodes:
         """A node without its faded landmarks; None if it is inactive or unknown."""
         if node_id in self._inactive or node_id.map in self._left_out:
             return None
-        known = self._node_of(node_id)
-        return None if known is None else bounded(without_faded(known, self._merged))
+        found_node = self._node_of(node_id)
+        return None if found_node is None else bounded(without_faded(found_node, self._merged))
 
 
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:

@@ -50,7 +50,7 @@ class AdmissionSettings:
 
 
 LONGEST_PAUSE = 10.0
-"""Longest time after which a robot is told to ask again, s."""
+"""Longest retry time, s."""
 
 
 class AdmissionControl:

@@ -1,4 +1,4 @@
-"""What other robots have mapped around one, told in that one's own map."""
+"""Fleet coverage: what other robots have mapped around a robot, in its own map."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
 class Coverage:
-    """Answers what others have mapped. It stands for one merged map; make another for the next."""
+    """Answers what others have mapped. It belongs to one merged map; make another for the next."""
 
     def __init__(self, merged: MergedMap) -> None:
         """Take a merged map."""
@@ -33,28 +33,28 @@ class Coverage:
         if asking not in self._merged.maps:
             return KnownAnswer(np.zeros((0, 4), np.float32), f"map {asking} is not in the merged map")
         views = [view for component in self._merged.components for view in self._views(asking, component)]
-        # A view whose principal point is outside of its image looks nowhere.
-        near = [view for view in views if view[3] > 0.0 and math.dist(view[:2], position) <= reach]
-        near.sort(key=lambda view: math.dist(view[:2], position))
-        told = near[:MAX_KNOWN]
+        # A view whose principal point is outside of its image covers nothing.
+        nearby = [view for view in views if view[3] > 0.0 and math.dist(view[:2], position) <= reach]
+        nearby.sort(key=lambda view: math.dist(view[:2], position))
+        views_sent = nearby[:MAX_KNOWN]
         if not views:
             reason = f"no other map is joined to {asking} yet"
         else:
-            reason = f"{len(told)} of {len(views)} views of others within {reach:.1f} m"
-        return KnownAnswer(np.array(told, np.float32).reshape(-1, 4), reason)
+            reason = f"{len(views_sent)} of {len(views)} views of others within {reach:.1f} m"
+        return KnownAnswer(np.array(views_sent, np.float32).reshape(-1, 4), reason)
 
     def _views(self, asking: MapId, component: frozenset[NodeId]) -> list[tuple[float, float, float, float]]:
         """[x m, y m, heading rad, semi-aperture rad], in the asking map, of a component's foreign nodes."""
         merged = self._merged
         own = sorted(node for node in component if node.map == asking)
-        others = sorted(node for node in component if node.map != asking)
-        if not own or not others:
+        other_nodes = sorted(node for node in component if node.map != asking)
+        if not own or not other_nodes:
             return []
         poses = {node: merged.pose(node) for node in component}
         tree = cKDTree([[poses[node].x, poses[node].y] for node in own])
-        _, nearest = tree.query([[poses[node].x, poses[node].y] for node in others])
+        _, nearest = tree.query([[poses[node].x, poses[node].y] for node in other_nodes])
         views = []
-        for node, k in zip(others, np.atleast_1d(nearest), strict=True):
+        for node, k in zip(other_nodes, np.atleast_1d(nearest), strict=True):
             map_from_own = merged.maps[asking].nodes[own[int(k)]].map_from_robot.mean
             place = map_from_own @ poses[own[int(k)]].inverse() @ poses[node]
             views.append(

@@ -1,4 +1,4 @@
-"""People's questions why maps are one and why routes lead so, and rulings that maps shall not be one."""
+"""Explanations of merges and routes for people, and their manual constraints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
-    MAX_MAPS_TOLD,
+    MAX_MAPS_LISTED,
     Explanation,
     FleetExplanation,
     MapsExplanation,
@@ -38,11 +38,11 @@ from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
 
-Told = TypeVar("Told", PairExplanation, MapsExplanation, RouteExplanation)
+AnyExplanation = TypeVar("AnyExplanation", PairExplanation, MapsExplanation, RouteExplanation)
 
 
 class RulingBook:
-    """The server's record of what people have ruled, on its disk. Entries are added, never taken out."""
+    """The server's record of manual constraints, on its disk. Entries are added, never removed."""
 
     def __init__(self, store: Store) -> None:
         """Read the record."""
@@ -64,15 +64,15 @@ class RulingBook:
         """All maps of which the server has anything: they can be retired."""
         return self._store.maps()
 
-    def add(self, ruling: ManualConstraint) -> None:
-        """Enter a ruling; it is on the disk when this returns.
+    def add(self, constraint: ManualConstraint) -> None:
+        """Add a manual constraint; it is on the disk when this returns.
 
         Raises:
             InvalidValue: there are too many.
             InvalidFile: the disk does not take it; then nothing has changed.
         """
-        self._store.add_ruling(encode(ruling))
-        self._rulings = ManualConstraints([*self._rulings.made, ruling])
+        self._store.add_ruling(encode(constraint))
+        self._rulings = ManualConstraints([*self._rulings.made, constraint])
 
 
 class Explainer:
@@ -84,7 +84,7 @@ class Explainer:
         keys: Keys,
         name: str,
         answers: Callable[[], Answers],
-        desk: AdmissionControl,
+        admission: AdmissionControl,
         book: RulingBook,
         rule: Callable[[ManualConstraints], None],
         settled: Callable[[], bool],
@@ -99,16 +99,16 @@ class Explainer:
             keys: of the fleet.
             name: of the server in the fleet.
             answers: the newest ones. May wait for them.
-            desk: explanations compare nodes, which takes long.
-            book: where rulings are kept.
-            rule: told all rulings whenever there is a new one.
+            admission: admission control; explanations compare nodes, which takes long.
+            book: record of manual constraints.
+            rule: called with all constraints whenever there is a new one.
             settled: whether the newest answers know all that has come.
             consistency: as in the merge.
             wary: pairs of nodes between which robots of late did not get through.
             happenings: what has become of the maps.
         """
         self._answers = answers
-        self._desk = desk
+        self._admission = admission
         self._book = book
         self._rule = rule
         self._settled = settled
@@ -118,7 +118,7 @@ class Explainer:
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
-            bus.serve(keys.rule(name), guarded(self._decree)),
+            bus.serve(keys.rule(name), guarded(self._apply_constraint)),
             bus.serve(keys.history(name), guarded(lambda _: encode(History(self.history())))),
         ]
 
@@ -128,7 +128,7 @@ class Explainer:
             closing.close()
 
     def _explain_later(self, request: Request) -> None:
-        done = self._desk.submit(lambda: self._explain(request.payload), usual=False)
+        done = self._admission.submit(lambda: self._explain(request.payload), usual=False)
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _explain(self, payload: bytes) -> bytes:
@@ -140,37 +140,41 @@ class Explainer:
         Raises:
             InvalidValue: they are not there.
         """
-        # Asked first: what comes meanwhile may be missing in the answers.
+        # Asked first: later changes may be missing in the answers.
         settled = self._settled()
         answers = self._answers()
         merged = answers.merged
         if request.ends is None:
-            maps = explain_fleet(merged, MAX_MAPS_TOLD)
-            return FleetExplanation(tuple(_still(one, settled) for one in maps))
+            maps = explain_fleet(merged, MAX_MAPS_LISTED)
+            return FleetExplanation(tuple(_still(pair, settled) for pair in maps))
         first, second = request.ends
         if isinstance(first, NodeId) and isinstance(second, NodeId):
             if request.route:
-                told = explain_route(answers.router, first, second, request.blocked, self._wary())
-                return _still(told, settled)
+                explanation = explain_route(answers.router, first, second, request.blocked, self._wary())
+                return _still(explanation, settled)
             return _still(explain_nodes(merged, first, second, None, self._consistency), settled)
         two = explain_maps(merged, MapId(*first[:2]), MapId(*second[:2]))
         return FleetExplanation((_still(two, settled),))
 
     def history(self) -> tuple[MapEvent, ...]:
-        """What has become of the maps, and what people have ruled, in order."""
+        """The history of the maps and the manual constraints, in order."""
         return with_rulings(self._happenings(), self._book.rulings)
 
-    def _decree(self, payload: bytes) -> bytes:
-        ruling = decode(payload, ManualConstraint)
+    def _apply_constraint(self, payload: bytes) -> bytes:
+        constraint = decode(payload, ManualConstraint)
         with self._turn:
-            check_manual_constraint(self._answers().merged, self._book.rulings, ruling, self._book.maps())
-            self._book.add(ruling)
+            check_manual_constraint(self._answers().merged, self._book.rulings, constraint, self._book.maps())
+            self._book.add(constraint)
             self._rule(self._book.rulings)
-        said = said_of(ruling)
-        log.warning("%s", said)
-        return encode_record({"said": said})
+        event = said_of(constraint)
+        log.warning("%s", event)
+        return encode_record({"said": event})
 
 
-def _still(told: Told, settled: bool) -> Told:
-    """What was not found yet is not said to be missing."""
-    return told if settled else replace(told, reason=f"{told.reason} (still merging: ask again)")
+def _still(explanation: AnyExplanation, settled: bool) -> AnyExplanation:
+    """Mark an explanation as preliminary while the server merges."""
+    return (
+        explanation
+        if settled
+        else replace(explanation, reason=f"{explanation.reason} (still merging: ask again)")
+    )

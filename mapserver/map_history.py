@@ -25,12 +25,16 @@ NAME = "history"
 MOST = 500
 """Happenings that are kept: the newest."""
 MOST_APART = 2000
-"""Pairs of maps that are remembered as kept apart, so that it is told once."""
+"""Pairs of maps that are remembered as kept apart, so that it is reported once."""
 MOST_AT_ONCE = 50
 """Happenings of one sort that one merge adds one by one: a thousand maps may join at once."""
 Pair = tuple[MapId, MapId]
-BODIES = ("would have seen", "would have been at the same place", "show nothing of what the other one mapped")
-"""What a refusal says where two robots cannot have been where the links put them."""
+EXCLUSION_WORDS = (
+    "would have seen",
+    "would have been at the same place",
+    "show nothing of what the other one mapped",
+)
+"""Words of a refusal by mutual exclusion."""
 
 
 class MapHistory:
@@ -39,7 +43,7 @@ class MapHistory:
     def __init__(
         self, store: Store | None = None, most: int = MOST, clock: Callable[[], int] = time.time_ns
     ) -> None:
-        """Read what was kept; a record that is damaged is begun anew, and that is said.
+        """Read the record; a damaged one is replaced by an empty one, with a warning.
 
         Args:
             store: where it is kept; None: it ends with the process.
@@ -50,10 +54,10 @@ class MapHistory:
         self._lock = threading.Lock()
         self._kept = KeptHistory()
         self._links: Collection[Link] | None = None
-        found = None if store is None else store.result(NAME)
-        if found is not None:
+        record = None if store is None else store.result(NAME)
+        if record is not None:
             try:
-                self._kept = decode(found, KeptHistory)
+                self._kept = decode(record, KeptHistory)
             except InvalidMessage as error:
                 self.failed(f"the record of what happened before was damaged ({error}); a new one begins")
 
@@ -67,7 +71,7 @@ class MapHistory:
     def newest(self) -> str:
         """Words of what last became of the maps; empty if nothing has."""
         return next(
-            (one.words for one in reversed(self.happenings) if one.kind is not MapEventKind.FAILED), ""
+            (event.words for event in reversed(self.happenings) if event.kind is not MapEventKind.FAILED), ""
         )
 
     @property
@@ -85,14 +89,14 @@ class MapHistory:
         parted = () if same else partings(before, self._links, merged)
         apart = _kept_apart(merged, now)
         was_in, is_in = _part_of(before), _part_of(now)
-        # Until two maps are one nothing new is told of them, and beyond the most nothing at all.
+        # Until two maps are joined nothing new is reported of them, and beyond the limit nothing at all.
         still = {(a, b) for a, b in self._kept.apart if is_in.get(a, -1) != is_in.get(b, -2)}
         new = [pair for pair in apart if pair not in still][: MOST_APART - len(still)]
-        # Of what has just parted it is told already what stands between.
+        # The reason of a split is reported with it already.
         held = [apart[a, b] for a, b in new if was_in.get(a, -1) != was_in.get(b, -2)]
         bad, before_bad = merged.set_apart, self._kept.set_apart
-        left_out = [f"map {one} is set apart: {bad[one]}" for one in sorted(bad.keys() - before_bad)]
-        taken_in = [f"map {one} is no longer set apart" for one in sorted(before_bad - bad.keys())]
+        left_out = [f"map {map_id} is set apart: {bad[map_id]}" for map_id in sorted(bad.keys() - before_bad)]
+        taken_in = [f"map {map_id} is no longer set apart" for map_id in sorted(before_bad - bad.keys())]
         for words in (*joined, *taken_in):
             log.info("%s", words)
         for words in (*parted, *held, *left_out):
@@ -105,13 +109,13 @@ class MapHistory:
             *_briefly(MapEventKind.SET_APART, taken_in),
             *_briefly(MapEventKind.SET_APART, left_out),
         ]
-        known = frozenset(still | set(new))
+        apart_pairs = frozenset(still | set(new))
         self._links = merged.links
-        if fresh or now != before or known != self._kept.apart:
-            self._keep(fresh, now, known, frozenset(bad))
+        if fresh or now != before or apart_pairs != self._kept.apart:
+            self._keep(fresh, now, apart_pairs, frozenset(bad))
 
     def failed(self, words: str) -> None:
-        """Take note that something could not be done; the same twice is told once."""
+        """Record that something could not be done; the same twice is reported once."""
         if not self._kept.happenings or self._kept.happenings[-1].words != words:
             self._keep(
                 [(MapEventKind.FAILED, words)], self._kept.parts, self._kept.apart, self._kept.set_apart
@@ -147,42 +151,40 @@ def between(before: MergedMap, after: MergedMap, stamp_ns: int) -> tuple[MapEven
 
 
 def _part_of(parts: Iterable[frozenset[MapId]]) -> dict[MapId, int]:
-    return {one: number for number, part in enumerate(parts) for one in part}
+    return {map_id: number for number, part in enumerate(parts) for map_id in part}
 
 
 def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pair, str]:
-    """Maps that are not one, since robots cannot have been where the links between them say, or one is
-    wrong.
-    """
+    """Maps that are kept apart by mutual exclusion, or since one has wrong geometry."""
     part_of = _part_of(parts)
     reasons: dict[Pair, Counter[str]] = {}
-    speaks_of_bodies: dict[str, bool] = {}
+    by_exclusion: dict[str, bool] = {}
     for r in merged.refused:
         if r.link is None or r.edge is not None:
             continue
-        if r.reason not in speaks_of_bodies:
-            speaks_of_bodies[r.reason] = any(words in r.reason for words in BODIES)
+        if r.reason not in by_exclusion:
+            by_exclusion[r.reason] = any(words in r.reason for words in EXCLUSION_WORDS)
         first, second = sorted((r.a.map, r.b.map))
-        if speaks_of_bodies[r.reason] and part_of.get(first) != part_of.get(second):
+        if by_exclusion[r.reason] and part_of.get(first) != part_of.get(second):
             reasons.setdefault((first, second), Counter())[r.reason] += 1
     # One line for a map with wrong geometry, under its pair with the first of those that it contradicts.
     out: dict[Pair, str] = {}
     for wrong in merged.wrong.values():
         first, second = sorted((wrong.which, wrong.agreeing[0]))
         out[first, second] = wrong.reason
-    for (first, second), found in sorted(reasons.items()):
-        count = sum(found.values())
+    for (first, second), counts in sorted(reasons.items()):
+        count = sum(counts.values())
         links = "1 link" if count == 1 else f"{count} links"
         out[first, second] = (
-            f"{first} and {second} are kept apart: {links} refused ({found.most_common(1)[0][0]})"
+            f"{first} and {second} are kept apart: {links} refused ({counts.most_common(1)[0][0]})"
         )
     return out
 
 
-def _briefly(kind: MapEventKind, told: Sequence[str]) -> list[tuple[MapEventKind, str]]:
+def _briefly(kind: MapEventKind, events: Sequence[str]) -> list[tuple[MapEventKind, str]]:
     """Of very much at once the number."""
-    more = [f"and {len(told) - MOST_AT_ONCE} more at once"] if len(told) > MOST_AT_ONCE else []
-    return [(kind, words) for words in (*told[:MOST_AT_ONCE], *more)]
+    more = [f"and {len(events) - MOST_AT_ONCE} more at once"] if len(events) > MOST_AT_ONCE else []
+    return [(kind, words) for words in (*events[:MOST_AT_ONCE], *more)]
 
 
 def _one_line(words: str) -> str:

@@ -40,9 +40,9 @@ BEAT = 15.0
 MOST = 2048
 """Nodes in one message."""
 DISTANCE = 0.05
-"""A node that has moved less than this since its agent was told is not sent again, m."""
+"""A node that has moved less than this since it was published is not sent again, m."""
 TURN = math.radians(1.0)
-"""A node that has turned less than this since its agent was told is not sent again, rad."""
+"""A node that has turned less than this since it was published is not sent again, rad."""
 
 
 class PoseBroadcast:

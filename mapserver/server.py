@@ -1,7 +1,7 @@
 """The map server: keeps every robot's log, merges the maps, answers lost robots.
 
-Ingest -> Store -> Upkeep -> Answers <- Services <- robots, over the bus
-                                     <- Web      <- people, over HTTP
+Ingest -> Store -> MergeWorker -> Answers <- Services <- robots, over the bus
+                                          <- Web      <- people, over HTTP
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ServerSettings:
 STATUS_EVERY = 0.5
 """Time between two status messages, s."""
 MERGE_SHARE = 0.4
-"""At most this share of the time is spent making the merged map anew."""
+"""Largest share of the time that is spent merging."""
 
 
 class MapServer:
@@ -75,7 +75,7 @@ class MapServer:
             path: of the store; its folder is made.
             name: of this server in the fleet.
             settings: how it shares its time.
-            schedule: runs its work and tells the time; threads and the machine's clock if not given. It
+            schedule: runs its work and gives the time; threads and the machine's clock by default. It
                 starts and ends with the server.
 
         Raises:
@@ -90,31 +90,31 @@ class MapServer:
         self._store = Store(path)
         self._places = PlaceDatabase(self._store, path)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
-        self._chronicle = MapHistory(self._store, clock=clock.time_ns)
-        self._upkeep = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._chronicle)
+        self._history = MapHistory(self._store, clock=clock.time_ns)
+        self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
         self._rulings = RulingBook(self._store)
-        self._upkeep.rule(self._rulings.rulings)
-        self._desk = AdmissionControl(
+        self._worker.rule(self._rulings.rulings)
+        self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
         self._blockages = Blockages()
 
     def __enter__(self) -> MapServer:
         """Begin to serve."""
-        upkeep, clock = self._upkeep, self._schedule
-        upkeep.start()
-        self._ingest = Ingest(self._bus, self._keys, self._store, self._name, upkeep.take, replay=upkeep.read)
+        worker, clock = self._worker, self._schedule
+        worker.start()
+        self._ingest = Ingest(self._bus, self._keys, self._store, self._name, worker.take, replay=worker.read)
         self._services = Services(
-            self._bus, self._keys, self._name, upkeep.current, self._desk, self._blockages, self.status,
-            lambda: self._chronicle.happenings, clock.monotonic, clock.executor(1),
+            self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
+            lambda: self._history.happenings, clock.monotonic, clock.executor(1),
         )  # fmt: skip
         self._explainer = Explainer(
-            self._bus, self._keys, self._name, upkeep.current, self._desk, self._rulings, upkeep.rule,
-            lambda: upkeep.settled, self._settings.merge.consistency,
-            lambda: self._blockages.known(clock.monotonic()), lambda: self._chronicle.happenings,
+            self._bus, self._keys, self._name, worker.current, self._admission, self._rulings, worker.rule,
+            lambda: worker.settled, self._settings.merge.consistency,
+            lambda: self._blockages.known(clock.monotonic()), lambda: self._history.happenings,
         )  # fmt: skip
-        self._herald = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
-        clock.every(STATUS_EVERY, self._tell)
+        self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
+        clock.every(STATUS_EVERY, self._publish)
         clock.every(EVERY, self._places.save_if_worthwhile)
         return self
 
@@ -124,24 +124,24 @@ class MapServer:
         """Stop serving; everything that was acknowledged is on the disk already."""
         self._services.close()
         self._explainer.close()
-        self._desk.close()
+        self._admission.close()
         self._ingest.close()
-        self._herald.close()
-        self._upkeep.close()
+        self._broadcast.close()
+        self._worker.close()
         self._places.close()
         self._store.close()
 
     def summary(self) -> str:
         """One line for people."""
-        return self._upkeep.answers.merged.summary()
+        return self._worker.answers.merged.summary()
 
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
-        return self._upkeep.settle(timeout)
+        return self._worker.settle(timeout)
 
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
-        merged = self._upkeep.answers.merged
+        merged = self._worker.answers.merged
         loops = sum(link.within for link in merged.links)
         traffic = self._store.traffic()
         return {
@@ -155,12 +155,12 @@ class MapServer:
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
             "rulings": len(merged.rulings.in_force),
             "set_apart": len(merged.set_apart),
-            "event": self._ingest.failure or self._upkeep.event,
-            "settled": self._upkeep.settled,
+            "event": self._ingest.failure or self._worker.event,
+            "settled": self._worker.settled,
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,
             "summary": merged.summary(),
-            **self._desk.counters(),
+            **self._admission.counters(),
         }
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
@@ -168,12 +168,12 @@ class MapServer:
 
         Args:
             look: makes the view; called by a worker.
-            ticket: the same if the same image comes again, see Desk.submit.
+            ticket: the same if the same image comes again, see AdmissionControl.submit.
 
         Raises:
             Busy: too many ask.
         """
-        return self._desk.submit(lambda: self._upkeep.current().relocalizer.answer(look()), ticket)
+        return self._admission.submit(lambda: self._worker.current().relocalizer.answer(look()), ticket)
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
         """Ask why nodes or maps are linked or are not, or why a route leads so, from any thread.
@@ -181,12 +181,12 @@ class MapServer:
         Raises:
             Busy: too many ask.
         """
-        return self._desk.submit(lambda: self._explainer.explain(request), usual=False)
+        return self._admission.submit(lambda: self._explainer.explain(request), usual=False)
 
     def history(self) -> tuple[MapEvent, ...]:
-        """What has become of the maps and what people have ruled, in order."""
+        """The history of the maps and the manual constraints, in order."""
         return self._explainer.history()
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))
-        self._herald.tell(self._upkeep.answers.merged)
+        self._broadcast.tell(self._worker.answers.merged)

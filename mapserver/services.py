@@ -1,4 +1,4 @@
-"""Robots' questions over the bus. Views are for the desk, the map is packed beside; the rest is quick."""
+"""Robots' questions over the bus. Views pass admission control, the map is packed in the background."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.packed_map import PackedMap
-from mapweave.mapserver.wire_limits import Pairs, drivable, said
+from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
@@ -33,7 +33,7 @@ class Services:
         keys: Keys,
         name: str,
         answers: Callable[[], Answers],
-        desk: AdmissionControl,
+        admission: AdmissionControl,
         blockages: Blockages,
         status: Callable[[], dict[str, Scalar]],
         history: Callable[[], Iterable[MapEvent]],
@@ -47,7 +47,7 @@ class Services:
             keys: of the fleet.
             name: of the server in the fleet.
             answers: the newest ones. May wait for them.
-            desk: for questions that take long.
+            admission: admission control of long questions.
             blockages: takes note of where robots did not get through.
             status: of the server.
             history: of the maps, for who takes them along.
@@ -56,7 +56,7 @@ class Services:
         """
         self._clock = clock
         self._answers = answers
-        self._desk = desk
+        self._admission = admission
         self._blockages = blockages
         self._status = status
         self._map = PackedMap(
@@ -78,12 +78,12 @@ class Services:
         self._map.close()
 
     def _relocalize_later(self, request: Request) -> None:
-        done = self._desk.submit(lambda: self._relocalize(request.payload), hash(request.payload))
+        done = self._admission.submit(lambda: self._relocalize(request.payload), hash(request.payload))
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _relocalize(self, payload: bytes) -> bytes:
         view = decode_view(payload)
-        return encode(said(self._answers().relocalizer.answer(view)))
+        return encode(within_range(self._answers().relocalizer.answer(view)))
 
     def _route(self, payload: bytes) -> bytes:
         request = decode(payload, RouteRequest)
@@ -92,8 +92,8 @@ class Services:
         wary = self._blockages.known(self._clock())
 
         def route(blocked: Pairs) -> RouteAnswer:
-            start, goal, here = request.start, request.goal, request.start_from_robot
-            return answers.router.route(start, goal, blocked, wary, here)
+            start, goal, start_from_robot = request.start, request.goal, request.start_from_robot
+            return answers.router.route(start, goal, blocked, wary, start_from_robot)
 
         return encode(drivable(route, request.blocked))
 

@@ -25,7 +25,7 @@ MOST_DETOURS = 8
 Pairs = tuple[tuple[NodeId, NodeId], ...]
 
 
-def can_be_said(pose: PoseGaussian | None) -> bool:
+def in_range(pose: PoseGaussian | None) -> bool:
     """Whether a pose is in the range of messages; none at all is."""
     try:
         return pose is None or bool(pack_pose(pose))
@@ -33,26 +33,26 @@ def can_be_said(pose: PoseGaussian | None) -> bool:
         return False
 
 
-def said(answer: RelocalizeAnswer) -> RelocalizeAnswer:
+def within_range(answer: RelocalizeAnswer) -> RelocalizeAnswer:
     """An answer without candidates that are out of range.
 
     A candidate of which only the merged pose is out of range keeps the rest. The certainty stays: if the
     robot may be at a place that is left out, it is not certain to be at the other. If the robot's own place
     is out of range, the answer is that it is unknown.
     """
-    fine = [can_be_said(one.node_from_robot) for one in answer.candidates]
-    told = tuple(
-        one
-        if can_be_said(one.merged_from_robot)
-        else replace(one, merged_from_robot=None, component=NO_COMPONENT)
-        for one, good in zip(answer.candidates, fine, strict=True)
+    fine = [in_range(candidate.node_from_robot) for candidate in answer.candidates]
+    candidates = tuple(
+        candidate
+        if in_range(candidate.merged_from_robot)
+        else replace(candidate, merged_from_robot=None, component=NO_COMPONENT)
+        for candidate, good in zip(answer.candidates, fine, strict=True)
         if good
     )
     sure = answer.certainty in (Certainty.FOUND, Certainty.PLACE)
-    if answer.candidates and (not told or (sure and not fine[0])):
+    if answer.candidates and (not candidates or (sure and not fine[0])):
         reason = f"the place is out of the range of messages: {answer.reason}"
         return RelocalizeAnswer(Certainty.UNKNOWN, (), reason)
-    return replace(answer, candidates=told)
+    return replace(answer, candidates=candidates)
 
 
 def drivable(
@@ -71,7 +71,7 @@ def drivable(
         bad = tuple(
             (before, leg.node.id)
             for before, leg in zip(names[:1] + names[:-1], answer.legs, strict=True)
-            if not can_be_said(leg.previous_from_node)
+            if not in_range(leg.previous_from_node)
             or max(abs(leg.previous_from_node.mean.x), abs(leg.previous_from_node.mean.y)) > LONGEST_LEG
         )
         if not bad:

@@ -96,13 +96,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except OSError as error:
         # A disk that is full, a folder that may not be written: the system's words say it best, but for one.
-        what = error.strerror or error
+        reason = error.strerror or error
         if isinstance(error, FileExistsError):
-            what = "is a file; give a folder, or a place where one can be made"
+            reason = "is a file; give a folder, or a place where one can be made"
         elif isinstance(error, NotADirectoryError):
-            what = "cannot be made: what it should be in is a file"
+            reason = "cannot be made: what it should be in is a file"
         where = f"{error.filename}: " if error.filename else ""
-        print(f"mapweave: {where}{what}", file=sys.stderr)
+        print(f"mapweave: {where}{reason}", file=sys.stderr)
         return 1
 
 

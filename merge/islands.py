@@ -1,4 +1,4 @@
-"""The merge as maps grow: only what a change can bear on is merged anew.
+"""The merge as maps grow: only islands that a change affects are merged again.
 
 Maps that links tie together, directly or by way of others, are an island. Nothing in one island bears on
 another, so an island that nothing has touched is kept as it is.
@@ -42,16 +42,16 @@ class Islands:
         self._settings = settings or MergeSettings()
         self._exact = exact
         self._cache = MergeCache()
-        self._known: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
+        self._merged_islands: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
         self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
-        self._rulings = ManualConstraints()
+        self._constraints = ManualConstraints()
 
     def merge(
         self,
         maps: Mapping[MapId, HybridMap],
         verdicts: Verdicts,
         touched: set[MapId],
-        rulings: ManualConstraints,
+        constraints: ManualConstraints,
     ) -> MergedMap:
         """Merge.
 
@@ -60,37 +60,41 @@ class Islands:
             verdicts: on pairs of their nodes.
             touched: maps that were replaced, or with a node of which the verdicts have changed, since this
                 was called last.
-            rulings: of people.
+            constraints: manual constraints.
 
         Returns:
             What `merge_maps` makes of all maps; of large islands nearly so.
         """
-        for ruling in {*rulings.in_force} ^ {*self._rulings.in_force}:
-            touched = touched | {end.map if isinstance(end, NodeId) else end for end in ruling.ends}
-        islands = self._ties(maps, verdicts, rulings)
-        known: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
+        for constraint in {*constraints.in_force} ^ {*self._constraints.in_force}:
+            touched = touched | {end.map if isinstance(end, NodeId) else end for end in constraint.ends}
+        islands = self._ties(maps, verdicts, constraints)
+        merged_islands: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
         for island in islands:
-            if island in self._known and not island & touched:
-                known[island] = self._known[island]
+            if island in self._merged_islands and not island & touched:
+                merged_islands[island] = self._merged_islands[island]
                 continue
             inside = {one: maps[one] for one in sorted(island)}
-            earlier = [self._known[one][1] for one in sorted(self._known, key=min) if one & island]
-            known[island] = self._decided(inside, verdicts.among(island), rulings, earlier)
-        self._known, self._rulings = known, rulings
+            earlier = [
+                self._merged_islands[one][1] for one in sorted(self._merged_islands, key=min) if one & island
+            ]
+            merged_islands[island] = self._decided(inside, verdicts.among(island), constraints, earlier)
+        self._merged_islands, self._constraints = merged_islands, constraints
         island_of = {one: island for island in islands for one in island}
-        return _together([merged for merged, _ in known.values()], maps, verdicts.across(island_of), rulings)
+        return _together(
+            [merged for merged, _ in merged_islands.values()], maps, verdicts.across(island_of), constraints
+        )
 
     def _decided(
         self,
         maps: Mapping[MapId, HybridMap],
         verdicts: Iterable[Verdict],
-        rulings: ManualConstraints,
+        constraints: ManualConstraints,
         earlier: Sequence[StandingDecisions],
     ) -> tuple[MergedMap, StandingDecisions]:
         links, refused = _sorted_out(verdicts)
-        undone = apply_constraints(maps, links, rulings)
+        undone = apply_constraints(maps, links, constraints)
         everything = undone.maps, undone.links, [*refused, *undone.refused], self._settings, self._cache
-        small = sum(len(one.nodes) for one in maps.values()) <= self._exact
+        small = sum(len(hybrid_map.nodes) for hybrid_map in maps.values()) <= self._exact
         before = None if small or not earlier else StandingDecisions.union(earlier)
         merged, stands = decide(*everything, before)
         if stands.changed > CHANGED * stands.size:
@@ -98,20 +102,20 @@ class Islands:
         return undone.completed(merged), stands
 
     def _ties(
-        self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, rulings: ManualConstraints
+        self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, constraints: ManualConstraints
     ) -> list[frozenset[MapId]]:
         """Islands: maps that links or drives tie together."""
         ties: nx.Graph = nx.Graph()
         ties.add_nodes_from(maps)
-        ties.add_edges_from(verdicts.ties(rulings))
-        for map_id, one in maps.items():
-            known = self._abroad.get(map_id)
-            if known is None or known[0] is not one:
-                ends = {node[:2] for edge in one.edges.values() for node in (edge.a, edge.b)}
-                known = self._abroad[map_id] = one, frozenset(MapId(*end) for end in ends) - {map_id}
-            ties.add_edges_from((map_id, other) for other in known[1])
-        found = (frozenset(part & maps.keys()) for part in nx.connected_components(ties))
-        return sorted((island for island in found if island), key=min)
+        ties.add_edges_from(verdicts.ties(constraints))
+        for map_id, hybrid_map in maps.items():
+            entry = self._abroad.get(map_id)
+            if entry is None or entry[0] is not hybrid_map:
+                ends = {node[:2] for edge in hybrid_map.edges.values() for node in (edge.a, edge.b)}
+                entry = self._abroad[map_id] = hybrid_map, frozenset(MapId(*end) for end in ends) - {map_id}
+            ties.add_edges_from((map_id, neighbour) for neighbour in entry[1])
+        parts = (frozenset(part & maps.keys()) for part in nx.connected_components(ties))
+        return sorted((island for island in parts if island), key=min)
 
 
 def _sorted_out(verdicts: Iterable[Verdict]) -> tuple[list[Link], list[RefusedLink]]:
@@ -129,25 +133,25 @@ def _together(
     islands: list[MergedMap],
     maps: Mapping[MapId, HybridMap],
     across: Iterable[Verdict],
-    rulings: ManualConstraints,
+    constraints: ManualConstraints,
 ) -> MergedMap:
     """One merged map of islands that have nothing to do with each other."""
     graphs = sorted(
         (
             (graph, component)
-            for one in islands
-            for graph, component in zip(one.graphs, one.components, strict=True)
+            for merged in islands
+            for graph, component in zip(merged.graphs, merged.components, strict=True)
         ),
         key=lambda item: (-len(item[0].nodes), item[0].anchor),
     )
     solved = tuple(graph for graph, _ in graphs)
     poses = Poses(solved)
-    links = sorted((link for one in islands for link in one.links), key=lambda link: link.pair)
-    refused = [refusal for one in islands for refusal in one.refused]
+    links = sorted((link for merged in islands for link in merged.links), key=lambda link: link.pair)
+    refused = [refusal for merged in islands for refusal in merged.refused]
     apart, between = _sorted_out(across)
-    undone = apply_constraints({}, apart, rulings)
+    undone = apply_constraints({}, apart, constraints)
     refused += [r for r in (*between, *undone.refused) if r.a in poses and r.b in poses]
     refused.sort(key=lambda refusal: refusal.pair)
     components = tuple(component for _, component in graphs)
     whole = MergedMap(dict(sorted(maps.items())), tuple(links), tuple(refused), components, poses, solved)
-    return replace(whole, rulings=rulings)
+    return replace(whole, rulings=constraints)

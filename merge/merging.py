@@ -1,13 +1,13 @@
 """Maps and verified links become a merged map: the whole of the merge after verification, as one function.
 
-1. Maps are cut into pieces that their own edges connect; a robot's own claims must agree with its way.
+1. Maps are cut into pieces that their own edges connect; loop closures must agree with the robot's drive.
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
-3. Pieces are joined, best supported first, and the links between what is larger now are sorted anew. Links
-   that would join what is joined already must agree with it.
+3. Pieces are joined, best supported first, and the links between the larger pieces are sorted again. Links
+   within one piece must agree with it.
 4. Each component is optimised. Where few links are refused, each is tried once more by solving with it.
-5. Where two robots would have been at the same place at the same time, the links that make them so are
-   refuted, and it goes on at 2 with the rest.
-6. Drives of a robot among others' nodes are checked against the outcome.
+5. Where two robots would have been at the same place at the same time, the links that cause this are
+   refuted, and the merge continues at 2 with the rest.
+6. Drives of a robot among others' nodes are checked against the result.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def decide(
     cache: MergeCache,
     before: StandingDecisions | None = None,
 ) -> tuple[MergedMap, StandingDecisions]:
-    """Merge, and tell what was decided, so that the next merge can begin from it.
+    """Merge, and return the decisions, so that the next merge can begin from them.
 
     Args:
         maps: by id; they are not changed.
@@ -84,11 +84,11 @@ def decide(
         refused: pairs that were refused before, to be kept with their reasons.
         settings: how.
         cache: of merges with the same settings.
-        before: what stands of the same maps, as far as it is still true. A link keeps its decision until
-            links between the same two maps come or go; None: all are decided.
+        before: standing decisions on the same maps. A link keeps its decision until links between the same
+            two maps come or go; None: all are decided.
 
     Returns:
-        The merged map, and what stands now.
+        The merged map, and the standing decisions.
     """
     s = settings
     fragments = cache.decisions.fragments(maps, s.consistency)
@@ -96,20 +96,20 @@ def decide(
     by_node = solver.by_node
     given = {link.pair: link for link in links if link.a in by_node and link.b in by_node}
     standing = before or StandingDecisions()
-    known = {pair for pair, link in given.items() if standing.given.get(pair) is link}
-    news = (given.keys() - known) | (standing.given.keys() - known)
+    unchanged = {pair for pair, link in given.items() if standing.given.get(pair) is link}
+    news = (given.keys() - unchanged) | (standing.given.keys() - unchanged)
     fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
-    weighed = _weighed(given, standing, known, fresh, by_node, maps, cache.decisions, s)
-    held = [link for pair, link in weighed.items() if pair in standing.believed and pair in known]
-    refuted = standing.refuted & known
+    weighed = _weighed(given, standing, unchanged, fresh, by_node, maps, cache.decisions, s)
+    held = [link for pair, link in weighed.items() if pair in standing.believed and pair in unchanged]
+    refuted = standing.refuted & unchanged
     closed = {
         pair
-        for pair in standing.refused.keys() & known
+        for pair in standing.refused.keys() & unchanged
         if weighed[pair].maps not in fresh and standing.together(*pair)
     }
     if before is not None:
-        gone = [standing.weighed[pair] for pair in standing.believed - known]
-        solver.resume(standing.graphs, standing.fragments, held, gone)
+        removed = [standing.weighed[pair] for pair in standing.believed - unchanged]
+        solver.resume(standing.graphs, standing.fragments, held, removed)
     refutation = Refutation(maps, fragments, s.exclusion, cache.trajectories)
     open_ = [link for pair, link in weighed.items() if pair not in refuted]
     groups = cache.decisions.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
@@ -120,8 +120,8 @@ def decide(
         if not impossible:
             break
         for key, reason in impossible.items():
-            story = [link for link in kept if refutation.key_of(link) == key]
-            groups[key] = groups[key].without(story, reason, s.consistency, refutation.verdict)
+            contradicting = [link for link in kept if refutation.key_of(link) == key]
+            groups[key] = groups[key].without(contradicting, reason, s.consistency, refutation.verdict)
         fallen = {r.pair for group in groups.values() for r in group.refuted}
         held = [link for link in held if link.pair not in fallen]
     refutations = {r.pair: r for group in groups.values() for r in group.refuted}
@@ -164,28 +164,28 @@ def _joined(
     solver.solve(kept, whole=whole)
     tried = [r.link for r in unjoined if r.link is not None]
     kept += readmitted(solver, kept, tried, s.consistency)
-    told = {link.key for link in kept}
-    return solver.solve(kept), kept, [r for r in unjoined if r.pair not in told]
+    keys = {link.key for link in kept}
+    return solver.solve(kept), kept, [r for r in unjoined if r.pair not in keys]
 
 
 def _weighed(
     given: Mapping[Pair, Link],
     standing: StandingDecisions,
-    known: Set[Pair],
+    unchanged: Set[Pair],
     fresh: Set[tuple[MapId, MapId]],
     by_node: Mapping[NodeId, Fragment],
     maps: Mapping[MapId, HybridMap],
     cache: DecisionCache,
     s: MergeSettings,
 ) -> dict[Pair, Link]:
-    """Links with their doubles, which are looked for among those between maps of which links are new."""
-    out = {pair: standing.weighed[pair] for pair in given if pair in known}
+    """Links with their aliased landmarks, searched among links between maps with new links."""
+    out = {pair: standing.weighed[pair] for pair in given if pair in unchanged}
     some = [link for link in given.values() if link.maps in fresh]
-    involved = {one: maps[one] for pair in fresh for one in pair if one in maps}
-    for link, found in zip(
+    involved = {map_id: maps[map_id] for pair in fresh for map_id in pair if map_id in maps}
+    for link, weighed_link in zip(
         some, cache.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
     ):
-        # What is known to be elsewhere too stays so, whoever is looked at.
-        if link.key not in out or out[link.key].doubles < found.doubles:
-            out[link.key] = found
+        # Known aliased landmarks stay aliased.
+        if link.key not in out or out[link.key].doubles < weighed_link.doubles:
+            out[link.key] = weighed_link
     return out

@@ -53,7 +53,7 @@ class MergeSettings:
     """How maps are merged.
 
     Attributes:
-        consistency: when links are believed.
+        consistency: when links are accepted.
         exclusion: when two robots would have been in one place.
     """
 

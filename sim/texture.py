@@ -23,7 +23,7 @@ painting them takes 2.2 s.
 
 @lru_cache(PAINTED)
 def painted(painter: Painter, seed: tuple[int, ...], width_px: int, height_px: int) -> Image:
-    """What a painter paints from a seed. Nobody may change it."""
+    """What a painter paints from a seed. Read-only."""
     image = np.array(painter(np.random.default_rng(seed), width_px, height_px), np.uint8, order="C")
     image.flags.writeable = False
     return image

@@ -60,7 +60,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     try:
         return msgspec.convert(values, cls)
     except msgspec.ValidationError as error:
-        raise SettingsError(f"{where}: {_told(str(error), values)}") from None
+        raise SettingsError(f"{where}: {_in_words(str(error), values)}") from None
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from None
 
@@ -95,7 +95,7 @@ def _dataclasses(kind: Any) -> Iterator[Any]:
             yield from _dataclasses(inner)
 
 
-def _told(error: str, values: Mapping[str, Any]) -> str:
+def _in_words(error: str, values: Mapping[str, Any]) -> str:
     """The error of msgspec as `path: what is wrong; what is there`.
 
     Args:

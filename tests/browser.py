@@ -60,8 +60,8 @@ class Browser:
 
     def type(self, selector: str, text: str) -> None:
         """Type into the field that a CSS selector finds; into one for files, a path."""
-        found = self._ask("POST", f"{self._session}/element", {"using": "css selector", "value": selector})
-        self._ask("POST", f"{self._session}/element/{found[ELEMENT]}/value", {"text": text})
+        result = self._ask("POST", f"{self._session}/element", {"using": "css selector", "value": selector})
+        self._ask("POST", f"{self._session}/element/{result[ELEMENT]}/value", {"text": text})
 
     def run(self, script: str) -> Any:
         """What a function body in JavaScript returns."""

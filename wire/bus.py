@@ -1,4 +1,4 @@
-"""The Bus protocol: publish, subscribe, ask, serve, be alive. Implementations stand beside."""
+"""The Bus protocol: publish, subscribe, ask, serve, liveliness. The implementations are separate files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Sample:
 
 
 class Request(Protocol):
-    """A question that somebody asked. It is answered exactly once, at once or later, from any thread."""
+    """A received question. It is answered exactly once, at once or later, from any thread."""
 
     @property
     def key(self) -> str:
@@ -90,7 +90,7 @@ class Bus(Protocol):
         """Ask everyone who serves the key; waits until all have answered or the time is over.
 
         Returns:
-            The replies that came. An empty list means that nobody is there (no error tells why).
+            The replies. An empty list means that there is no server.
         """
         ...
 

@@ -31,7 +31,7 @@ class BusSettings:
 
     Attributes:
         mode: a client of a router, or the router itself.
-        endpoints: where a client looks for a router; it takes the first that answers.
+        endpoints: routers that a client tries; it takes the first that answers.
         listen: where a router waits for clients.
     """
 

@@ -1,4 +1,4 @@
-"""Changes as bytes: what is kept on disks and sent over the wire. The layout stands in docs/wire.md.
+"""Changes as bytes: what is kept on disks and sent over the wire. The layout is in docs/wire.md.
 
 A change is an envelope (sequence number, stamp) around a *body*. The body alone is what a map file holds. Ids
 of the body's own map are written as a bare number, ids of other maps in full.
@@ -38,7 +38,7 @@ CHANGE = Limit("change", MAX_CHANGE_BYTES)
 MAX_SHARED = MAX_LANDMARKS
 SINGLE = struct.Struct("<f")
 MOST_EVIDENCE = float(MAX_LANDMARKS)
-"""Greatest number among the evidence: most are counts of landmarks or less. More says nothing more."""
+"""Greatest number among the evidence: most are counts of landmarks or less."""
 
 EDGE_KINDS = {
     EdgeKind.MAPPED: 1,
@@ -91,7 +91,7 @@ class _Envelope(msgspec.Struct):
 
 
 def element_of(body: ChangeBody) -> NodeId:
-    """The id of the node or edge that a body is about."""
+    """The id of a body's node or edge."""
     match body:
         case NodePut(node):
             return node.id
@@ -178,7 +178,7 @@ def wrap_body(sequence: int, stamp_ns: int, encoded: bytes) -> bytes:
 
 
 def unwrap_body(data: bytes) -> tuple[int, int, bytes]:
-    """Sequence number, stamp and the encoded body of a change; the body is not looked at.
+    """Sequence number, stamp and the encoded body of a change; the body is not decoded.
 
     Raises:
         InvalidMessage: the envelope is broken.
@@ -247,7 +247,7 @@ def _small(value: float) -> int | float:
     """A whole number packs into one to three bytes, another one, rounded to float32, into five."""
     if not math.isfinite(value):
         raise InvalidValue(f"edge: {value:g} in its evidence is no number")
-    # Rounded first: what becomes whole by it must look the same when it is encoded again.
+    # Rounded first, so that the value encodes the same again.
     (number,) = SINGLE.unpack(SINGLE.pack(min(max(value, 0.0), MOST_EVIDENCE)))
     return int(number) if number == int(number) else float(number)
 

@@ -1,9 +1,9 @@
 """One worker thread a bus, on which all of its handlers run, one after the other.
 
 Transports must never wait for a handler: Zenoh stalls a whole session when a callback falls behind. So a
-callback only puts a task into this queue. The queue is bounded, and nothing falls off its end silently: a
-message that finds it full is counted and logged (replication repairs it), a question is refused so that its
-asker knows, and news of who is alive always find room, because nobody would repeat them.
+callback only puts a task into this queue. The queue is bounded, and nothing is dropped silently: a message
+that finds it full is counted and logged (replication repairs it), a question is refused so that its asker
+knows, and liveliness news always find room, because they are not repeated.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Dispatcher:
         self._thread.start()
 
     def message(self, handler: Callable[[Sample], None], sample: Sample, wanted: Callable[[], bool]) -> None:
-        """Hand over a message, unless nobody wants it any more when its turn comes."""
+        """Hand over a message, unless its subscription has ended when its turn comes."""
 
         def task() -> None:
             if wanted():
@@ -90,7 +90,7 @@ class Dispatcher:
     def presence(
         self, handler: Callable[[str, bool], None], key: str, alive: bool, wanted: Callable[[], bool]
     ) -> None:
-        """Hand over that somebody came or went."""
+        """Hand over a change of liveliness."""
 
         def task() -> None:
             if wanted():

@@ -11,17 +11,17 @@ _lock = threading.Lock()
 _open: set[Closing] = set()
 
 
-def remember(one: Closing) -> None:
+def remember(closing: Closing) -> None:
     """Close this at the exit, unless it is closed or gone by then."""
     with _lock:
         if not any(thread.name == THREAD for thread in threading.enumerate()):
             threading.Thread(target=_close_at_exit, name=THREAD, daemon=False).start()
-        _open.add(one)
+        _open.add(closing)
 
 
-def forget(one: Closing) -> None:
+def forget(closing: Closing) -> None:
     """It was closed."""
-    _open.discard(one)
+    _open.discard(closing)
 
 
 def _close_at_exit() -> None:
@@ -32,5 +32,5 @@ def _close_at_exit() -> None:
     in the middle of closing.
     """
     threading.main_thread().join()
-    for one in list(_open):
-        one.close()
+    for closing in list(_open):
+        closing.close()

@@ -1,6 +1,6 @@
 """Key expressions: what is a key, what is a pattern, and which patterns meet.
 
-A key is chunks joined by `/`. In a pattern, `*` stands for one whole chunk and `**` for any number of them,
+A key is chunks joined by `/`. In a pattern, `*` matches one whole chunk and `**` any number of them,
 none included. This is the part of Zenoh's key expressions that Mapweave uses.
 """
 
@@ -29,7 +29,7 @@ def check_pattern(pattern: str) -> str:
     """Return the pattern, or raise InvalidValue if it is neither a key nor one with `*` or `**`."""
     chunks = pattern.split("/")
     if len(chunks) > MAX_CHUNKS or not all(c in ("*", "**") or CHUNK.fullmatch(c) for c in chunks):
-        raise InvalidValue(f"{pattern!r} is no key pattern: '*' and '**' stand for whole chunks")
+        raise InvalidValue(f"{pattern!r} is no key pattern: '*' and '**' match whole chunks")
     return pattern
 
 
@@ -39,18 +39,18 @@ def is_key(pattern: str) -> bool:
 
 
 @lru_cache(maxsize=16384)
-def intersects(one: str, other: str) -> bool:
+def intersects(a: str, b: str) -> bool:
     """Whether some key is matched by both patterns; a key is a pattern that matches itself."""
-    return _meet(tuple(one.split("/")), tuple(other.split("/")))
+    return _meet(tuple(a.split("/")), tuple(b.split("/")))
 
 
-def _meet(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
-    if not one:
-        return all(chunk == "**" for chunk in other)
-    if not other:
-        return all(chunk == "**" for chunk in one)
-    if one[0] == "**":
-        return _meet(one[1:], other) or _meet(one, other[1:])
-    if other[0] == "**":
-        return _meet(one, other[1:]) or _meet(one[1:], other)
-    return (one[0] == other[0] or "*" in (one[0], other[0])) and _meet(one[1:], other[1:])
+def _meet(a: tuple[str, ...], b: tuple[str, ...]) -> bool:
+    if not a:
+        return all(chunk == "**" for chunk in b)
+    if not b:
+        return all(chunk == "**" for chunk in a)
+    if a[0] == "**":
+        return _meet(a[1:], b) or _meet(a, b[1:])
+    if b[0] == "**":
+        return _meet(a, b[1:]) or _meet(a[1:], b)
+    return (a[0] == b[0] or "*" in (a[0], b[0])) and _meet(a[1:], b[1:])

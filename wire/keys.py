@@ -1,4 +1,4 @@
-"""Every key of a fleet: the version first, then who, then what. No data stands in a key.
+"""Every key of a fleet: the version first, then who, then what. Keys contain no data.
 
     mapweave/1/<fleet>/agent/<agent>/change/<epoch>   one change each; see mapweave.wire.log_messages
     mapweave/1/<fleet>/agent/<agent>/head/<epoch>     beacon: the newest sequence number
@@ -10,8 +10,8 @@
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, rule, history
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
-    mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
-    mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of whoever drives that body
+    mapweave/1/<fleet>/robot/<robot>/describe         question to a robot base; likewise step
+    mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of the driver of that base
 
 The identity is a chunk at a fixed place before the class of the message, so that an access rule can name it.
 """
@@ -45,7 +45,7 @@ class Keys:
     fleet: str = "fleet"
 
     def __post_init__(self) -> None:
-        """Refuse a name that cannot stand in a key (InvalidValue)."""
+        """Refuse a name that cannot be part of a key (InvalidValue)."""
         check_name(self.fleet)
 
     @property
@@ -53,7 +53,7 @@ class Keys:
         """The prefix of every key of the fleet."""
         return f"mapweave/{VERSION}/{self.fleet}"
 
-    # An agent speaks.
+    # Keys of an agent.
 
     def change(self, map_id: MapId) -> str:
         """Where an agent publishes the changes of one map."""
@@ -99,34 +99,34 @@ class Keys:
         """Where an agent takes an operator's commands."""
         return f"{self.root}/agent/{check_name(agent)}/mission"
 
-    # A server speaks.
+    # Keys of a server.
 
     def ack(self, server: str, agent: str) -> str:
-        """Where a server says what of an agent's log is on its disk."""
+        """Acknowledgements of a server to an agent."""
         return f"{self.root}/server/{check_name(server)}/ack/{check_name(agent)}"
 
     def all_acks(self, server: str) -> str:
-        """Pattern: what a server says to every agent; a question: the newest map that it has of one."""
+        """Pattern: a server's acknowledgements to all agents; a question: the newest map of one."""
         return f"{self.root}/server/{check_name(server)}/ack/*"
 
     def acks(self, agent: str) -> str:
-        """Pattern: what any server says to an agent."""
+        """Pattern: acknowledgements of any server to an agent."""
         return f"{self.root}/server/*/ack/{check_name(agent)}"
 
     def poses(self, server: str, agent: str) -> str:
-        """Where a server tells an agent how its nodes lie in the merged map, and answers for all of them."""
+        """Merged poses of an agent's nodes, published by a server; a question returns all of them."""
         return f"{self.root}/server/{check_name(server)}/poses/{check_name(agent)}"
 
     def all_poses(self, server: str) -> str:
-        """Pattern: what a server tells every agent."""
+        """Pattern: a server's merged poses for all agents."""
         return f"{self.root}/server/{check_name(server)}/poses/*"
 
     def relocalize(self, server: str) -> str:
-        """Where a server tells from which place a view was taken."""
+        """Relocalization by a server."""
         return self._of_server("relocalize", server)
 
     def any_relocalize(self) -> str:
-        """Pattern: whichever server answers."""
+        """Pattern: any server."""
         return f"{self.root}/server/*/relocalize"
 
     def route(self, server: str) -> str:
@@ -134,15 +134,15 @@ class Keys:
         return self._of_server("route", server)
 
     def any_route(self) -> str:
-        """Pattern: whichever server answers."""
+        """Pattern: any server."""
         return f"{self.root}/server/*/route"
 
     def known(self, server: str) -> str:
-        """Where a server tells a robot what others have mapped around it."""
+        """Fleet coverage by a server."""
         return self._of_server("known", server)
 
     def any_known(self) -> str:
-        """Pattern: whichever server answers."""
+        """Pattern: any server."""
         return f"{self.root}/server/*/known"
 
     def server_map(self, server: str) -> str:
@@ -150,19 +150,19 @@ class Keys:
         return self._of_server("map", server)
 
     def any_server_map(self) -> str:
-        """Pattern: whichever server answers."""
+        """Pattern: any server."""
         return f"{self.root}/server/*/map"
 
     def explain(self, server: str) -> str:
-        """Where a server says why nodes or maps are linked, or are not."""
+        """Explanations by a server."""
         return self._of_server("explain", server)
 
     def any_explain(self) -> str:
-        """Pattern: whichever server answers."""
+        """Pattern: any server."""
         return f"{self.root}/server/*/explain"
 
     def rule(self, server: str) -> str:
-        """Where a server is told what people rule: that nodes or maps shall not be linked."""
+        """Manual constraints to a server."""
         return self._of_server("rule", server)
 
     def any_rule(self) -> str:
@@ -170,7 +170,7 @@ class Keys:
         return f"{self.root}/server/*/rule"
 
     def history(self, server: str) -> str:
-        """Where a server says what has become of the maps, and what people have ruled."""
+        """The history of the maps, from a server."""
         return self._of_server("history", server)
 
     def any_history(self) -> str:
@@ -193,18 +193,18 @@ class Keys:
         """Pattern: every server."""
         return f"{self.root}/server/*/alive"
 
-    # A body speaks.
+    # Keys of a robot base.
 
     def robot_describe(self, robot: str) -> str:
-        """Where a robot's body describes itself."""
+        """Description of a robot base."""
         return f"{self.root}/robot/{check_name(robot)}/describe"
 
     def robot_step(self, robot: str) -> str:
-        """Where a robot's body takes a command and gives the next observation."""
+        """A robot base takes a command and returns the next observation."""
         return f"{self.root}/robot/{check_name(robot)}/step"
 
     def robot_driver(self, robot: str, number: int) -> str:
-        """Under which one that drives a robot's body is alive."""
+        """Liveliness of a robot base's driver."""
         return f"{self.root}/robot/{check_name(robot)}/driver/{check_epoch(number)}"
 
     def robot_drivers_of(self, robot: str) -> str:
@@ -212,10 +212,10 @@ class Keys:
         return f"{self.root}/robot/{check_name(robot)}/driver/*"
 
     def robot_drivers(self) -> str:
-        """Pattern: everybody who drives a body."""
+        """Pattern: all drivers of a base."""
         return f"{self.root}/robot/*/driver/*"
 
-    # What a key that came from outside says. Each raises InvalidMessage if it is of another form.
+    # Parsing of received keys. Each raises InvalidMessage if the key is of another form.
 
     def parse_change(self, key: str) -> MapId:
         """Whose changes."""
@@ -274,7 +274,7 @@ class Keys:
         return [_name(chunk, key) for chunk in self._chunks(form, key)]
 
     def _chunks(self, form: str, key: str) -> list[str]:
-        """The chunks that stand where the form has `*`."""
+        """The chunks that match `*` of the form."""
         wanted = [*self.root.split("/"), *form.split("/")]
         given = key.split("/") if len(key) <= 256 else []
         if len(given) != len(wanted) or any(w not in ("*", g) for w, g in zip(wanted, given, strict=True)):
@@ -290,7 +290,7 @@ def _name(chunk: str, key: str) -> str:
 
 
 def _number(chunk: str, key: str) -> int:
-    # The text must be the one that a number prints as: "007" and digits of other scripts are none.
+    # The text must be the canonical form of a number: "007" and digits of other scripts are refused.
     if not (chunk.isascii() and chunk.isdigit() and str(int(chunk)) == chunk and int(chunk) <= MAX_EPOCH):
         raise InvalidMessage(f"key {key!r}: {chunk!r} is no epoch")
     return int(chunk)

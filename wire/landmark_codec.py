@@ -1,4 +1,4 @@
-"""Landmarks as packed bytes: where nearly all of a map's size is. The layout stands in docs/wire.md.
+"""Landmarks as packed bytes: nearly all of a map's size. The layout is in docs/wire.md.
 
 Whole numbers (mapweave.hybridmap.quantization, mapweave.hybridmap.descriptor) are packed without loss, each
 for the bits that its frequency is worth. About 17.5 bytes a landmark: 13.3 for the descriptor, 1.7 for depth
@@ -168,7 +168,7 @@ def _unpack(data: bytes, with_depths: bool) -> tuple[QuantizedLandmarks, NDArray
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """What the head says of the bits behind it.
+    """Contents of the head.
 
     Attributes:
         count: landmarks.
@@ -199,22 +199,22 @@ def _read(data: bytes, lay: _Layout) -> _Parts:
 
 def _push_depths(lanes: LaneWriter, rounded: QuantizedLandmarks) -> None:
     _, shares, cells = _written_columns()
-    known = np.flatnonzero(rounded.share)
-    fine = FINE_BITS[rounded.share[known]]
-    depth = rounded.depth[known]
-    lanes.push_plain(depth & ((1 << fine) - 1), fine, known)
-    lanes.push((depth >> fine).astype(np.uint8)[None], cells, known)
+    with_depth = np.flatnonzero(rounded.share)
+    fine = FINE_BITS[rounded.share[with_depth]]
+    depth = rounded.depth[with_depth]
+    lanes.push_plain(depth & ((1 << fine) - 1), fine, with_depth)
+    lanes.push((depth >> fine).astype(np.uint8)[None], cells, with_depth)
     lanes.push(rounded.share.astype(np.uint8)[None], shares)
 
 
 def _pop_depths(lanes: LaneReader) -> tuple[Ints, Ints]:
     _, shares, cells = _read_columns()
     share = lanes.pop(shares)[0].astype(np.int64)
-    known = np.flatnonzero(share)
-    fine = FINE_BITS[share[known]]
+    with_depth = np.flatnonzero(share)
+    fine = FINE_BITS[share[with_depth]]
     depth = np.zeros(len(share), np.int64)
-    cell = lanes.pop(cells, known)[0].astype(np.int64)
-    depth[known] = (cell << fine) | lanes.pop_plain(fine, known)
+    cell = lanes.pop(cells, with_depth)[0].astype(np.int64)
+    depth[with_depth] = (cell << fine) | lanes.pop_plain(fine, with_depth)
     return share, depth
 
 

@@ -35,12 +35,12 @@ Encoded = Annotated[bytes, Meta(max_length=MAX_CHANGE_BYTES)]
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What the attachment of a published change says, so that a receiver can order it undecoded.
+    """Attachment of a published change, so that a receiver can order it undecoded.
 
     Attributes:
         sequence: of the change.
-        log_id: which log this is. Drawn by chance when the log is begun: an agent that has lost its disk
-            and counts from one again must not be taken for the one before.
+        log_id: which log this is. Random, drawn when the log is begun: an agent that has lost its disk and
+            counts from one again must not be confused with the one before.
     """
 
     sequence: int
@@ -87,8 +87,7 @@ class Head(LogMessage, frozen=True):
     Attributes:
         log_id: see Mark.
         newest: sequence number of the newest change, 0 if there is none.
-        acknowledged: what the agent believes to be on which server's disk. A server that has more says so
-            again.
+        acknowledged: watermark by server, as known to the agent. A server that has more acknowledges again.
     """
 
     limit = Limit("head", MAX_SMALL_BYTES)
@@ -114,8 +113,8 @@ class Ack(LogMessage, frozen=True):
         log_id: see Mark.
         watermark: every change up to this one is settled: stored, or refused for good.
         refusals: the newest of those that were refused.
-        store: drawn by chance when the server's store was made; 0 from a server that does not say. One that
-            has lost its store acknowledges with another, and less.
+        store: random, drawn when the server's store was made; 0 if unknown. A server that has lost its store
+            acknowledges with another, and less.
     """
 
     limit = Limit("ack", MAX_SMALL_BYTES)
@@ -164,7 +163,7 @@ class LogAnswer(LogMessage, frozen=True):
         first: as asked.
         covered: how far the answer reaches; less than asked if that would be too much for one answer. What
             is missing up to here was superseded by a later change and is no longer kept.
-        changes: (sequence, encoded change), in order. They are not looked at.
+        changes: (sequence, encoded change), in order. They are not decoded.
     """
 
     limit = Limit("log answer", MAX_ROWS * MAX_CHANGE_BYTES + MAX_SMALL_BYTES)

@@ -48,7 +48,7 @@ class MemoryHub:
     """What a router is to Zenoh: the place where buses meet."""
 
     def __init__(self) -> None:
-        """Make a hub that nobody is on, and that loses nothing."""
+        """Make an empty hub without losses."""
         self._lock = threading.RLock()
         self._buses: list[MemoryBus] = []
         self._faults: dict[MemoryBus | None, Faults] = {}
@@ -57,13 +57,13 @@ class MemoryHub:
         self._clock = 0
 
     def disturb(self, faults: Faults, random: np.random.Generator, bus: MemoryBus | None = None) -> None:
-        """From now on treat messages badly, by the given source of chance: one bus's, or everybody's."""
+        """From now on disturb messages, with the given random numbers: of one bus, or of all."""
         with self._lock:
             self._faults[bus] = faults
             self._random = random
 
     def calm(self, bus: MemoryBus | None = None) -> None:
-        """From now on treat one bus's messages, or everybody's, well; those held back arrive, oldest last."""
+        """From now on deliver messages of one bus, or of all; those held back arrive, oldest last."""
         with self._lock:
             if bus is None:
                 self._faults.clear()
@@ -75,7 +75,7 @@ class MemoryHub:
                 self._deliver(sender, sample)
 
     def cut(self, bus: MemoryBus) -> None:
-        """Take a bus off the hub: it hears nothing, is heard by nobody, and the others see its tokens die."""
+        """Disconnect a bus from the hub: it sends and receives nothing, and its tokens disappear."""
         self._change(lambda: setattr(bus, "_cut", True))
 
     def restore(self, bus: MemoryBus) -> None:
@@ -94,7 +94,7 @@ class MemoryHub:
                 self._change(lambda: self._buses.remove(bus))
 
     def _change(self, change: Callable[[], object]) -> None:
-        """Do something that may alter who sees whom, and tell the watchers."""
+        """Make a change that may alter visibility, and notify the watchers."""
         with self._lock:
             change()
             tokens = [(bus, token.key) for bus in self._buses for token in bus._tokens]

@@ -85,7 +85,7 @@ class Watcher(Declared):
         self._seen: set[str] = set()
 
     def see(self, alive: set[str]) -> None:
-        """Tell what is different from what was told before."""
+        """Report the differences from the last report."""
         for key in sorted(self._seen - alive):
             self._dispatcher.presence(self._handler, key, False, self.wanted)
         for key in sorted(alive - self._seen):
@@ -123,7 +123,7 @@ class MemoryRequest:
         self._finish(self, decode_refusal(encode_refusal(reason, retry_after)))
 
     def abandon(self) -> None:
-        """Nobody will answer: the server has closed."""
+        """Mark as unanswered: the server has closed."""
         self._finish(self, None)
 
 
@@ -149,7 +149,7 @@ class Collector:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Nobody waits for more."""
+        """Stop waiting for replies."""
         with self._changed:
             self._missing = 0
             self._changed.notify_all()

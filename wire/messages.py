@@ -42,8 +42,8 @@ class KeptHistory:
     Attributes:
         happenings: in order.
         parts: maps that were one when it was written, each in one set.
-        apart: two maps each of which it was told that they are kept apart.
-        set_apart: maps of which it was told that they are set apart.
+        apart: pairs of maps that are reported as kept apart.
+        set_apart: maps that are reported as set apart.
     """
 
     happenings: tuple[MapEvent, ...] = ()

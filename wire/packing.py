@@ -73,7 +73,7 @@ def unpack(data: bytes, kind: Any, limit: Limit, read: Callable[[Any, Any], Any]
         read: returns values of types that msgspec does not know.
 
     Raises:
-        InvalidMessage: the message is invalid; one line says why.
+        InvalidMessage: the message is invalid; one line gives the reason.
     """
     try:
         return msgspec.convert(_fields(data, limit), kind, builtin_types=(bytes,), dec_hook=read)

@@ -16,8 +16,7 @@ POSTURE = struct.Struct("<9f")
 UPPER = np.triu_indices(3)
 
 MAX_MEASURED = 1e5
-"""Of what a robot itself places, nodes and ends of edges, m: a day's drive at 1 m/s, where float32 still
-tells centimetres."""
+"""Of nodes and ends of edges, m: a day's drive at 1 m/s, where float32 still resolves centimetres."""
 
 MAX_VARIANCE = 1e4
 """Largest eigenvalue of a covariance, m^2 or rad^2: who is off by 100 m knows nothing."""
@@ -57,7 +56,7 @@ def unpack_camera(data: bytes) -> Camera:
 def pack_pose(pose: PoseGaussian, farthest: float = MAX_POSITION) -> bytes:
     """Encode a pose: mean x, y, heading, then the covariance's upper triangle by rows, nine float32.
 
-    Greater variances become the greatest: that nothing is known can always be said.
+    Greater variances become the greatest.
 
     Raises:
         InvalidValue: a number is out of the range that `unpack_pose` accepts.

@@ -1,4 +1,4 @@
-"""What a server tells an agent of where its nodes lie in the merged map, as bytes."""
+"""Merged poses of an agent's nodes, from a server, as bytes."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PoseNews:
     """What has become of an agent's nodes.
 
     Attributes:
-        run: which life of the server this is, drawn by chance: its numbers begin anew when it starts again.
+        run: random number of this run of the server: its numbers begin again after a restart.
         after: number of the news that must be known before these; 0: these are all there is.
         sequence: number of these news. The same as `after` if there is nothing new.
         placed: nodes that lie elsewhere now, or in another component.

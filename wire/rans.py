@@ -199,7 +199,7 @@ class LaneWriter:
         self.states[lanes] = states
 
     def push_plain(self, numbers: Ints, widths: Ints, lanes: Lanes = EVERY) -> None:
-        """A number of 0 to 12 bits for each lane, all alike likely."""
+        """A number of 0 to 12 bits for each lane, all equally likely."""
         left, states = TOTAL_BITS - widths, self.states[lanes]
         # A frequency of 2^left: the state is divided by shifting it.
         out = widths - ((states >> widths) < (1 << left + self.size - TOTAL_BITS))
@@ -296,7 +296,7 @@ def pack_bits(numbers: Ints, widths: Ints) -> bytes:
     ends = np.cumsum(widths)
     begins = ends - widths
     length = -(-int(ends[-1]) // 8) if len(ends) else 0
-    # Each number lies in five bytes from the one where it begins; what shares a byte is added up.
+    # Each number covers five bytes from its first one; numbers that share a byte are added.
     moved, first = numbers << (40 - widths - (begins & 7)), begins >> 3
     packed = np.zeros(length + 5)
     for k in range(5):

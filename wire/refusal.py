@@ -10,7 +10,7 @@ from mapweave.wire.bus import Reply
 MARK = b"refused: "
 """Begins a refusal that a handler made; all other errors are Zenoh's own, like its "Timeout"."""
 LONGEST_PAUSE = 3600.0
-"""Longest time after which somebody may be told to ask again, s."""
+"""Longest retry time, s."""
 _END = b"\0"
 
 

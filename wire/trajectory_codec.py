@@ -1,4 +1,4 @@
-"""Wakes as packed bytes: 8 a moment, and 1 more a proximity sensor.
+"""Trajectory segments as packed bytes: 8 a moment, and 1 more a proximity sensor.
 
 ages      K int16   1e-2 s
 x, y      K int16   mm each
@@ -27,7 +27,7 @@ def pack_trajectory(wake: TrajectorySegment, reach: float) -> bytes:
     """Encode.
 
     Args:
-        wake: with at least one moment.
+        wake: a segment with at least one moment.
         reach: of the node's proximity sensors, m.
     """
     x, y, headings = wake.node_from_robot.T
@@ -40,7 +40,7 @@ def pack_trajectory(wake: TrajectorySegment, reach: float) -> bytes:
 
 
 def unpack_trajectory(data: bytes, ranges: Ranges) -> TrajectorySegment:
-    """Decode the wake of a node whose proximity sensors are those of its ranges.
+    """Decode the trajectory segment of a node whose proximity sensors are those of its ranges.
 
     Raises:
         InvalidMessage: it is none.
@@ -48,7 +48,7 @@ def unpack_trajectory(data: bytes, ranges: Ranges) -> TrajectorySegment:
     sensors = len(ranges)
     k, rest = divmod(len(data), 8 + sensors)
     if rest:
-        raise InvalidMessage(f"wake: {len(data)} bytes are none with {sensors} sensors")
+        raise InvalidMessage(f"trajectory: {len(data)} bytes are none with {sensors} sensors")
     ages, x, y = np.frombuffer(data, "<i2", 3 * k).astype(np.float64).reshape(3, k)
     headings = unpack_bearings(data[6 * k : 8 * k])
     distances = unpack_distances(data[8 * k :], ranges.reach).reshape(k, sensors)

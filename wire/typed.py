@@ -150,7 +150,7 @@ def decode(data: bytes, kind: type[Value], limit: Limit) -> Value:
     """Decode a message.
 
     Raises:
-        InvalidMessage: the message is invalid; one line says why.
+        InvalidMessage: the message is invalid; one line gives the reason.
     """
     schema: Any = kind
     value: Value = unpack(data, _schema(schema), limit, _read)
@@ -225,7 +225,7 @@ def _value(kind: Any, plain: Any) -> Any:
     if get_origin(kind) is np.ndarray:
         return _array(np.dtype(get_args(get_args(kind)[1])[0]), *_convert(plain, _Array))
     pair: Any = tuple[tuple(map(_schema, get_args(kind)))]  # type: ignore[misc]
-    # An empty map is packed as a map: nothing says what its keys would be.
+    # An empty map is packed as a map: the type of its keys is unknown.
     return dict(_convert(plain, list[pair] | _EmptyMap))
 
 

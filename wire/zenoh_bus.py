@@ -65,7 +65,7 @@ class ZenohBus:
             try:
                 session.put(key, payload, attachment=attachment or None)
             except zenoh.ZError:
-                # The session was closed between the look and the put: the same as no connection.
+                # The session was closed between the check and the put: the same as no connection.
                 log.debug("put on %s after the session was closed", key)
 
     def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
@@ -139,8 +139,8 @@ class ZenohBus:
         self._owner.dispatcher.close()
         for request in list(self._owner.open_requests):
             request.abandon()
-        for one in declared:
-            one.close()
+        for entity in declared:
+            entity.close()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
         with self._in_use_changed:
@@ -178,15 +178,15 @@ class ZenohBus:
         """Try until there is a router, then declare what was asked for in the meantime."""
         config = _config(self._settings)
         wait = RETRY_FIRST
-        told = False
+        reported = False
         while not self._closed.is_set():
             try:
                 session = zenoh.open(config)
             except zenoh.ZError as error:
-                if not told:
+                if not reported:
                     log.info("no router at %s yet, trying on", ", ".join(self._settings.endpoints))
                     log.debug("zenoh says: %s", error)
-                    told = True
+                    reported = True
                 self._closed.wait(wait)
                 wait = min(2 * wait, RETRY_LONGEST)
                 continue

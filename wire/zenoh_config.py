@@ -1,4 +1,4 @@
-"""The session settings: nothing is found by chance, everything is where the settings say."""
+"""The session settings: no scouting, only the configured endpoints."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from mapweave.wire.bus_settings import LEASE, RETRY_FIRST, RETRY_LONGEST, ROUTER
 ACCEPT_PENDING = 1000
 """Connections of which a router does not know yet who they are."""
 ACCEPT_TIMEOUT = 2.0
-"""s; a new connection that says nothing for this long is dropped. A handshake takes two round trips."""
+"""s; a silent new connection is dropped after this time. A handshake takes two round trips."""
 
 
 def session_values(settings: BusSettings) -> dict[str, object]:
@@ -24,9 +24,9 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "connect/retry": retry,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # There is nobody to scout for, so opening a router need not wait half a second for it.
+        # There is no scouting, so opening a router need not wait half a second for it.
         "scouting/delay": 1,
-        # With Zenoh's own 100 and 10 s, a hundred idle connections keep everybody else out for 10 s.
+        # With Zenoh's own 100 and 10 s, a hundred idle connections keep all others out for 10 s.
         "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT * 1e3),
         "transport/link/tx/lease": round(LEASE * 1e3),

@@ -27,7 +27,7 @@ class Owner:
         dispatcher: on which handlers run. Zenoh's own threads only enqueue there.
         lock: of `declared`.
         declared: in the order of declaration.
-        open_requests: questions that nobody has answered yet.
+        open_requests: questions without an answer yet.
     """
 
     dispatcher: Dispatcher
@@ -142,7 +142,7 @@ class Watcher(Declared):
 
     def _receive(self, sample: zenoh.Sample) -> None:
         key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
-        # History and news may both tell of the same token.
+        # History and news may both contain the same token.
         if alive != (key in self._seen):
             (self._seen.add if alive else self._seen.discard)(key)
             self._owner.dispatcher.presence(self._handler, key, alive, self.wanted)
@@ -179,7 +179,7 @@ class ZenohRequest:
         self._finish(lambda: self._query.reply_err(encode_refusal(reason, retry_after)))
 
     def abandon(self) -> None:
-        """Nobody will answer: the bus closes."""
+        """Mark as unanswered: the bus closes."""
         self._finish(lambda: None)
 
     def _finish(self, answer: Callable[[], None]) -> None:
@@ -197,8 +197,8 @@ class ZenohRequest:
 
 
 def read_reply(reply: zenoh.Reply) -> Reply | None:
-    """What a server answered; None for what Zenoh says by itself."""
+    """A server's answer; None for Zenoh's own replies."""
     if reply.ok is not None:
         return Reply(payload=reply.ok.payload.to_bytes())
-    # Zenoh's own "Timeout" is none: somebody has not answered, which the list shows by its length.
+    # Zenoh's own "Timeout" is no reply: a missing answer shows in the length of the list.
     return decode_refusal(reply.err.payload.to_bytes() if reply.err is not None else b"")

@@ -55,7 +55,7 @@ class LandmarkRefinement:
 SHARE = 0.7
 """A landmark is known better if its depth's sigma has fallen below this share of what it was."""
 LEAST = 5
-"""A node is told anew if so many of its landmarks are known better: it costs some 3 kB."""
+"""A node is written again if so many of its landmarks are refined: it costs some 3 kB."""
 FLOOR = (0.01, 0.015)
 """What a depth is never better than: m, and share of the depth; as when it was mapped."""
 DOUBT = 3.3

@@ -12,7 +12,7 @@ from mapweave.hybridmap.pose import Array, Pose2
 PATIENCE = 2
 """Steps without an image after which the filter says so."""
 PARALLAX_PX = 5.0
-"""Depths cannot be told before landmarks have moved by this much in the image, px."""
+"""Depths are unknown before landmarks have moved by this much in the image, px."""
 
 
 class FilterHealth:

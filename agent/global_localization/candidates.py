@@ -61,7 +61,7 @@ class Candidates:
 
     Attributes:
         places: best first.
-        ambiguous: why the best cannot be told from another, in words; empty if it can.
+        ambiguous: why the best cannot be distinguished from another, in words; else empty.
         reason: of the outcome, in words.
     """
 

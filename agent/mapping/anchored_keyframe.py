@@ -1,4 +1,4 @@
-"""Where mapping stands: the node that an episode has made or recognised, and the anchor from there."""
+"""The anchored keyframe: the node that an episode has made or recognised, and the anchor relative to it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
 @dataclass(eq=False)
 class AnchoredKeyframe:
-    """A node that was made or recognised, and where the current anchor stands from it.
+    """A node that was made or recognised, and the pose of the current anchor relative to it.
 
     Attributes:
         node: the node.

@@ -16,7 +16,7 @@ class EpisodeRequest(Enum):
     BEGIN = auto()
     """Take the current image as the first anchor."""
     ADD_VIEW = auto()
-    """Keep the current image as a node beside the anchor, for example at the far end of a drive."""
+    """Keep the current image as a further node, for example at the far end of a drive."""
     FINISH = auto()
     """End the episode: its views become nodes, and the current image becomes the next anchor."""
 

@@ -1,4 +1,4 @@
-"""Image acceptance: which images are new, and which are believed."""
+"""Image acceptance: which images are new, and which are accepted."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ STALE = (0.4, 0.5)
 
 
 class ImageAcceptance:
-    """Compares each image with the last one that was believed.
+    """Compares each image with the last accepted one.
 
-    An image that shows nothing of what the image before leads to expect is not believed: the tracks wait
-    where they were last seen, for the light to come back or somebody to step aside. If that does not happen
-    while the wheels stand, the robot was carried off.
+    An image that shows nothing of what the last one predicts is rejected: the tracks wait at their last
+    positions, for the light to come back or a person to step aside. If that does not happen while the wheels
+    do not move, the robot was carried off.
 
     Attributes:
-        moved: by the wheels since the last image that was believed.
-        strange: how many images in a row were not believed because they show other things.
+        moved: by the wheels since the last accepted image.
+        strange: how many images in a row were rejected because they show other things.
         blank: likewise because they show nothing.
         missing: how many images in a row did not come, or came a second time.
     """
@@ -38,11 +38,11 @@ class ImageAcceptance:
         self.moved = Pose2()
         self.strange = self.blank = self.missing = 0
         self._detector, self._settings = detector, settings
-        self._believed: NDArray[np.uint8] | None = None
+        self._accepted: NDArray[np.uint8] | None = None
 
     @property
     def doubtful(self) -> bool:
-        """Whether the last image was not believed, or the last images were missing."""
+        """Whether the last image was rejected, or the last images were missing."""
         return bool(self.strange or self.blank) or self.missing > DROPPED
 
     @property
@@ -57,7 +57,7 @@ class ImageAcceptance:
     def new_image(self, observation: Observation) -> NDArray[np.uint8] | None:
         """The image, unless none came or the last one came again."""
         if observation.image is None or self._is_frozen(observation.image):
-            self.missing += self._believed is not None
+            self.missing += self._accepted is not None
             return None
         self.missing = 0
         return observation.image
@@ -66,44 +66,44 @@ class ImageAcceptance:
         """The tracks as they are seen in a new image.
 
         Args:
-            tracker: the tracks in the last image that was believed. It is left as it is unless nothing can
-                be said of that image any more.
+            tracker: the tracks in the last accepted image. It is unchanged unless that image is too old
+                to compare with.
             image: the new one.
             expected: (N, 2) px, where the tracks should be.
 
         Returns:
-            None if the image is not believed.
+            None if the image is rejected.
         """
-        believed, (way, turn) = self._believed, STALE
-        if believed is None or np.hypot(self.moved.x, self.moved.y) > way or abs(self.moved.heading) > turn:
+        accepted, (way, turn) = self._accepted, STALE
+        if accepted is None or np.hypot(self.moved.x, self.moved.y) > way or abs(self.moved.heading) > turn:
             tracker.track(image, expected)
-            return self._believe(image, tracker)
-        overlap, moved = self._compared(tracker, image, believed, expected)
+            return self._accept(image, tracker)
+        overlap, moved = self._compared(tracker, image, accepted, expected)
         if overlap is FrameOverlap.SAME:
-            return self._believe(image, moved)
-        same_light, moved = self._compared(tracker, relit(image, believed), believed, expected)
+            return self._accept(image, moved)
+        same_light, moved = self._compared(tracker, relit(image, accepted), accepted, expected)
         if same_light is FrameOverlap.SAME:
             # The next image will be in the same light as this one really is.
             moved.relight(image)
-            return self._believe(image, moved)
+            return self._accept(image, moved)
         self.strange += overlap is FrameOverlap.STRANGE
         self.blank += overlap is FrameOverlap.BLANK
         return None
 
-    def _believe(self, image: NDArray[np.uint8], tracker: Tracker) -> Tracker:
+    def _accept(self, image: NDArray[np.uint8], tracker: Tracker) -> Tracker:
         self.strange = self.blank = 0
-        self._believed, self.moved = image, Pose2()
+        self._accepted, self.moved = image, Pose2()
         return tracker
 
     def _compared(
-        self, tracker: Tracker, image: NDArray[np.uint8], believed: NDArray[np.uint8], expected: Array
+        self, tracker: Tracker, image: NDArray[np.uint8], accepted: NDArray[np.uint8], expected: Array
     ) -> tuple[FrameOverlap, Tracker]:
-        """What an image has in common with the one before, and the tracks as they are followed into it."""
+        """What an image has in common with the last one, and the tracks followed into it."""
         moved = copy.copy(tracker)
         moved.track(image, expected)
-        found = np.full(expected.shape, np.nan)
-        found[np.isin(tracker.ids, moved.ids)] = moved.pixels
-        return self._detector.compare(believed, image, self.moved.heading, expected, found), moved
+        followed = np.full(expected.shape, np.nan)
+        followed[np.isin(tracker.ids, moved.ids)] = moved.pixels
+        return self._detector.compare(accepted, image, self.moved.heading, expected, followed), moved
 
     def _is_frozen(self, image: NDArray[np.uint8]) -> bool:
         """Whether an image is the last one again, to the last grey level, although the wheels have moved.
@@ -112,6 +112,6 @@ class ImageAcceptance:
         """
         moved = self.moved
         stands = max(abs(moved.x), abs(moved.y), abs(moved.heading)) < 1e-3
-        if stands or self._believed is None or not np.array_equal(image, self._believed):
+        if stands or self._accepted is None or not np.array_equal(image, self._accepted):
             return False
         return int(image.min()) < int(image.max())

@@ -31,8 +31,8 @@ def initial_inverse_depths(
 ) -> tuple[Array, Array]:
     """(N,) inverse depths 1/m of tracks, and their sigmas.
 
-    Tracks that were followed outside of the filter are triangulated against its trajectory. Its errors enter
-    all of them alike, which their covariances do not know.
+    Tracks that were followed outside of the filter are triangulated against its trajectory. Its errors are
+    common to all of them, which their covariances do not contain.
 
     Args:
         ids: (N,) the tracks.
@@ -45,7 +45,7 @@ def initial_inverse_depths(
     inverse_depths = np.full(len(ids), 1.0 / expected_depth)
     nearest = PRIOR_NEAR / max(camera.mount_height, 0.05)
     sigmas = np.maximum(PRIOR_SPREAD * inverse_depths, nearest)
-    poses, pixels = history.sightings(ids)
+    poses, pixels = history.observations(ids)
     if len(poses) >= 2:
         solved = triangulate(poses, pixels, camera, pixel_sigma, anchor_from_robot.vector)
         better = DOUBT * np.sqrt(solved.ray_covariances[:, 2, 2])

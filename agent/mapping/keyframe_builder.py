@@ -49,10 +49,10 @@ LOOP_TRIES = 4
 LOOP_SIGMA = 0.12
 """A loop closure known no better than this is left to the server, m."""
 LOOP_GATE = 25.0
-"""Chi-square with 3 degrees of freedom by which a loop closure may miss what the robot has measured on its
-way from the one node to the other: places may look alike."""
+"""Chi-square with 3 degrees of freedom by which a loop closure may differ from the robot's own
+measurement between the two nodes: places may look the same."""
 LOOP_FLOOR = (0.05, 0.03)
-"""Error of that way that its covariance does not tell of, m and rad."""
+"""Error of that measurement beyond its covariance, m and rad."""
 
 
 TURN_ONLY = 0.15
@@ -107,9 +107,9 @@ class KeyframeBuilder:
 
         Args:
             anchor: the view where the episode began.
-            leaves: views beside it.
-            tracking: what is known of the landmarks.
-            wayside: where the robot was since the last node: it is the anchor's wake, if that becomes a node.
+            leaves: further views of the episode.
+            tracking: the landmarks.
+            wayside: trajectory since the last node; it goes with the anchor, if that becomes a node.
 
         Returns:
             The anchor's node; None, and nothing is changed, if the anchor shows too little.
@@ -145,7 +145,7 @@ class KeyframeBuilder:
         self._last = AnchoredKeyframe(node, tracks, recognition.node_from_robot, recognition.evidence)
 
     def lose(self, moved: PoseGaussian) -> None:
-        """Nobody knows any more where the robot is; `old_anchor_from_robot` is where it was thought to be.
+        """The robot's pose is lost; `old_anchor_from_robot` is the last estimate.
 
         A map without nodes may begin anywhere.
         """
@@ -153,7 +153,7 @@ class KeyframeBuilder:
         self._last = None
 
     def move_anchor(self, moved: PoseGaussian) -> None:
-        """The next episode begins elsewhere: `old_anchor_from_new`, as the filter says."""
+        """Begin the next episode at another anchor: `old_anchor_from_new`, by the filter."""
         moved = self._sober(moved)
         self.map_from_anchor = self.map_from_anchor @ moved
         if self._last is not None:
@@ -187,42 +187,44 @@ class KeyframeBuilder:
         pose = self.map_from_anchor @ view.anchor_from_view
         d = self._description
         ranges = d.ranges(view.proximity)
-        wake = TrajectorySegment() if wayside is None else wayside.wake(view.stamp_ns, ranges)
-        node = Node(self._number(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius, ranges, wake)
+        segment = TrajectorySegment() if wayside is None else wayside.segment(view.stamp_ns, ranges)
+        node = Node(
+            self._number(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius, ranges, segment
+        )
         return AnchoredKeyframe(node, tracks)
 
     def _landmarks(self, view: View, tracking: Tracking) -> tuple[Landmarks, NDArray[np.int64]]:
         """The view's features with depth in the view: by the filter, else triangulated; and their tracks."""
         camera = self._camera
         depths, sigmas = np.full(len(view.tracks), np.nan), np.full(len(view.tracks), np.nan)
-        poses, pixels = tracking.history.sightings(view.tracks)
+        poses, pixels = tracking.history.observations(view.tracks)
         if len(poses) >= 2 and len(view.tracks):
             solved = triangulate(poses, pixels, camera, reference=view.anchor_from_view.mean.vector)
             fits = solved.chi2 < MOST_CHI2
             depths[fits], sigmas[fits] = solved.depths[fits], solved.depth_sigmas[fits]
         view_from_robot = view.anchor_from_view.mean.inverse() @ tracking.pose.mean
-        known = tracking.landmarks()
-        shared, row, seat = np.intersect1d(known.ids, view.tracks, return_indices=True)
+        estimates = tracking.landmarks()
+        shared, row, seat = np.intersect1d(estimates.ids, view.tracks, return_indices=True)
         if len(shared):
-            ahead = view_from_robot.apply(known.points_in_robot[row])[:, 0] - camera.mount_forward
+            ahead = view_from_robot.apply(estimates.points_in_robot[row])[:, 0] - camera.mount_forward
             axis = view_from_robot.rotation[0]
-            spread = np.einsum("i,nij,j->n", axis, known.covariances_in_robot[row][:, :2, :2], axis)
-            # What the filter has followed for a moment only is known better by all its sightings.
+            spread = np.einsum("i,nij,j->n", axis, estimates.covariances_in_robot[row][:, :2, :2], axis)
+            # Landmarks new to the filter are known better from all their observations.
             sure = (ahead > 0.05) & (np.sqrt(np.maximum(spread, 0.0)) < DEPTH_SHARE * ahead)
             depths[seat[sure]] = ahead[sure]
             sigmas[seat[sure]] = np.sqrt(np.maximum(spread[sure], 1e-12))
         with np.errstate(invalid="ignore"):
             good = np.flatnonzero((depths > 0.05) & (sigmas < DEPTH_SHARE * depths))
-        # Tracks err alike for a while, which neither filter nor triangulation knows.
+        # Tracks have common errors for a while, which neither filter nor triangulation models.
         sigmas = np.hypot(sigmas, DEPTH_FLOOR[0] + DEPTH_FLOOR[1] * depths)
         landmarks = Landmarks(
             view.features.pixels[good].astype(np.float32), view.features.codes[good],
             depths[good].astype(np.float32), sigmas[good].astype(np.float32),
         )  # fmt: skip
-        seen = np.isfinite(pixels[:, good, 0]).mean(axis=0) if len(poses) else np.ones(len(good))
-        likely = worth(seen, good / max(len(view.tracks), 1))
+        visible_share = np.isfinite(pixels[:, good, 0]).mean(axis=0) if len(poses) else np.ones(len(good))
+        likely = worth(visible_share, good / max(len(view.tracks), 1))
         kept = choose(landmarks, likely, camera, self._selection)[:MOST_LANDMARKS]
-        # Rounded now, the robot works with the same numbers as everybody who gets the node.
+        # Rounded now, the robot works with the same numbers as all receivers of the node.
         landmarks, order = settle(landmarks.take(kept), camera)
         return landmarks, view.tracks[good[kept[order]]]
 
@@ -256,24 +258,26 @@ class KeyframeBuilder:
 
     def _close_loops(self, node: Node) -> list[Edge]:
         """Recognise places of the own map (paper, section 5): each gives a new edge."""
-        near = []
-        for other in self.map.nodes.values():
-            between = other.map_from_robot.mean.inverse() @ node.map_from_robot.mean
+        nearby = []
+        for candidate in self.map.nodes.values():
+            between = candidate.map_from_robot.mean.inverse() @ node.map_from_robot.mean
             reach = float(np.hypot(between.x, between.y))
-            joined = self._last is not None and other.id == self._last.node.id and not self._last.evidence
+            joined = self._last is not None and candidate.id == self._last.node.id and not self._last.evidence
             if not joined and reach < LOOP_REACH and abs(between.heading) < LOOP_TURN:
-                near.append((reach, other))
+                nearby.append((reach, candidate))
         edges: list[Edge] = []
-        for _, other in sorted(near, key=lambda pair: pair[0])[:LOOP_TRIES]:
-            found = register(other, node, None, self._rng)
-            if found is None or found.evidence["sigma_xy"] >= LOOP_SIGMA:
+        for _, candidate in sorted(nearby, key=lambda pair: pair[0])[:LOOP_TRIES]:
+            recognition = register(candidate, node, None, self._rng)
+            if recognition is None or recognition.evidence["sigma_xy"] >= LOOP_SIGMA:
                 continue
-            if self._credible(other, node, found.node_from_robot):
-                pose, pairs, evidence = found.node_from_robot, found.pairs, found.evidence
-                edges.append(Edge(self._number(), other.id, node.id, pose, EdgeKind.LOOP, pairs, evidence))
+            if self._credible(candidate, node, recognition.node_from_robot):
+                pose, pairs, evidence = recognition.node_from_robot, recognition.pairs, recognition.evidence
+                edges.append(
+                    Edge(self._number(), candidate.id, node.id, pose, EdgeKind.LOOP, pairs, evidence)
+                )
         return edges
 
-    def _credible(self, earlier: Node, later: Node, found: PoseGaussian) -> bool:
+    def _credible(self, earlier: Node, later: Node, measured: PoseGaussian) -> bool:
         """Whether a recognition agrees with the robot's own way from the earlier node to the later one.
 
         The later pose is the earlier one and the way, L = E W; so the way's covariance is
@@ -286,5 +290,5 @@ class KeyframeBuilder:
         values, vectors = np.linalg.eigh(0.5 * (grown + grown.T))
         grown = (vectors * np.maximum(values, 0.0)) @ vectors.T
         xy, heading = LOOP_FLOOR
-        spread = grown + found.covariance + np.diag([xy**2, xy**2, heading**2])
-        return PoseGaussian(found.mean, spread).mahalanobis2(way) < LOOP_GATE
+        spread = grown + measured.covariance + np.diag([xy**2, xy**2, heading**2])
+        return PoseGaussian(measured.mean, spread).mahalanobis2(way) < LOOP_GATE

@@ -1,9 +1,9 @@
-"""Whether an image continues the one before: tells a robot that was carried off from one that has driven.
+"""Kidnap detection: whether an image continues the last one, or the robot was carried off.
 
-Between two frames a robot moves a little, so nearly all that it saw is still there, near where its wheels
-say. In simulated offices, corridors and warehouses, by good cameras and bad ones, at least 70 % of the points
-were found again from frame to frame, and a third where somebody walked past. After the robot had been put
-elsewhere it was at most 8 %, or 30 % where the same wall was still ahead.
+Between two frames a robot moves a little, so nearly all points are still visible, near their predictions by
+the wheels. In simulated offices, corridors and warehouses, with good and bad cameras, at least 70 % of the
+points were found again from frame to frame, and a third where a person walked past. After a kidnapping it was
+at most 8 %, or 30 % where the same wall was still ahead.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ LEAST_GAIN, MOST_GAIN = 0.5, 4.0
 made much fainter to be like a blank wall shows as little as that."""
 
 BLACK, WHITE = 5, 250
-"""Grey levels beyond which a camera tells nothing any more."""
+"""Grey levels beyond which a camera is saturated."""
 
 
 class FrameOverlap(Enum):
     """What an image shows, compared with one before it."""
 
     SAME = auto()
-    """The same things; or nothing that could tell."""
+    """The same things; or no evidence."""
     STRANGE = auto()
     """Other things."""
     BLANK = auto()
@@ -47,7 +47,7 @@ class FrameOverlap(Enum):
 
 
 LEAST = 8
-"""Points that should be in the image; with fewer nothing is said."""
+"""Points that should be in the image; with fewer there is no verdict."""
 SHARE = 0.45
 """If a smaller share of the expected points is found, the image shows something else."""
 BORDER_PX = 12.0
@@ -61,7 +61,7 @@ LEAST_CORNERS = 6
 MOST_CLIPPED = 0.5
 """An image of which a larger share is black or white shows nothing."""
 FEW_POINTS = 30
-"""With fewer points than this in the image, all of it is compared besides."""
+"""With fewer points than this, the whole image is compared as well."""
 COARSE = 8
 """Side of the squares over which images are averaged before they are compared as a whole, px."""
 ALIKE = 0.95
@@ -87,27 +87,27 @@ class KidnapDetector:
         now: NDArray[np.uint8],
         turn: float,
         expected: Array,
-        found: Array,
+        followed: Array,
     ) -> FrameOverlap:
-        """Tell whether an image shows what the image before leads to expect.
+        """Whether an image shows what the last one predicts.
 
         Args:
             before: (H, W) an image.
             now: (H, W) a later one.
             turn: rad, by how much the robot has turned in between, by its wheels.
             expected: (N, 2) px in the ideal image, where tracked points of `before` are expected now.
-            found: (N, 2) px, where they were found; NaN for those that were lost.
+            followed: (N, 2) px, where they were found; NaN for those that were lost.
         """
         if before.shape != now.shape:
             return FrameOverlap.SAME
-        same = self._same(expected, found)
+        same = self._same(expected, followed)
         if same is None:
             same = self._corners_agree(before, now, turn)
         if same is None:
             same = self._corners_agree(now, before, -turn)
         if same is not False:
             return FrameOverlap.SAME
-        # A dozen tracks on smooth shapes can all be lost at once; then the whole image has its say.
+        # A dozen tracks on smooth shapes can all be lost at once; then the whole image is compared.
         inside = int(self._camera.contains(expected, BORDER_PX).sum())
         few = LEAST <= inside < FEW_POINTS
         if few and self._alike(before, now, turn):
@@ -116,12 +116,12 @@ class KidnapDetector:
         blank = clipped > MOST_CLIPPED or len(self._corners(now)) < LEAST_CORNERS
         return FrameOverlap.BLANK if blank else FrameOverlap.STRANGE
 
-    def _same(self, expected: Array, found: Array) -> bool | None:
+    def _same(self, expected: Array, followed: Array) -> bool | None:
         """Whether enough points are near where they should be; None if too few should be in the image."""
         inside = self._camera.contains(expected, BORDER_PX)
         if inside.sum() < LEAST:
             return None
-        near = np.linalg.norm(found[inside] - expected[inside], axis=1) <= ASTRAY_PX
+        near = np.linalg.norm(followed[inside] - expected[inside], axis=1) <= ASTRAY_PX
         return bool(near.mean() >= SHARE)
 
     def _alike(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool:
@@ -134,13 +134,13 @@ class KidnapDetector:
         first = before[:, max(-aside, 0) : width - max(aside, 0)]
         second = now[:, max(aside, 0) : width - max(-aside, 0)]
         size = (first.shape[1] // COARSE, height // COARSE)
-        one = cv2.resize(first, size, interpolation=cv2.INTER_AREA).astype(np.float64)
-        two = cv2.resize(second, size, interpolation=cv2.INTER_AREA).astype(np.float64)
-        if abs(float(one.mean() - two.mean())) > SAME_LIGHT:
+        a = cv2.resize(first, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+        b = cv2.resize(second, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+        if abs(float(a.mean() - b.mean())) > SAME_LIGHT:
             return False
-        one, two = one - one.mean(), two - two.mean()
-        spread = float(one.std() * two.std())
-        return spread > LEAST_SPREAD**2 and float((one * two).mean()) > ALIKE * spread
+        a, b = a - a.mean(), b - b.mean()
+        spread = float(a.std() * b.std())
+        return spread > LEAST_SPREAD**2 and float((a * b).mean()) > ALIKE * spread
 
     def _corners_agree(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool | None:
         corners = self._corners(before)
@@ -151,9 +151,9 @@ class KidnapDetector:
         tracker.add(np.arange(len(corners), dtype=np.int64), corners)
         expected = turned(self._camera, tracker.pixels, turn)
         tracker.track(now, expected)
-        found = np.full(expected.shape, np.nan)
-        found[tracker.ids] = tracker.pixels
-        return self._same(expected, found)
+        followed = np.full(expected.shape, np.nan)
+        followed[tracker.ids] = tracker.pixels
+        return self._same(expected, followed)
 
     def _corners(self, image: NDArray[np.uint8]) -> Array:
         """(N, 2) px in the real image: the strongest corner of each cell that has one."""
@@ -171,8 +171,10 @@ class KidnapDetector:
 
 
 def relit(image: NDArray[np.uint8], like: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """An image as bright and as rich in contrast as another: somebody may have switched a lamp on or off."""
-    (mean, spread), (wanted, wanted_spread) = ((float(one.mean()), float(one.std())) for one in (image, like))
+    """An image as bright and as rich in contrast as another: a lamp may have been switched."""
+    (mean, spread), (wanted, wanted_spread) = (
+        (float(picture.mean()), float(picture.std())) for picture in (image, like)
+    )
     gain = min(max(wanted_spread / max(spread, 1.0), LEAST_GAIN), MOST_GAIN)
     return cv2.convertScaleAbs(image, alpha=gain, beta=wanted - gain * mean).astype(np.uint8, copy=False)
 

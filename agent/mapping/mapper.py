@@ -48,7 +48,7 @@ class Mapper:
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
     ) -> None:
-        """Start an empty map where the robot stands, or take up one that was begun; see Cartographer."""
+        """Start an empty map at the robot's pose, or resume one; see KeyframeBuilder."""
         settings = settings or AgentSettings()
         self.typical_depth = DEPTHS_PER_HEIGHT * max(description.camera.mount_height, 0.05)
         self._description = description
@@ -178,9 +178,9 @@ class Mapper:
             self._begin_at(anchor)
 
     def lose(self) -> None:
-        """Nobody knows any more where the robot is. What was seen since the anchor view is dropped.
+        """The robot's pose is lost. Observations since the anchor view are dropped.
 
-        With nodes it is astray and must `resume`; without any it may `begin` anew.
+        With nodes it is astray and must `resume`; without any it may `begin` again.
         """
         self._cartographer.lose(self._tracking.pose)
         self._tracking = Tracking(self._description, self._lens, self._settings)
@@ -211,7 +211,7 @@ class Mapper:
         self._tracking.follow(anchor, self.typical_depth)
 
     def leaf(self, observation: Observation) -> None:
-        """Keep the current image as a node beside the anchor, for example at the far end of a drive."""
+        """Keep the current image as a further node, for example at the far end of a drive."""
         view = self._take(observation, self._tracking.pose)
         if view is not None:
             self._tracking.remember(force=True)

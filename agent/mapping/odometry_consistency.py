@@ -1,8 +1,8 @@
 """Wheels against image: how far the two are apart since the view where an episode began.
 
-A wheel that slips a little is corrected by the image, and that is what the image is for. But when the two
-tell quite different stories nobody on board knows which is true: a wheel may spin or an encoder be dead, or
-somebody may carry a box through the view, which then seems to stand still while the room turns.
+The image corrects a wheel that slips a little. But when the two contradict each other strongly, it is unknown
+which is true: a wheel may spin or an encoder be dead, or a person may carry a box through the view, which
+then seems to be fixed while the room turns.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ SHARE = 0.1
 
 
 class OdometryConsistency:
-    """Reckons by the wheels alone, beside the filter."""
+    """Dead reckoning by the wheels alone, in parallel to the filter."""
 
     def __init__(self) -> None:
         """The two agree."""
         self.settle()
 
     def settle(self) -> None:
-        """Begin anew from where the filter is."""
+        """Restart at the filter's pose."""
         self._reckoned = Pose2()
         self._way = self._turned = 0.0
 
@@ -39,5 +39,5 @@ class OdometryConsistency:
     def with_filter(self, anchor_from_robot: Pose2) -> bool:
         """Whether the filter's pose and the wheels' are further apart than wheels and image can be."""
         turned = abs(wrap_angle(anchor_from_robot.heading - self._reckoned.heading))
-        far = math.hypot(anchor_from_robot.x - self._reckoned.x, anchor_from_robot.y - self._reckoned.y)
-        return far > APART[0] + SHARE * self._way or turned > APART[1] + SHARE * self._turned
+        distance = math.hypot(anchor_from_robot.x - self._reckoned.x, anchor_from_robot.y - self._reckoned.y)
+        return distance > APART[0] + SHARE * self._way or turned > APART[1] + SHARE * self._turned

@@ -11,8 +11,8 @@ from mapweave.hybridmap.pose import Array
 class PredictionOffset:
     """Tracks that are followed and do not correct the filter: too few, or all in one corner.
 
-    Meanwhile the wheels are off by more and more, and the filter expects all tracks elsewhere. Where they
-    come to be from one image to the next it still knows.
+    In between the wheels' error grows, and the filter's predictions of all tracks are off by a common motion.
+    The motion from one image to the next it still predicts.
     """
 
     def __init__(self) -> None:
@@ -36,6 +36,6 @@ class PredictionOffset:
         out = np.zeros((len(ids), 2))
         if len(self._ids):
             place = np.clip(np.searchsorted(self._ids, ids), 0, len(self._ids) - 1)
-            known = self._ids[place] == ids
-            out[known] = self._aside[place[known]]
+            matching = self._ids[place] == ids
+            out[matching] = self._aside[place[matching]]
         return out

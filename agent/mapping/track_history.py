@@ -13,16 +13,16 @@ from mapweave.hybridmap.pose import Array, Pose2
 class TrackHistory:
     """Pixels of tracks with the poses from which they were seen.
 
-    A sighting is kept when the robot has moved enough since the last one: standing still adds nothing.
+    An observation is kept when the robot has moved enough since the last one: standing still adds nothing.
     """
 
     def __init__(self, step: float = 0.02, turn_step: float = 0.02, most: int = 80) -> None:
-        """Set how far apart sightings are.
+        """Set how far apart observations are.
 
         Args:
             step: m.
             turn_step: rad.
-            most: sightings kept; of more, every second one is forgotten.
+            most: observations kept; of more, every second one is dropped.
         """
         self._step = step
         self._turn_step = turn_step
@@ -34,7 +34,7 @@ class TrackHistory:
     def record(
         self, anchor_from_robot: Pose2, ids: NDArray[np.int64], pixels: Array, force: bool = False
     ) -> None:
-        """Keep a sighting, ids (N,) and pixels (N, 2) px, if the robot has moved or it is forced."""
+        """Keep an observation, ids (N,) and pixels (N, 2) px, if the robot has moved or it is forced."""
         if self._poses and not force:
             moved = self._poses[-1].inverse() @ anchor_from_robot
             if math.hypot(moved.x, moved.y) < self._step and abs(moved.heading) < self._turn_step:
@@ -46,8 +46,8 @@ class TrackHistory:
             for column in (self._poses, self._ids, self._pixels):
                 del column[1::2]
 
-    def sightings(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
-        """All sightings of some tracks.
+    def observations(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
+        """All observations of some tracks.
 
         Args:
             ids: (N,) tracks.
@@ -59,23 +59,23 @@ class TrackHistory:
         pixels = np.full((len(self._poses), len(ids), 2), np.nan)
         order = np.argsort(ids)
         sorted_ids = ids[order]
-        for row, (seen, at) in enumerate(zip(self._ids, self._pixels, strict=True)):
+        for row, (track_ids, at) in enumerate(zip(self._ids, self._pixels, strict=True)):
             if not len(ids):
                 break
-            place = np.clip(np.searchsorted(sorted_ids, seen), 0, len(ids) - 1)
-            hit = sorted_ids[place] == seen
+            place = np.clip(np.searchsorted(sorted_ids, track_ids), 0, len(ids) - 1)
+            hit = sorted_ids[place] == track_ids
             pixels[row, order[place[hit]]] = at[hit]
         poses = np.array([p.vector for p in self._poses]).reshape(-1, 3)
         return poses, pixels
 
     def reanchor(self, old_from_new: Pose2, alive: NDArray[np.int64]) -> None:
-        """Express everything in a new anchor's frame and keep only sightings of the tracks still alive."""
+        """Express everything in a new anchor's frame and keep only observations of the present tracks."""
         new_from_old = old_from_new.inverse()
         poses, ids, pixels = self._poses, self._ids, self._pixels
         self._poses, self._ids, self._pixels = [], [], []
-        for pose, seen, at in zip(poses, ids, pixels, strict=True):
-            mask = np.isin(seen, alive)
+        for pose, track_ids, at in zip(poses, ids, pixels, strict=True):
+            mask = np.isin(track_ids, alive)
             if mask.any():
                 self._poses.append(new_from_old @ pose)
-                self._ids.append(seen[mask])
+                self._ids.append(track_ids[mask])
                 self._pixels.append(at[mask])

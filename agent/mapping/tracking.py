@@ -29,16 +29,16 @@ from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
 
-# What each stage of a step gives to the next. A stage takes the value that only the one before makes.
+# The values between the stages of a step. A stage takes the value that only the stage before makes.
 
 
 class FollowedImage(NamedTuple):
-    """An image that is believed, and the filter's landmarks that were not followed into it.
+    """An accepted image, and the filter's landmarks that were not followed into it.
 
     Attributes:
         image: of the camera.
         lost: (N,) tracks.
-        templates: what these looked like.
+        templates: their patches.
     """
 
     image: NDArray[np.uint8]
@@ -100,7 +100,7 @@ class Tracking:
 
     Attributes:
         history: where each track was seen from.
-        acceptance: which images are believed.
+        acceptance: which images are accepted.
     """
 
     def __init__(self, description: RobotDescription, lens: Lens, settings: AgentSettings) -> None:
@@ -137,7 +137,7 @@ class Tracking:
 
     @property
     def report(self) -> TrackQuality:
-        """What the tracks are worth after the last image that was believed."""
+        """Quality of the tracks after the last accepted image."""
         tracker = self._tracker
         return TrackQuality.of(
             self._camera, tracker.pixels, tracker.ages, tracker.held, self._correction.misses_px
@@ -151,19 +151,19 @@ class Tracking:
     @property
     def health(self) -> tuple[Health, str]:
         """What holds the pose up, and in words what is wrong; empty if nothing is."""
-        told, images, unused = self._filter.health, self.acceptance, self._correction.unused
+        filter_health, images, unused = self._filter.health, self.acceptance, self._correction.unused
         if images.missing or images.strange or images.blank:
-            return told
+            return filter_health
         if unused is None:
             # Images came, but showed nothing to go by; a new view's landmarks are seen in the next.
-            return (Health.GOOD, "") if told[0] is Health.NO_IMAGE else told
+            return (Health.GOOD, "") if filter_health[0] is Health.NO_IMAGE else filter_health
         if not unused:
             return Health.BLIND, "no landmark in view"
         return Health.FEW, f"{unused} landmarks in view are too few or too near to each other to go by"
 
     @property
     def disputed(self) -> bool:
-        """Whether wheels and images tell stories since the anchor that cannot both be true."""
+        """Whether wheels and images have contradicted each other since the anchor."""
         return self._dispute.with_filter(self._filter.pose.mean)
 
     @property
@@ -179,7 +179,7 @@ class Tracking:
     def step(self, observation: Observation) -> None:
         """Predict by the wheels, follow the tracks, correct by what they show.
 
-        Each stage takes the value that the one before gives, so they cannot change places.
+        Each stage takes the value of the stage before, so their order is fixed.
         """
         self._predict(observation.odometry)
         followed = self._follow(self.acceptance.new_image(observation))
@@ -197,7 +197,7 @@ class Tracking:
         self.history.record(self._filter.pose.mean, self._tracker.ids, self._tracker.pixels, force)
 
     def take(self, observation: Observation, features: Features, anchor_from_view: PoseGaussian) -> View:
-        """Make a view of an image that was just tracked, and tell which of its features are tracks."""
+        """Make a view of an image that was just tracked, and match its features with tracks."""
         tracks = associate(features, self._tracker.ids, self._tracker.raw, ASSOCIATE_PX)
         return View(observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity)
 
@@ -215,7 +215,7 @@ class Tracking:
         self.remember(force=True)
 
     def reanchor(self) -> PoseGaussian:
-        """Begin anew from here; returns `old_anchor_from_new`."""
+        """Restart at the present pose; returns `old_anchor_from_new`."""
         moved = self._filter.reanchor()
         self._dispute.settle()
         self.history.reanchor(moved.mean, self._tracker.ids)
@@ -230,7 +230,7 @@ class Tracking:
         self.acceptance.predict(odometry.motion())
 
     def _follow(self, image: NDArray[np.uint8] | None) -> FollowedImage | None:
-        """Follow the tracks into a new image; None without one that is believed: then they stay."""
+        """Follow the tracks into a new image; None without an accepted one: then they stay."""
         if image is None:
             return None
         ids, templates = self._tracker.ids, self._tracker.templates
@@ -250,12 +250,12 @@ class Tracking:
             expected = self._filter.predict_pixels(self._hidden.ids)
             # What has left the view, or is leaving it, is not hidden.
             margin = BORDER_PX + HALF_PX
-            far_in = np.array([self._camera.width, self._camera.height]) - margin
-            inside: NDArray[np.bool_] = np.asarray(((expected >= margin) & (expected < far_in)).all(axis=1))
+            inner = np.array([self._camera.width, self._camera.height]) - margin
+            inside: NDArray[np.bool_] = np.asarray(((expected >= margin) & (expected < inner)).all(axis=1))
             self._hidden.keep(inside)
-            found, raw, patches = self._hidden.seek(followed.image, self._lens.distort(expected[inside]))
-            if len(found):
-                self._tracker.add(found, raw, patches)
+            redetected, raw, patches = self._hidden.seek(followed.image, self._lens.distort(expected[inside]))
+            if len(redetected):
+                self._tracker.add(redetected, raw, patches)
         return LiveTracks(np.concatenate([self._tracker.ids, self._hidden.ids]))
 
     def _hold(self, alive: LiveTracks) -> HeldTracks:

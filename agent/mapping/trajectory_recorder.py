@@ -16,7 +16,7 @@ PERIOD = 1.0
 class TrajectoryRecorder:
     """Moments since the last node, seen from the mapper's anchor.
 
-    Nobody can compare the times of a robot whose clock has no name: it keeps nothing.
+    Times of a robot whose clock has no name cannot be compared: it keeps nothing.
     """
 
     def __init__(self, description: RobotDescription) -> None:
@@ -25,10 +25,10 @@ class TrajectoryRecorder:
         self.clear(0)
 
     def clear(self, stamp_ns: int) -> None:
-        """Forget all: the moments are a node's now, or nobody knows any more where they were.
+        """Drop all moments: they belong to a node now, or their poses are lost.
 
         Args:
-            stamp_ns: of the anchor's image, which needs no moment beside it.
+            stamp_ns: of the anchor's image, which needs no moment of its own.
         """
         self._newest = stamp_ns
         self._stamps: list[int] = []
@@ -54,22 +54,24 @@ class TrajectoryRecorder:
         new_from_old = old_from_new.inverse()
         self._poses = [new_from_old @ pose for pose in self._poses]
 
-    def wake(self, stamp_ns: int, ranges: Ranges) -> TrajectorySegment:
+    def segment(self, stamp_ns: int, ranges: Ranges) -> TrajectorySegment:
         """What was kept, for a node at the anchor.
 
         Args:
             stamp_ns: of the node's image.
-            ranges: what its proximity sensors saw; without any, the wake has no readings.
+            ranges: what its proximity sensors saw; without any, the segment has no readings.
         """
         if not self._stamps:
             return TrajectorySegment()
         ages = (np.array(self._stamps, np.int64) - stamp_ns) * 1e-9
         poses = np.array([pose.vector for pose in self._poses])
         distances = np.zeros((len(ages), len(ranges)))
-        for k, one in enumerate(self._readings):
-            # What is missing is as if something stood before the sensor: it tells of nothing behind.
+        for k, readings in enumerate(self._readings):
+            # A missing reading is like an obstacle at the sensor: nothing is known behind it.
             distances[k] = (
-                seen.distances if len(seen := self._description.ranges(one)) == len(ranges) else 0.0
+                ranges_.distances
+                if len(ranges_ := self._description.ranges(readings)) == len(ranges)
+                else 0.0
             )
         good = (np.abs(ages) < LONGEST) & (np.abs(poses[:, :2]) < FURTHEST).all(axis=1)
         return TrajectorySegment(ages[good], poses[good], distances[good])

@@ -31,7 +31,7 @@ class View:
 
 
 def associate(features: Features, ids: NDArray[np.int64], raw: Array, within_px: float) -> NDArray[np.int64]:
-    """Tell which features are points that are tracked already: nearest to each other, and near.
+    """Match features with tracked points: mutually nearest, and near.
 
     Args:
         features: of an image.

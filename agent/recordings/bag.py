@@ -69,7 +69,7 @@ class Bag:
             self._reader.open()
         except Exception as error:  # noqa: BLE001  # parsers raise whatever a damaged file leads them to
             raise DeviceError(f"{path}: not a bag that can be read ({_line(error)})") from None
-        # Recordings are read as long as anybody holds them; the file is let go with the last one.
+        # The file stays open as long as the recording is referenced.
         weakref.finalize(self, self._reader.close)
         self.topics = tuple(
             sorted(
@@ -112,7 +112,7 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def bag(path: Path, options: RecordingOptions) -> Recording:
-    """Open a bag: its images and its odometry, by the topics' types where nobody names them.
+    """Open a bag: its images and its odometry, by the topics' types if no names are given.
 
     Raises:
         DeviceError: something is missing or wrong; one line says which topics there are.

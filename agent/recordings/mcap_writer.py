@@ -40,7 +40,7 @@ def check_new(folder: Path) -> None:
 
 
 class McapWriter:
-    """Writes what a robot senses and what it is told to do, in a thread of its own.
+    """Writes a robot's observations and commands, in a thread of its own.
 
     Topics: /camera/image/compressed, /camera/camera_info, /odom, /tf_static, /cmd_vel, /bumper, /proximity/N.
     """

@@ -40,7 +40,7 @@ class RecordingOptions:
             height_given: whether its mount is, too.
 
         Raises:
-            DeviceError: nobody says what camera it is, or how high.
+            DeviceError: the camera or its height is not given.
         """
         if self.camera is not None:
             return read_camera(self.camera)

@@ -22,7 +22,7 @@ def video(path: Path, options: RecordingOptions) -> Recording:
     """Open a video. Stamps begin at 0 with the first frame.
 
     Raises:
-        DeviceError: it cannot be read, or nobody says what camera it is or how it moved.
+        DeviceError: it cannot be read, or its camera or odometry is not given.
     """
     images = video_images(path)
     camera, distortion = options.camera_of(path, None)

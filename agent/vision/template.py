@@ -99,7 +99,7 @@ SIGMA_PX = 4.0
 """Standard deviation of the Gaussian by which pixels far from the point count less, px: they are on another
 surface, or on a slanted one, more often than those near it."""
 MOST_SCALE = 1.7
-"""Once a patch has grown or shrunk by more than this factor it is cut anew from the present image."""
+"""Once a patch has grown or shrunk by more than this factor it is cut again from the present image."""
 
 
 class TemplateMatcher:

@@ -1,6 +1,6 @@
 """Which command measures what: one stored result each.
 
-Seeds from 700 on were used for nothing before. `DATA` stands for the folder of recordings (`--data`).
+Seeds from 700 on were used for nothing before. `DATA` is the folder of recordings (`--data`).
 """
 
 from __future__ import annotations

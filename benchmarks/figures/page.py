@@ -66,9 +66,9 @@ def _rules(rules: Sequence[Rule], results: Mapping[str, Result]) -> str:
         "| rule | file | what fails without it | command |", "|---|---|---|---|",
     ]  # fmt: skip
     for rule in rules:
-        told = "; ".join(filled(words, _of(results, source).figures) for words, source in rule.fails)
+        reasons = "; ".join(filled(words, _of(results, source).figures) for words, source in rule.fails)
         commands = ", ".join(dict.fromkeys(_command(_of(results, source)) for _, source in rule.fails))
-        lines.append(f"| {rule.name} | `{rule.file}` | {told} | {commands} |")
+        lines.append(f"| {rule.name} | `{rule.file}` | {reasons} | {commands} |")
     return "\n".join(lines)
 
 

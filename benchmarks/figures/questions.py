@@ -171,7 +171,7 @@ LOST = Question(
             "relocalize",
         ),
         Row(
-            "views of twin rooms, and of unknown buildings, that are told a place, among 1 000 and 100 000",
+            "views of twin rooms, and of unknown buildings, answered with a place, among 1 000 and 100 000",
             "{sizes/1000/wrong/twins:.1%}, {sizes/1000/wrong/nowhere:.1%}; "
             "{sizes/100000/wrong/twins:.1%}, {sizes/100000/wrong/nowhere:.1%} of {queries} each",
             "relocalize",
@@ -297,12 +297,12 @@ def _trials(rule: str, scenario: str) -> tuple[str, str]:
 
 
 def _places(rule: str) -> tuple[str, str]:
-    """What lost robots are told without a rule, and with all."""
-    told = (
+    """Answers to lost robots without a rule, and with all."""
+    kinds = (
         "{places/WAY/wrong/twins:.1%} of twin rooms, {places/WAY/wrong/nowhere:.1%} of unknown buildings, "
         "recall {places/WAY/recall_at_1:.1%}"
     )
-    words = f"told a place: {told.replace('WAY', rule)} instead of {told.replace('WAY', 'all rules')}"
+    words = f"answered: {kinds.replace('WAY', rule)} instead of {kinds.replace('WAY', 'all rules')}"
     return words, "rules_places"
 
 
@@ -371,7 +371,7 @@ RULES = (
         "mapserver/relocalization/place_hypotheses.py",
         (
             (
-                "views of known places that are told another one: "
+                "views of known places that are answered with another one: "
                 "{places/lonely recognition/wrong_place:.2%} instead of {places/all rules/wrong_place:.2%}",
                 "rules_places",
             ),

@@ -10,7 +10,7 @@ links alone (`good`), joined by no true link (`joined_falsely`), and how many fa
 in files are split among four robots: chi-square over the batch optimum. Trials are those of
 `benchmarks.merge_sim`; what their robots mapped is merged once more without each rule. Places are those of
 `benchmarks.relocalize`: recall of near views, and the share of views of twin rooms and of unknown buildings
-that are told a place.
+that are answered with a place.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def places(seed: int, count: int, progress: Progress) -> dict[str, dict[str, Any
 
     def answers() -> dict[str, Any]:
         replies = bench.asked("questions", Relocalizer(index, bench.node, bench.merged))
-        told = figures(replies)
+        values = figures(replies)
         wanted = ("recall_at_1", "false_accept", "wrong_place", "ambiguous", "cpu_p50_ms")
-        return {**{name: told[name] for name in wanted}, "wrong": wrong_by_kind(replies)}
+        return {**{name: values[name] for name in wanted}, "wrong": wrong_by_kind(replies)}
 
     return by_rule(PLACE_RULES, answers)
 

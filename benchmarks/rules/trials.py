@@ -54,7 +54,7 @@ def trial(name: str, seed: int) -> dict[str, dict[str, int]]:
 
 
 def _own_changes(whole: HybridMap) -> list[tuple[MapId, ChangeBody]]:
-    """What robots have told, without what the merge has made of it."""
+    """The robots' logs, without the results of the merge."""
     out: list[tuple[MapId, ChangeBody]] = [
         (node.id.map, NodePut(node)) for _, node in sorted(whole.nodes.items())
     ]

@@ -36,10 +36,10 @@ def measured(
     for name, run, kind in product(scenes, range(runs), kinds):
         fleet = draw_fleet(seed + run, SCENES[name], Fault(kind))
         views = lost_views(fleet, SCENES[name], queries, seed + run)
-        told = {WITHOUT: outcome(fleet, views, frozenset({ODD})), WITH: outcome(fleet, views)}
+        outcomes = {WITHOUT: outcome(fleet, views, frozenset({ODD})), WITH: outcome(fleet, views)}
         with switched_off(NO_SEARCH):
-            told[UNSEARCHED] = outcome(fleet, views)
-        for way, one in told.items():
+            outcomes[UNSEARCHED] = outcome(fleet, views)
+        for way, one in outcomes.items():
             answers = {str(sort): one[str(sort)] for sort in AnswerOutcome}
             out[way].update(
                 answers | {"fleets": 1, "in_pieces": int(one["parts"] > 1), "found": len(one["found"])}

@@ -1,14 +1,14 @@
-"""The map server for people: a photograph in, JSON out, why maps are one, why routes lead so, and pages.
+"""The map server for people: a photograph in, JSON out, explanations of merges and routes, and pages.
 
     GET /             the page for photographs
-    GET /why          the page that says why maps are one, or are not
+    GET /why          the page that explains why maps are one, or are not
     GET /status       what the server holds, JSON
-    GET /history      what has joined, come apart and been ruled, with dates, JSON
+    GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
-    GET /route        why a route leads as it does: ?a=r0.1.17&b=r1.1.5 from the one to the other, JSON
+    GET /route        explanation of the route from a to b: ?a=r0.1.17&b=r1.1.5, JSON
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
-Whatever goes wrong comes back as one JSON object with `error`. A server that is busy answers 503 with
+An error comes back as one JSON object with `error`. A busy server answers 503 with
 Retry-After in whole seconds and `retry_after` exactly. The pages are in `static/`.
 """
 
@@ -50,30 +50,30 @@ PAGES = {"/": "index.html", "/why": "why.html"}
 MOST_BYTES = 16 * 2**20
 """Longest body, 16 MiB."""
 PATIENCE = 10.0
-"""How long a body may take to come, and an answer to be found, s."""
+"""Time limit for a body, and for an answer, s."""
 MOST_AT_ONCE = 32
 """Questions that are served at once; the next one is refused."""
 WHOLE = "mapweave.whole"
-"""In the scope of a request whose body has come to its end."""
+"""Set in the scope of a request whose body is complete."""
 METHODS = dict.fromkeys((*PAGES, "/status", "/history", "/explain", "/route"), "GET") | {
     "/relocalize": "POST"
 }
 
 
 class Answering(Protocol):
-    """What is asked, as of a MapServer: from any thread; what cannot be answered raises a MapweaveError."""
+    """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         """Where a view was taken."""
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
-        """Why maps are one, or a route leads so."""
+        """Explain a merge or a route."""
 
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does."""
 
     def history(self) -> tuple[MapEvent, ...]:
-        """What has happened."""
+        """The history of the maps."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -104,11 +104,11 @@ class Web(HttpThread):
         Args:
             address: host and port; port 0 takes any.
             server: answers.
-            patience: how long a body may take to come, and an answer to be found, s.
+            patience: time limit for a body, and for an answer, s.
             limits: of connections.
 
         Raises:
-            NotConnected: nobody can listen there, for example since the port is taken.
+            NotConnected: the port cannot be used, for example since it is taken.
         """
         app = SameSite(Questions(server, patience).app, address[0])
         try:
@@ -141,7 +141,7 @@ class Reply(Response):
 
 
 async def _hear_out(scope: Scope, receive: Receive) -> None:
-    # To read from a peer that waits to be told to go on would tell it so.
+    # Reading from a peer that waits for "100 Continue" would send it.
     if any(name == b"expect" for name, _ in scope["headers"]):
         return
     try:
@@ -189,7 +189,7 @@ class Questions:
     def _answering(
         self, answer: Callable[[Request], Awaitable[Mapping[str, Any]]]
     ) -> Callable[[Request], Awaitable[Response]]:
-        """Tell what comes of a question, or why nothing does."""
+        """Answer a question, or refuse it with a reason."""
 
         async def endpoint(request: Request) -> Response:
             if self._open >= MOST_AT_ONCE:
@@ -244,7 +244,7 @@ class Questions:
         return json_values(await self._result(lambda: self._server.locate(photo.view, ticket)))
 
     async def _result(self, ask: Callable[[], Future[Any]]) -> Any:
-        """Ask on a thread, since in lock-step the asker does the work; then wait for the answer."""
+        """Ask on a thread, since in lock-step the asking thread does the work; then wait for the answer."""
         async with asyncio.timeout(self._patience):
             return await asyncio.wrap_future(await run_in_threadpool(ask))
 
@@ -264,7 +264,7 @@ class Questions:
 def _length(request: Request) -> int:
     text = request.headers.get("Content-Length", "")
     if "Transfer-Encoding" in request.headers or not (text.isascii() and text.isdigit()):
-        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "say how long the image is with Content-Length")
+        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the image with Content-Length")
     if len(text) > 12 or int(text) > MOST_BYTES:
         raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES >> 20} MiB are taken")
     if int(text) == 0:

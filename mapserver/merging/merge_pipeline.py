@@ -39,7 +39,7 @@ class MergePipeline:
         """See `Islands.merge`.
 
         Raises:
-            InvalidValue: a node lies where nobody could be told of it.
+            InvalidValue: a node's pose is out of the range of messages.
         """
         merged = self._islands.merge(maps, verdicts, touched, rulings)
         for graph in merged.graphs:

@@ -33,10 +33,9 @@ log = logging.getLogger(__name__)
 class Merger:
     """Holds every robot's map, and merges them from what comparing their nodes has found.
 
-    Work is done where it is cheapest: a new node is compared with its best candidates when it comes; the
-    merged map is made when it is asked for and something has changed, and then only where it has. New
-    nodes are not compared with such as were superseded on another day. But for that the outcome depends on
-    what the maps hold, not on the order in which it came.
+    A new node is compared with its best candidates when it comes; the merged map is made when it is requested
+    and something has changed, and then only where it has. New nodes are not compared with nodes superseded on
+    another day. Except for that the result depends on the maps, not on the order of changes.
     """
 
     def __init__(self, places: PlaceDatabase | None = None, settings: MergeSettings | None = None) -> None:
@@ -64,19 +63,19 @@ class Merger:
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
         self._changed: set[MapId] = set()
-        self._rulings = ManualConstraints()
+        self._constraints = ManualConstraints()
         self._merged = MergedMap.empty()
         self._dirty = False
 
     @property
     def uncompared(self) -> int:
-        """Nodes that were read and for which nobody has yet looked which others are like them."""
+        """Nodes that were read and whose similar nodes are not searched yet."""
         return self._comparisons.uncompared
 
     @property
     def compared(self) -> tuple[int, int]:
         """Nodes that were compared with all others, and pairs of them on which there is a verdict."""
-        nodes = sum(len(one.nodes) for one in self.maps.values())
+        nodes = sum(len(hybrid_map.nodes) for hybrid_map in self.maps.values())
         return nodes - self.uncompared, len(self._comparisons)
 
     @property
@@ -85,34 +84,36 @@ class Merger:
         return self._comparisons.recollecting
 
     def recollect(self, findings: VerificationCache) -> None:
-        """Believe what was found before of nodes that are just as they were; what is not read by then."""
+        """Use earlier results for nodes that are unchanged when they are read."""
         self._comparisons.recollect(findings)
 
     def findings(self) -> VerificationCache:
         """What was found of all nodes that are compared."""
-        return self._comparisons.findings(node for one in self.maps.values() for node in one.nodes.values())
+        return self._comparisons.findings(
+            node for hybrid_map in self.maps.values() for node in hybrid_map.nodes.values()
+        )
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
-        one = self.maps.get(node_id.map)
-        return None if one is None else one.nodes.get(node_id)
+        hybrid_map = self.maps.get(node_id.map)
+        return None if hybrid_map is None else hybrid_map.nodes.get(node_id)
 
     def on_change(self, change: Change) -> None:
         """Take in one change, in the order of its log."""
         self.counters.changes += 1
         self.apply(change.map, change.body)
         if isinstance(change.body, NodePut):
-            # Which nodes of its own map are no neighbours its edges tell, and they come after it.
+            # A node's neighbours in its own map follow from its edges, which come after it.
             pairs = self._comparisons.pairs_of(change.body.node.id)
             self._comparisons.verify(pair for pair in pairs if pair[0].map != pair[1].map)
 
-    def apply(self, map_id: MapId, body: ChangeBody) -> None:
+    def apply(self, map_id: MapId, change: ChangeBody) -> None:
         """Take in a change without comparing nodes yet."""
-        before = self._comparisons.pairs_of(body.node.id) if isinstance(body, NodePut) else []
-        self._replay(map_id, body)
-        if isinstance(body, NodePut):
-            self.places.put([body.node])
-            self._comparisons.put(body.node, before)
+        before = self._comparisons.pairs_of(change.node.id) if isinstance(change, NodePut) else []
+        self._replay(map_id, change)
+        if isinstance(change, NodePut):
+            self.places.put([change.node])
+            self._comparisons.put(change.node, before)
 
     def read(
         self,
@@ -122,18 +123,18 @@ class Merger:
     ) -> None:
         """Take in many changes at once: a store at the start. Places can be found as soon as this returns.
 
-        Which are alike is looked for by `search_pairs`, or when they are merged; then they are compared.
+        Similar nodes are searched by `search_pairs`, or when they are merged; then they are compared.
 
         Args:
-            log: what each map tells, in its order.
-            overlaps: if they are known already, of all pairs of these nodes; else they are looked for.
-            links: what is known already of pairs of these nodes.
+            log: each map's changes, in order.
+            overlaps: of all pairs of these nodes, if known; else they are searched.
+            links: known results on pairs of these nodes.
         """
         put: dict[NodeId, None] = {}
-        for map_id, body in log:
-            self._replay(map_id, body)
-            if isinstance(body, NodePut):
-                put[body.node.id] = None
+        for map_id, change in log:
+            self._replay(map_id, change)
+            if isinstance(change, NodePut):
+                put[change.node.id] = None
         # What the database has already, just so, it leaves as it is.
         fresh = [node for node_id in put if (node := self.node(node_id)) is not None]
         self.places.put(fresh)
@@ -145,13 +146,13 @@ class Merger:
             self._comparisons.judge(pair, link)
 
     def rule(self, constraints: ManualConstraints) -> None:
-        """Heed these rulings of people from now on, and no others."""
-        ruled = {*constraints.in_force} ^ {*self._rulings.in_force}
-        # A map that is retired harms nobody, and is no longer set apart.
-        self._isolation.release(one.retires for one in ruled if one.retires is not None)
-        if self._rulings.retired.keys() - constraints.retired.keys():
+        """Apply exactly these manual constraints from now on."""
+        ruled = {*constraints.in_force} ^ {*self._constraints.in_force}
+        # A retired map is harmless, and is no longer set apart.
+        self._isolation.release(constraint.retires for constraint in ruled if constraint.retires is not None)
+        if self._constraints.retired.keys() - constraints.retired.keys():
             self.alike.forget()
-        self._rulings = constraints
+        self._constraints = constraints
         self._stale |= self._verdicts.at(self.maps.keys())
         self._dirty = True
 
@@ -160,7 +161,7 @@ class Merger:
         self._suspects = frozenset(maps)
 
     def merged(self, use: Callable[[MergedMap], object] | None = None) -> MergedMap:
-        """The merged map of all that has come; made anew only if something has changed, and where it has.
+        """The merged map of all changes; merged again only if something has changed, and where it has.
 
         A map with which it fails is set apart: it is merged without it, until that has changed.
 
@@ -169,7 +170,7 @@ class Merger:
         """
         if self._dirty:
             self.search_pairs()
-            # A server merges before it has read its store if people's rulings come first.
+            # A server merges before it has read its store if manual constraints come first.
             if self.maps:
                 self._comparisons.take_over()
             for pair, verdict in self._comparisons.changes():
@@ -178,7 +179,7 @@ class Merger:
                 if verdict is None:
                     self._verdicts.drop(pair)
                 else:
-                    self._verdicts.put(pair, self._told(verdict))
+                    self._verdicts.put(pair, self._counted(verdict))
             for map_id in self._changed:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
@@ -187,11 +188,11 @@ class Merger:
             try:
                 self._find_wrong_geometry()
             except Exception:  # a defect with one map must not hold up the merge
-                log.exception("maps with wrong geometry could not be looked for")
-            maps = [one for one in self._kept if one not in self._isolation]
+                log.exception("the search for maps with wrong geometry failed")
+            maps = [kept_id for kept_id in self._kept if kept_id not in self._isolation]
             try:
                 merged = self._made(self._pipeline, self._verdicts, maps, self._touched, use)
-            except Exception as error:  # whatever it is, it is one map's or a few maps' and not everybody's
+            except Exception as error:  # any error is of one map or a few, and not of all
                 log.exception("the merge fails; looking for the map with which it does")
                 merged = self._made_without_bad(maps, error, use)
             for node_id, overlaps in self.places.leave_out(merged.superseded, self.node).items():
@@ -210,17 +211,17 @@ class Merger:
         touched: set[MapId],
         use: Callable[[MergedMap], object] | None,
     ) -> MergedMap:
-        kept = {one: self._kept[one] for one in maps}
-        merged = pipeline.merged(kept, verdicts, touched, self._rulings)
+        kept = {map_id: self._kept[map_id] for map_id in maps}
+        merged = pipeline.merged(kept, verdicts, touched, self._constraints)
         merged = replace(merged, set_apart=self._isolation.reasons, wrong=self._wrong)
         if use is not None:
             use(merged)
         return merged
 
     def _find_wrong_geometry(self) -> None:
-        """Maps that contradict others that agree are merged with nobody."""
+        """Maps that contradict others that agree are not merged."""
         self._stale |= self._verdicts.at(self._changed)
-        before, left_out = self._wrong, {*self._rulings.retired, *self._isolation.reasons}
+        before, left_out = self._wrong, {*self._constraints.retired, *self._isolation.reasons}
         self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, left_out)
         self._stale = set()
         if before.keys() - self._wrong.keys():
@@ -229,16 +230,14 @@ class Merger:
         for maps in self._verdicts.at(differ):
             self._touched |= {*maps}
             for pair in list(self._verdicts.between(maps)):
-                self._verdicts.put(pair, self._told(self._comparisons[pair]))
+                self._verdicts.put(pair, self._counted(self._comparisons[pair]))
 
     def _links(self, maps: MapPair) -> list[Link]:
-        """The links between two maps that people have not ruled out, also those of maps with wrong
-        geometry.
-        """
-        known = (self._comparisons[pair] for pair in self._verdicts.between(maps))
-        return [v for v in known if isinstance(v, Link) and self._rulings.against(*v.pair) is None]
+        """The links between two maps that no constraint excludes, also of maps with wrong geometry."""
+        verdicts = (self._comparisons[pair] for pair in self._verdicts.between(maps))
+        return [v for v in verdicts if isinstance(v, Link) and self._constraints.against(*v.pair) is None]
 
-    def _told(self, verdict: Verdict) -> Verdict:
+    def _counted(self, verdict: Verdict) -> Verdict:
         """A verdict, or why it does not count."""
         if isinstance(verdict, RefusedLink) or verdict.within:
             return verdict
@@ -248,7 +247,7 @@ class Merger:
     def _made_without_bad(
         self, maps: Collection[MapId], first: Exception, use: Callable[[MergedMap], object] | None
     ) -> MergedMap:
-        """Merge as many maps as it works with, from nothing: nobody knows what a failure has left behind."""
+        """Merge as many maps as possible, without cached state, which a failure may have damaged."""
 
         def attempt(some: Collection[MapId]) -> MergePipeline:
             pipeline = self._new_pipeline()
@@ -256,32 +255,38 @@ class Merger:
             return pipeline
 
         # Those that are suspected before and the small ones last: they are rather set apart than others.
-        trusted = sorted(maps, key=lambda one: (self._suspicion(one), -len(self._kept[one].nodes), one))
+        trusted = sorted(
+            maps, key=lambda map_id: (self._suspicion(map_id), -len(self._kept[map_id].nodes), map_id)
+        )
         pipeline, bad = leave_out(trusted, attempt)
-        for one, error in bad.items():
-            self._isolation.add(one, reason_of(error))
+        for map_id, error in bad.items():
+            self._isolation.add(map_id, reason_of(error))
         if not bad:
-            log.warning("the merge fails with what it knew (%s) and not without it: begun anew", first)
+            log.warning(
+                "the merge fails with cached state (%s) and not without it: the cache is dropped", first
+            )
         self._pipeline = pipeline
-        return self._made(pipeline, self._verdicts, [one for one in maps if one not in bad], set(), use)
+        return self._made(
+            pipeline, self._verdicts, [map_id for map_id in maps if map_id not in bad], set(), use
+        )
 
-    def _suspicion(self, one: MapId) -> int:
-        return self._isolation.suspicion(one) + (one in self._suspects)
+    def _suspicion(self, map_id: MapId) -> int:
+        return self._isolation.suspicion(map_id) + (map_id in self._suspects)
 
     def search_pairs(self, most: int | None = None) -> None:
-        """Look for what is like the nodes that were read, or like so many of them."""
+        """Search for nodes similar to those that were read, or to so many of them."""
         self._comparisons.search_pairs(most)
 
     def apart(self) -> MergedMap:
-        """The merged map if nobody had compared any two maps: a component for each part of each map.
+        """The merged map without comparisons of maps: a component for each part of each map.
 
-        Without those with which it fails: the merge says which they are.
+        Without those with which it fails; the merge returns them.
         """
-        kept = {map_id: HybridMap(one.contents()) for map_id, one in self.maps.items()}
+        kept = {map_id: HybridMap(hybrid_map.contents()) for map_id, hybrid_map in self.maps.items()}
 
         def attempt(some: Collection[MapId]) -> MergedMap:
-            inside = {one: kept[one] for one in some}
-            return Islands(self.settings).merge(inside, Verdicts(), set(inside), self._rulings)
+            inside = {hybrid_map: kept[hybrid_map] for hybrid_map in some}
+            return Islands(self.settings).merge(inside, Verdicts(), set(inside), self._constraints)
 
         return leave_out(sorted(kept), attempt)[0]
 
@@ -289,23 +294,23 @@ class Merger:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
         return self.merged().summary()
 
-    def _replay(self, map_id: MapId, body: ChangeBody) -> None:
+    def _replay(self, map_id: MapId, change: ChangeBody) -> None:
         """Take a change into its map, and forget what no longer holds."""
-        one = self.maps.setdefault(map_id, HybridMap())
+        hybrid_map = self.maps.setdefault(map_id, HybridMap())
         self._touched.add(map_id)
         self._changed.add(map_id)
         self._dirty = True
-        gone = one.nodes.get(body.id) if isinstance(body, NodeRetired) else None
-        for edge in one.dropped_by(body):
+        removed = hybrid_map.nodes.get(change.id) if isinstance(change, NodeRetired) else None
+        for edge in hybrid_map.dropped_by(change):
             self._comparisons.disconnect(edge)
-        one.apply(body)
-        match body:
+        hybrid_map.apply(change)
+        match change:
             case NodePut(node):
                 self._comparisons.forget(node.id)
                 self.places.observe(node)
             case NodeRetired(node_id):
                 self._comparisons.forget(node_id)
-                self.places.remove(gone, node_id)
+                self.places.remove(removed, node_id)
             case EdgePut(edge):
                 self._comparisons.connect(edge)
 

@@ -66,7 +66,7 @@ class NodeComparisons:
 
     @property
     def uncompared(self) -> int:
-        """Nodes that were read and for which nobody has yet looked which others are like them."""
+        """Nodes that were read and whose similar nodes are not searched yet."""
         return len(self._uncompared)
 
     # Nodes come and go.
@@ -79,7 +79,7 @@ class NodeComparisons:
         """Look which nodes are like one that is in the place database.
 
         Args:
-            node: has come, or come anew.
+            node: was added, or written again.
             before: its pairs as it was.
         """
         self._pairs.put(node.id, self._places.overlaps(node, self._node_of, before))
@@ -112,7 +112,7 @@ class NodeComparisons:
     # Pairs are compared.
 
     def search_pairs(self, most: int | None = None) -> None:
-        """Look for what is like the nodes that were read, or like so many of them."""
+        """Search for nodes similar to those that were read, or to so many of them."""
         for node_id in list(islice(self._uncompared, most)):
             del self._uncompared[node_id]
             if (node := self._node_of(node_id)) is not None:
@@ -121,7 +121,9 @@ class NodeComparisons:
                 try:
                     self._pairs.put(node_id, source.overlaps(node, self._node_of))
                 except Exception:  # a defect with one node must not hold up all others
-                    log.exception("nobody can say which nodes are like %s: it is compared with none", node_id)
+                    log.exception(
+                        "the search for nodes similar to %s failed: it is compared with none", node_id
+                    )
 
     def changes(self) -> list[tuple[Pair, Verdict | None]]:
         """Compare what is to be compared, and tell what has changed since this was asked last.
@@ -162,11 +164,11 @@ class NodeComparisons:
         return self._cached is not None
 
     def recollect(self, findings: VerificationCache) -> None:
-        """Believe what was found before of nodes that are just as they were; what is not read by then."""
+        """Use earlier results for nodes that are unchanged when they are read."""
         self._cached = CachedVerifications(findings)
 
     def take_over(self) -> None:
-        """Take over all verdicts of before, once nodes are read; whatever comes now is found anew."""
+        """Take over all earlier verdicts, once nodes are read; later pairs are compared again."""
         if self._cached is not None:
             for pair, verdict in self._cached.verdicts(self._node_of):
                 if pair not in self:
@@ -180,15 +182,14 @@ class NodeComparisons:
             known = before.get(node.id)
             same = known is not None and known[0] is node
             self._prints[node.id] = known if known and same else (node, fingerprint_of(node))
-        prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
+        prints = {n: fingerprint for n, (_, fingerprint) in self._prints.items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._verdicts.items() for b, v in known.items() if a < b}
         return VerificationCache(prints, self._pairs.overlaps(), verdicts)
 
 
 def _makes_neighbours(edge: Edge) -> bool:
-    """Whether an edge says that two nodes are near to each other on their robot's way.
+    """Whether an edge connects two nodes that are near each other on their robot's drive.
 
-    These are not compared: it tells nothing new. A later drive says nothing of that, and nobody says it of
-    others' nodes.
+    These are not compared: it would add nothing. Later drives and edges between nodes of others do not count.
     """
     return edge.kind is not EdgeKind.DRIVEN and edge.within

@@ -1,4 +1,4 @@
-"""Which nodes a node looks like, anywhere on the map: found out once, kept while both stay what they are."""
+"""Cache of aliased nodes: which nodes look the same anywhere on the map, kept while both are unchanged."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ Between = Callable[[NodeId, NodeId], Pose2 | None]
 
 @dataclass(frozen=True, eq=False)
 class AliasedNode:
-    """A node that looks like another one, and is not the same place as far as the map knows.
+    """A node that looks like another node, at a different place by the map.
 
     Attributes:
         other: which.
-        other_from_node: where the one would be, seen from it.
-        landmarks: (K,) of the one that the other shows too.
+        other_from_node: relative pose that the similarity implies.
+        landmarks: (K,) of the node that the other shows too.
         others: (K,) those of the other.
     """
 
@@ -43,13 +43,13 @@ class AliasedNode:
     others: NDArray[np.int64]
 
     def turned_round(self, node: Node) -> AliasedNode:
-        """The same, told of the other; of which node this was is not kept."""
+        """The same from the other node's side."""
         return AliasedNode(node, self.other_from_node.inverse(), self.others, self.landmarks)
 
 
 @dataclass(frozen=True, eq=False)
 class _Entry:
-    """What was found out about a node: what looks like it, and what was left out, being the same place."""
+    """Cached result of a node: its aliases, and candidates left out as the same place."""
 
     node: Node
     found: dict[NodeId, AliasedNode]
@@ -57,9 +57,9 @@ class _Entry:
 
 
 class AliasCache:
-    """Remembers for each node which others it looks like.
+    """Caches the aliases of each node.
 
-    A node that comes later is entered with those that it looks like as soon as it is asked about itself.
+    A later node is entered with its aliases as soon as its own aliases are requested.
     """
 
     def __init__(self, recognition: RecognitionSettings, candidates: int = 16) -> None:
@@ -69,23 +69,23 @@ class AliasCache:
             recognition,
             candidates,
         )
-        self._known: dict[NodeId, _Entry] = {}
+        self._entries: dict[NodeId, _Entry] = {}
 
     def compare(self, a: Node, b: Node) -> Recognition | None:
         """See Doubles.compare."""
         return self._doubles.compare(a, b)
 
     def forget(self) -> None:
-        """Look for everything again: nodes that were hidden when it was looked for are there again."""
-        self._known = {}
+        """Drop all results: nodes that were hidden at the search are active again."""
+        self._entries = {}
 
     def __contains__(self, node_id: NodeId) -> bool:
         """Whether this was found out of a node, as it is or as it was."""
-        return node_id in self._known
+        return node_id in self._entries
 
     def knows(self, node: Node) -> bool:
         """Whether this was found out."""
-        entry = self._known.get(node.id)
+        entry = self._entries.get(node.id)
         return entry is not None and unchanged(entry.node, node)
 
     def in_place(self, a: Node, b: Node, a_from_b: Pose2) -> int:
@@ -101,28 +101,28 @@ class AliasCache:
         node_of: Callable[[NodeId], Node | None],
         between: Between,
     ) -> list[AliasedNode]:
-        """What looks like a node, and lies elsewhere on the map or on a part of it that nothing joins.
+        """Aliases of a node: elsewhere on the map, or on an unconnected part of it.
 
         Args:
-            node: the one.
-            index: finds what may look like it.
+            node: of which aliases are searched.
+            index: finds candidates.
             node_of: gives a node by its id; None if it is gone.
-            between: what the merged map says of two nodes.
+            between: relative pose of two nodes in the merged map.
         """
-        entry = self._known.get(node.id)
+        entry = self._entries.get(node.id)
         # What is gone, or is of a map that people have retired, is parted from nothing.
         parted = entry is not None and any(
-            between(one, node.id) is None and node_of(one) is not None for one in entry.same
+            between(alias, node.id) is None and node_of(alias) is not None for alias in entry.same
         )
         if entry is None or parted or not unchanged(entry.node, node):
             entry = self._search(node, index, node_of, between)
         alike = []
-        for one in list(entry.found.values()):
-            other, mapped = node_of(one.other.id), between(one.other.id, node.id)
-            if other is None or not unchanged(one.other, other):
+        for alias in list(entry.found.values()):
+            aliased, mapped = node_of(alias.other.id), between(alias.other.id, node.id)
+            if aliased is None or not unchanged(alias.other, aliased):
                 continue
-            if mapped is None or not same_place(mapped, one.other_from_node.mean):
-                alike.append(one)
+            if mapped is None or not same_place(mapped, alias.other_from_node.mean):
+                alike.append(alias)
         return alike
 
     def _search(
@@ -132,33 +132,37 @@ class AliasCache:
         node_of: Callable[[NodeId], Node | None],
         between: Between,
     ) -> _Entry:
-        """Look for it in the whole fleet."""
-        s, found, same = self._recognition, dict[NodeId, AliasedNode](), []
+        """Search the whole fleet."""
+        s, aliases, same = self._recognition, dict[NodeId, AliasedNode](), []
         marks = node.landmarks
         view = View(marks.pixels, marks.codes, node.camera)
-        for other_id, _ in index.query(view, self._candidates + 1):
-            other = node_of(other_id)
-            if other_id == node.id or other is None:
+        for candidate_id, _ in index.query(view, self._candidates + 1):
+            candidate = node_of(candidate_id)
+            if candidate_id == node.id or candidate is None:
                 continue
-            pairs = match(other.landmarks.codes, marks.codes, s.matching)
+            pairs = match(candidate.landmarks.codes, marks.codes, s.matching)
             if len(pairs) < s.least_inliers:
                 continue
-            mapped = between(other_id, node.id)
+            mapped = between(candidate_id, node.id)
             if mapped is not None:
-                left = unexplained(other, pairs, marks.pixels, node.camera, mapped, EXPLAINED_PX)
+                left = unexplained(candidate, pairs, marks.pixels, node.camera, mapped, EXPLAINED_PX)
                 if left < s.least_inliers:
-                    same.append(other_id)
+                    same.append(candidate_id)
                     continue
-            likeness = self._doubles.compare(other, node)
+            likeness = self._doubles.compare(candidate, node)
             if likeness is not None:
-                found[other_id] = AliasedNode(
-                    other, likeness.node_from_robot, likeness.pairs[:, 1], likeness.pairs[:, 0]
+                aliases[candidate_id] = AliasedNode(
+                    candidate, likeness.node_from_robot, likeness.pairs[:, 1], likeness.pairs[:, 0]
                 )
-        entry = _Entry(node, found, tuple(same))
-        self._known[node.id] = entry
-        for one in found.values():
-            known = self._known.get(one.other.id)
-            if known is not None and unchanged(known.node, one.other) and node.id not in known.found:
-                more = {**known.found, node.id: one.turned_round(node)}
-                self._known[one.other.id] = replace(known, found=more)
+        entry = _Entry(node, aliases, tuple(same))
+        self._entries[node.id] = entry
+        for alias in aliases.values():
+            alias_entry = self._entries.get(alias.other.id)
+            if (
+                alias_entry is not None
+                and unchanged(alias_entry.node, alias.other)
+                and node.id not in alias_entry.found
+            ):
+                more = {**alias_entry.found, node.id: alias.turned_round(node)}
+                self._entries[alias.other.id] = replace(alias_entry, found=more)
         return entry

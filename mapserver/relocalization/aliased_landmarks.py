@@ -1,4 +1,4 @@
-"""What looks like a place elsewhere on the map: the map knows its own doubles.
+"""Aliased landmarks: similar places elsewhere on the map are searched in the map itself.
 
 A view that shows one place may fit another as well and not be recognised there, because fewer of its features
 happen to be landmarks there, or because they leave the pose open. Two nodes compare better: each holds its
@@ -32,11 +32,11 @@ REMEMBERED = 20_000
 VAGUE: dict[str, Any] = {
     "least_cells": 2, "most_position_share": 0.5, "most_heading_sigma": math.radians(20.0), "most_rival": 1.0,
 }  # fmt: skip
-"""What a node that looks like another need not hold: a poster seen from near fills few cells and tells no
-pose well, and its double in the next room is one all the same."""
+"""Looser thresholds for an alias: a poster seen from near fills few cells and gives an imprecise pose, and
+its copy in the next room is an alias all the same."""
 
 EXPLAINED_PX = 12.0
-"""A match nearer than this to where a pose expects it speaks for that pose."""
+"""A match nearer than this to its prediction supports the pose."""
 
 NEAR_M, NEAR_HEADING = 0.5, 0.35
 """Two nodes see the same place, and are no doubles, if the map has them about where they see each
@@ -53,24 +53,24 @@ class AliasedLandmarks:
         self._kept: OrderedDict[tuple[NodeId, NodeId], tuple[Node, Node, Recognition | None]] = OrderedDict()
 
     def compare(self, a: Node, b: Node) -> Recognition | None:
-        """`a_from_b` and what both show, or None if they do not look alike."""
+        """`a_from_b` and the common landmarks, or None if they do not match."""
         key = a.id, b.id
-        known = self._kept.get(key)
-        if known is not None and unchanged(known[0], a) and unchanged(known[1], b):
-            return known[2]
-        found = register(a, b, self._settings, np.random.default_rng(0))
-        self._kept[key] = a, b, found
+        cached = self._kept.get(key)
+        if cached is not None and unchanged(cached[0], a) and unchanged(cached[1], b):
+            return cached[2]
+        recognition = register(a, b, self._settings, np.random.default_rng(0))
+        self._kept[key] = a, b, recognition
         while len(self._kept) > REMEMBERED:
             self._kept.popitem(last=False)
-        return found
+        return recognition
 
 
-def unchanged(one: Node, other: Node) -> bool:
-    """Whether two nodes of one id look the same: without faded landmarks one is made anew each time."""
-    if one is other:
+def unchanged(first: Node, second: Node) -> bool:
+    """Whether two nodes of one id have the same landmarks; without faded ones a node is a new object."""
+    if first is second:
         return True
-    a, b = one.landmarks, other.landmarks
-    alike = one.id == other.id and one.stamp_ns == other.stamp_ns and one.camera == other.camera
+    a, b = first.landmarks, second.landmarks
+    alike = first.id == second.id and first.stamp_ns == second.stamp_ns and first.camera == second.camera
     return alike and np.array_equal(a.codes, b.codes) and np.array_equal(a.depths, b.depths, equal_nan=True)
 
 
@@ -85,29 +85,29 @@ def between(merged: MergedMap, a: NodeId, b: NodeId) -> Pose2 | None:
 def carried(
     double: Node,
     likeness: Recognition,
-    seen: NodeMatch,
+    recognised: NodeMatch,
     view: View,
     matching: MatchSettings,
     within_px: float,
 ) -> NodeMatch:
-    """What follows for a node that looks like one that was recognised.
+    """The recognition of an alias that follows from the recognition of its node.
 
     Args:
-        double: the node that looks like it.
+        double: the alias.
         likeness: `double_from_node`, with landmarks of the double and of the node that agree.
-        seen: that the node was recognised in the view.
+        recognised: that the node was recognised in the view.
         view: the image's features.
         matching: how features are matched.
-        within_px: a match nearer than this to where the pose expects it speaks for the double.
+        within_px: a match nearer than this to its prediction supports the alias.
 
     Returns:
-        A sighting of the double, of the features that it would explain: those of landmarks that both nodes
-        have, and those that match the double's own. Its evidence tells the share seen of what should be.
+        A recognition of the alias, from the features that it would explain: those of landmarks that both
+        nodes have, and those that match its own. Its evidence has the share seen of what should be visible.
     """
-    pose = likeness.node_from_robot @ seen.recognition.node_from_robot
+    pose = likeness.node_from_robot @ recognised.recognition.node_from_robot
     points = double.landmarks.points_in_robot(double.camera)
     expected = view.camera.project(pose.mean.inverse().apply(points))
-    feature_of = dict(seen.recognition.pairs.tolist())
+    feature_of = dict(recognised.recognition.pairs.tolist())
     pairs = {i: feature_of[j] for i, j in likeness.pairs.tolist() if j in feature_of}
     taken = set(pairs.values())
     for i, j in match(double.landmarks.codes, view.codes, matching).tolist():
@@ -119,15 +119,15 @@ def carried(
         likeness,
         node_from_robot=pose,
         pairs=np.array(sorted(pairs.items()), np.int64).reshape(-1, 2),
-        usable=seen.recognition.usable,
+        usable=recognised.recognition.usable,
         evidence={**likeness.evidence, "seen": min(len(pairs) / max(should, 1), 1.0)},
     )
-    return NodeMatch(double.id, recognition, alike=seen.node)
+    return NodeMatch(double.id, recognition, alike=recognised.node)
 
 
-def same_place(one: Pose2, other: Pose2) -> bool:
+def same_place(a: Pose2, b: Pose2) -> bool:
     """Whether two poses are so near that vague estimates of one may be both."""
-    return one.distance(other) < NEAR_M and abs(wrap_angle(one.heading - other.heading)) < NEAR_HEADING
+    return a.distance(b) < NEAR_M and abs(wrap_angle(a.heading - b.heading)) < NEAR_HEADING
 
 
 def unexplained(
@@ -145,7 +145,7 @@ def unexplained(
         pairs: (K, 2), landmark and feature.
         pixels: (N, 2) px, of the features.
         camera: that saw them.
-        node_from_robot: from where, as it is thought.
+        node_from_robot: estimated pose.
         within_px: what is nearer is explained.
     """
     points = node.landmarks.take(pairs[:, 0]).points_in_robot(node.camera)
@@ -154,6 +154,6 @@ def unexplained(
 
 
 def elsewhere(ranked: Sequence[tuple[NodeId, float]], best: NodeId, faint: float) -> list[NodeId]:
-    """Which nodes look at least so much like the view, as a share of how the best one does, best first."""
+    """Candidates with at least this share of the best one's similarity, best first."""
     least = faint * dict(ranked).get(best, 0.0)
     return [node for node, score in ranked if node != best and score >= least]

@@ -1,9 +1,9 @@
-"""What a region of the map looks like elsewhere: told by the neighbours of a place, not by the place alone.
+"""Aliased regions: a place's neighbours show whether its whole region looks like another.
 
-A view of one of two rooms that look the same may be like no node of the other room, since nobody has looked
-there from that side. But the nodes around the place that was recognised have their doubles there, and all of
-them imply one and the same motion from room to room. Where that takes the robot it may be as well: if what it
-sees lies on what is there twice, or if nobody has looked there at where it would lie.
+A view of one of two similar rooms may match no node of the other room, if that was not seen from the same
+side. But the nodes around the recognised place have their aliases there, and all of them imply the same
+motion from room to room. The robot may be at the place that this motion gives: if the landmarks that it sees
+are aliased, or if their counterparts were not observed there.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 WELL_INSIDE = 0.85
 """Of a camera's semi-aperture: of what is nearer to the edge of its image a node keeps little."""
 ALIKE_TURN, ALIKE_TIMES = math.radians(35.0), 1.6
-"""A thing looks about the same from directions that differ less, and up to so many times as far away."""
+"""A thing looks about the same within this angle, and up to so many times as far away."""
 IN_COMMON = 3
 """Matches that are in place: about one in 150 wrong ones is so by chance."""
 UNTOLD_XY, UNTOLD_HEADING = 0.1, 0.05
@@ -39,10 +39,10 @@ class AliasedRegionSettings:
     """When the surroundings of a place count as being there twice.
 
     Attributes:
-        least_nodes: nodes around it whose doubles imply the same motion. 0: regions are not looked at.
+        least_nodes: nodes around it whose aliases imply the same motion. 0: regions are not tested.
         least_share: of the landmarks that the view shows, how many must lie on what these doubles show.
-        most_looked_at: how many of them may lie, in the other region, where somebody has looked and has not
-            seen them, if the doubles show less. Then they must show more than one thing.
+        most_looked_at: how many of them may be, in the other region, in observed but empty places, if the
+            aliases show less. Then they must show more than one thing.
         least_around: nodes whose doubles must imply the same motion then. All but one must have a double of
             its own.
     """
@@ -55,13 +55,13 @@ class AliasedRegionSettings:
 
 @dataclass(frozen=True, eq=False)
 class Counterpart:
-    """Where a robot may be as well, by what its surroundings look like.
+    """Another pose where a robot may be, by the similarity of the surroundings.
 
     Attributes:
-        node: the nearest there of those that look like a node here.
+        node: the nearest alias there.
         node_from_robot: pose there.
         features: of the view, on what is or may be there twice.
-        nodes: how many nodes here say so.
+        nodes: how many nodes here imply it.
     """
 
     node: NodeId
@@ -80,7 +80,7 @@ class _Vote:
 
     Attributes:
         here: the node.
-        alike: its double.
+        alike: its alias.
         frame: in which that lies.
         there: `frame_from_double`.
         robot: `frame_from_robot`, by the two.
@@ -104,7 +104,7 @@ BESIDE = 0.35
 
 
 class AliasedRegions:
-    """Finds counterparts of places. It stands for one merged map; make another for the next."""
+    """Finds counterparts of places. It belongs to one merged map; make another for the next."""
 
     def __init__(
         self,
@@ -114,111 +114,112 @@ class AliasedRegions:
         alike: AliasCache,
         settings: AliasedRegionSettings,
     ) -> None:
-        """Take what is known; which nodes look alike outlives the merged map."""
+        """Take the merged map and the alias cache, which outlives it."""
         self._index, self._node_of, self._merged = index, node_of, merged
         self._alike, self._settings = alike, settings
         self._left: list[NodeId] | None = None
 
     def prepare(self, most: int) -> int:
-        """Find out what at most so many nodes look like before anybody asks, and say how many are left.
+        """Evaluate the aliases of at most so many nodes in advance, and return how many are left.
 
         Not by two threads at once.
         """
         if not self._settings.least_nodes:
             return 0
         if self._left is None:
-            self._left = sorted((one for one in self._merged.poses if one not in self._alike), reverse=True)
+            self._left = sorted(
+                (node_id for node_id in self._merged.poses if node_id not in self._alike), reverse=True
+            )
         while self._left and most > 0:
             node = self._node_of(self._left.pop())
             if node is not None and not self._alike.knows(node):
-                self._look_alikes(node)
+                self._aliases(node)
                 most -= 1
         return len(self._left)
 
-    def counterpart(self, seen: NodeMatch, ranked: Sequence[NodeId] = ()) -> Counterpart | None:
+    def counterpart(self, recognised: NodeMatch, ranked: Sequence[NodeId] = ()) -> Counterpart | None:
         """Where else a robot may be.
 
         Args:
-            seen: the node that was recognised best.
-            ranked: nodes that look like the view; of a map that is not merged yet no other neighbours are
-                known.
+            recognised: the node that was recognised best.
+            ranked: candidates of the view; a map that is not merged yet has no other neighbours.
 
         Returns:
             The counterpart that shows most of what the view shows; None if there is none.
         """
-        s, node = self._settings, self._node_of(seen.node)
+        s, node = self._settings, self._node_of(recognised.node)
         if node is None or not s.least_nodes:
             return None
         frame, frame_from_node = self._placed(node)
-        robot = frame_from_node @ seen.recognition.node_from_robot.mean
-        landmarks, features = seen.recognition.pairs.T
+        robot = frame_from_node @ recognised.recognition.node_from_robot.mean
+        landmarks, features = recognised.recognition.pairs.T
         points = frame_from_node.apply(node.points_in_robot[landmarks])
-        known = np.isfinite(points[:, 0])
-        if not known.any():
+        has_depth = np.isfinite(points[:, 0])
+        if not has_depth.any():
             return None
-        points, features = points[known], features[known]
+        points, features = points[has_depth], features[has_depth]
         votes = self._votes(self._around(node, frame, robot, points, ranked), frame, robot)
         best: tuple[list[_Vote], NDArray[np.bool_]] | None = None
         for party in self._parties(votes):
             shown = np.concatenate([vote.shown for vote in party])
             twice = np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1, initial=np.inf) < BESIDE
             if twice.mean() < s.least_share:
-                best_told = max(party, key=lambda vote: (len(vote.shown), vote.alike.other.id))
-                missed = self._looked_at(best_told, frame_from_node, robot, points, node) & ~twice
+                largest = max(party, key=lambda vote: (len(vote.shown), vote.alike.other.id))
+                missed = self._observed(largest, frame_from_node, robot, points, node) & ~twice
                 if missed.mean() > s.most_looked_at or not self._is_wide(party, shown):
                     continue
                 twice = np.logical_not(missed)
             if best is None or twice.sum() > best[1].sum():
                 best = party, twice
-        return None if best is None else self._told(seen, node, best[0], features[best[1]])
+        return None if best is None else self._counterpart_of(recognised, node, best[0], features[best[1]])
 
     def _is_wide(self, party: Sequence[_Vote], shown: Array) -> bool:
-        """Whether a party speaks for what it does not show: many nodes, and more than one thing."""
-        here, there = {vote.here.id for vote in party}, {vote.alike.other.id for vote in party}
+        """Whether a group is enough evidence beyond what it shows: many nodes, and more than one thing."""
+        nodes_here, nodes_there = {vote.here.id for vote in party}, {vote.alike.other.id for vote in party}
         least = self._settings.least_around
-        return len(here) >= least and len(there) >= least - 1 and extent(shown) >= THING_SIGMA
+        return len(nodes_here) >= least and len(nodes_there) >= least - 1 and extent(shown) >= THING_SIGMA
 
-    def _looked_at(
+    def _observed(
         self, vote: _Vote, frame_from_node: Pose2, robot: Pose2, points: Array, node: Node
     ) -> NDArray[np.bool_]:
-        """(K,) which points somebody would have seen in the other region, about as the robot sees them.
+        """(K,) which points would have been observed in the other region, about as the robot sees them.
 
-        Who has a few landmarks in common with the node here, where they should be, has not looked in vain.
+        A node with a few common landmarks at their predictions has observed them.
 
         Args:
-            vote: says where the other region is.
+            vote: gives the other region.
             frame_from_node: where the node is.
             robot: `frame_from_robot`, here.
             points: (K, 3) m, what it sees, in the frame here.
-            node: that was recognised; its camera stands for all.
+            node: that was recognised; its camera is used for all.
         """
-        seen = np.ones(len(points), np.bool_)
+        observed = np.ones(len(points), np.bool_)
         if not isinstance(vote.frame, int):
-            return seen
-        seen[:] = False
+            return observed
+        observed[:] = False
         there_from_here = vote.robot @ robot.inverse()
-        there = there_from_here.apply(points)
-        own, own_bearings = _ways(there, vote.robot.vector[None])
-        for one_id, mean in zip(*self._near(vote.frame, vote.robot), strict=True):
-            away, bearings = _ways(there, mean[None])
+        points_there = there_from_here.apply(points)
+        own, own_bearings = _ways(points_there, vote.robot.vector[None])
+        for node_id, mean in zip(*self._nearby_nodes(vote.frame, vote.robot), strict=True):
+            away, bearings = _ways(points_there, mean[None])
             inside = np.cos(bearings - mean[2]) > math.cos(WELL_INSIDE * node.camera.semi_aperture)
             alike = np.cos(bearings - own_bearings) > math.cos(ALIKE_TURN)
             alike &= (away < ALIKE_TIMES * own) & (own < ALIKE_TIMES * away)
-            looked = (inside & alike)[0]
-            one = self._node_of(one_id) if (looked & ~seen).any() else None
-            if one is None:
+            in_view = (inside & alike)[0]
+            neighbour = self._node_of(node_id) if (in_view & ~observed).any() else None
+            if neighbour is None:
                 continue
-            one_from_node = Pose2.from_vector(mean).inverse() @ there_from_here @ frame_from_node
-            if self._alike.in_place(one, node, one_from_node) < IN_COMMON:
-                seen |= looked
-        return seen
+            node_from_view = Pose2.from_vector(mean).inverse() @ there_from_here @ frame_from_node
+            if self._alike.in_place(neighbour, node, node_from_view) < IN_COMMON:
+                observed |= in_view
+        return observed
 
-    def _told(
-        self, seen: NodeMatch, node: Node, party: Sequence[_Vote], features: NDArray[np.int64]
+    def _counterpart_of(
+        self, recognised: NodeMatch, node: Node, party: Sequence[_Vote], features: NDArray[np.int64]
     ) -> Counterpart:
-        """What a party says, by the node there that is nearest to the robot."""
+        """The counterpart that a group implies, by its node nearest to the robot."""
         chosen = min(party, key=lambda vote: (vote.robot.distance(vote.there), vote.alike.other.id))
-        robot = seen.recognition.node_from_robot
+        robot = recognised.recognition.node_from_robot
         if chosen.here.id != node.id:
             robot = self._way(chosen.here, node) @ robot
         pose = chosen.alike.other_from_node @ robot
@@ -228,9 +229,9 @@ class AliasedRegions:
     def _around(
         self, node: Node, frame: Frame, robot: Pose2, points: Array, ranked: Sequence[NodeId]
     ) -> Iterator[Node]:
-        """The node, then others near the robot, first those that look at most of the points that it sees."""
+        """The node, then others near the robot, first those that observe most of the points that it sees."""
         if isinstance(frame, int):
-            ids, means = self._near(frame, robot)
+            ids, means = self._nearby_nodes(frame, robot)
         else:
             same = [one for one in ranked if one.map == frame and self._merged.component_of(one) is None]
             nodes = [one for one in map(self._node_of, same) if one is not None]
@@ -238,40 +239,46 @@ class AliasedRegions:
             means = np.array([one.map_from_robot.mean.vector for one in nodes]).reshape(-1, 3)
         yield node
         bearings = _ways(points, means)[1] - means[:, 2:]
-        seen = np.cos(bearings) > math.cos(node.camera.semi_aperture)
-        for k in np.argsort(-seen.sum(axis=1), kind="stable")[:NODES].tolist():
+        in_view = np.cos(bearings) > math.cos(node.camera.semi_aperture)
+        for k in np.argsort(-in_view.sum(axis=1), kind="stable")[:NODES].tolist():
             one = self._node_of(ids[k])
             if one is not None and one.id != node.id:
                 yield one
 
-    def _near(self, component: int, at: Pose2) -> tuple[list[NodeId], Array]:
+    def _nearby_nodes(self, component: int, at: Pose2) -> tuple[list[NodeId], Array]:
         """The nodes nearest to a pose in a component, within reach, and (N, 3) their poses."""
         graph = self._merged.graphs[component]
         away = np.hypot(graph.means[:, 0] - at.x, graph.means[:, 1] - at.y)
-        near = np.flatnonzero(away < REACH)
-        near = near[np.argsort(away[near], kind="stable")][: 3 * NODES]
-        return [graph.nodes[k] for k in near.tolist()], graph.means[near]
+        nearby = np.flatnonzero(away < REACH)
+        nearby = nearby[np.argsort(away[nearby], kind="stable")][: 3 * NODES]
+        return [graph.nodes[k] for k in nearby.tolist()], graph.means[nearby]
 
     def _votes(self, around: Iterable[Node], frame: Frame, robot: Pose2) -> list[_Vote]:
-        """What the doubles of nodes say."""
+        """The motions that the aliases of nodes imply."""
         votes: list[_Vote] = []
-        for one in around:
-            frame_from_one = self._placed(one)[1]
-            for alike in self._look_alikes(one):
-                other_frame, there = self._placed(alike.other)
-                told = there @ alike.other_from_node.mean @ frame_from_one.inverse() @ robot
-                if other_frame == frame and same_place(told, robot):
+        for neighbour in around:
+            frame_from_neighbour = self._placed(neighbour)[1]
+            for alike in self._aliases(neighbour):
+                other_frame, frame_from_alias = self._placed(alike.other)
+                robot_there = (
+                    frame_from_alias @ alike.other_from_node.mean @ frame_from_neighbour.inverse() @ robot
+                )
+                if other_frame == frame and same_place(robot_there, robot):
                     continue
-                shown = frame_from_one.apply(one.points_in_robot[alike.landmarks])
+                shown = frame_from_neighbour.apply(neighbour.points_in_robot[alike.landmarks])
                 shown = shown[np.isfinite(shown[:, 0])]
-                votes.append(_Vote(one, alike, other_frame, there, told, shown))
+                votes.append(_Vote(neighbour, alike, other_frame, frame_from_alias, robot_there, shown))
         return votes
 
     def _parties(self, votes: Sequence[_Vote]) -> Iterator[list[_Vote]]:
         """Votes of enough nodes for about the same pose."""
         for vote in votes:
-            party = [one for one in votes if one.frame == vote.frame and same_place(one.robot, vote.robot)]
-            if len({one.here.id for one in party}) >= self._settings.least_nodes:
+            party = [
+                other_vote
+                for other_vote in votes
+                if other_vote.frame == vote.frame and same_place(other_vote.robot, vote.robot)
+            ]
+            if len({other_vote.here.id for other_vote in party}) >= self._settings.least_nodes:
                 yield party
 
     def _placed(self, node: Node) -> tuple[Frame, Pose2]:
@@ -282,12 +289,12 @@ class AliasedRegions:
         return component, self._merged.pose(node.id)
 
     def _way(self, a: Node, b: Node) -> PoseGaussian:
-        """`a_from_b` of two nodes in one frame; in a map that is not merged nobody says how surely."""
+        """`a_from_b` of two nodes in one frame; without covariance in a map that is not merged."""
         mean = self._placed(a)[1].inverse() @ self._placed(b)[1]
-        told = self._merged.relative(a.id, b.id)
-        return told or PoseGaussian.from_sigmas(mean, UNTOLD_XY, UNTOLD_HEADING)
+        relative = self._merged.relative(a.id, b.id)
+        return relative or PoseGaussian.from_sigmas(mean, UNTOLD_XY, UNTOLD_HEADING)
 
-    def _look_alikes(self, node: Node) -> list[AliasedNode]:
+    def _aliases(self, node: Node) -> list[AliasedNode]:
         return self._alike.of(node, self._index, self._node_of, partial(between, self._merged))
 
 

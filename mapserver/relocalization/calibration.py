@@ -1,4 +1,4 @@
-"""How probable it is that a robot is at a place that was recognised, from what speaks for it and against it.
+"""Calibration: the probability that a robot is at a recognised place, from the evidence for and against it.
 
 A logistic regression on views of simulated buildings, with truth, by `python -m benchmarks.fit_belief`; its
 buildings are not those on which benchmarks.relocalize measures.
@@ -20,13 +20,13 @@ COEFFICIENTS = (1.078, 0.378, 1.095, -0.033, 0.082, -3.171)
 
 @dataclass(frozen=True)
 class HypothesisSupport:
-    """What is known of one place among those that were recognised in a view.
+    """Evidence of one place among those that were recognised in a view.
 
     Attributes:
         inliers: landmarks of its best node that agree.
         share: of the matches that could have agreed.
         seen: share of the landmarks that should be in the view that are.
-        sightings: nodes that say so.
+        sightings: recognised nodes.
         others: features that the strongest other place explains, as a share of those that this one does.
     """
 
@@ -57,4 +57,4 @@ def probabilities(
     """That the robot is at each of the places that were recognised in one view, 0 to 1, at most 1 in all."""
     alone = [1.0 / (1.0 + math.exp(-float(np.dot(weights, place.numbers)))) for place in places]
     total = max(1.0, sum(alone))
-    return [one / total for one in alone]
+    return [weight / total for weight in alone]

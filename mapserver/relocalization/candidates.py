@@ -1,4 +1,4 @@
-"""Retrieval: which nodes look like a view. The first of three steps to an answer."""
+"""Retrieval: candidate nodes for a view. The first of three steps to an answer."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ MOST_COMPARED = 16
 
 
 class Retrieval(Protocol):
-    """Finds nodes that look like a view, for example mapweave.mapserver.retrieval.place_index.PlaceIndex."""
+    """Finds candidate nodes for a view, for example mapweave.mapserver.retrieval.place_index.PlaceIndex."""
 
     def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
-        """At most k nodes with how much they look like it, best first."""
+        """At most k nodes with their similarity to it, best first."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Nodes that look like a view.
+    """Candidate nodes for a view.
 
     Attributes:
         view: the image's features.
-        ranked: nodes with how much they look like it, best first.
+        ranked: nodes with their similarity to it, best first.
     """
 
     view: View

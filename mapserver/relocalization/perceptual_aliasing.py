@@ -27,7 +27,7 @@ from mapweave.registration.recognition import RecognitionSettings
 
 
 class PerceptualAliasing:
-    """Finds places that look like one that was recognised. It stands for one merged map."""
+    """Finds places that look like a recognised one. It belongs to one merged map."""
 
     def __init__(
         self,
@@ -42,30 +42,30 @@ class PerceptualAliasing:
         """Take what is known.
 
         Args:
-            index: which nodes look like a view.
+            index: finds candidates of a view.
             node_of: gives a node by its id.
             merged: where nodes are.
-            cache: which nodes look alike; outlives the merged map.
+            cache: of aliased nodes; outlives the merged map.
             recognition: when a place counts as recognised.
             regions: when a place counts as being there twice, by its surroundings.
-            faint: candidates that look less alike than this share of the best one are left out.
+            faint: candidates with less than this share of the best one's similarity are left out.
         """
         self._node_of, self._merged, self._cache = node_of, merged, cache
         self._settings, self._faint = recognition, faint
         self._regions = AliasedRegions(index, node_of, merged, cache, regions)
 
     def prepare(self, most: int) -> int:
-        """Find out what at most so many nodes look like before anybody asks, and say how many are left."""
+        """Evaluate the aliases of at most so many nodes in advance, and return how many are left."""
         return self._regions.prepare(most)
 
     def matches(self, view: View, best: NodeMatch, ranked: Sequence[tuple[NodeId, float]]) -> list[NodeMatch]:
-        """Nodes elsewhere, of those that look like a view, that look like the node recognised best."""
-        s, found, node = self._settings, [], self._node_of(best.node)
-        for other in elsewhere(ranked, best.node, self._faint):
-            double = self._node_of(other)
+        """Candidates of a view that are elsewhere and look like the node recognised best."""
+        s, aliases, node = self._settings, [], self._node_of(best.node)
+        for candidate in elsewhere(ranked, best.node, self._faint):
+            double = self._node_of(candidate)
             if node is None or double is None:
                 continue
-            mapped = between(self._merged, other, best.node)
+            mapped = between(self._merged, candidate, best.node)
             if mapped is not None:
                 pairs = match(double.landmarks.codes, node.landmarks.codes, s.matching)
                 left = unexplained(double, pairs, node.landmarks.pixels, node.camera, mapped, EXPLAINED_PX)
@@ -76,16 +76,16 @@ class PerceptualAliasing:
                 continue
             alias = carried(double, likeness, best, view, s.matching, EXPLAINED_PX)
             if alias.recognition.inliers >= SLIGHT * best.recognition.inliers:
-                found.append(alias)
-        return found
+                aliases.append(alias)
+        return aliases
 
     def counterpart(self, place: PlaceHypothesis, ranked: Sequence[NodeId]) -> PlaceHypothesis | None:
-        """Where the robot may be as well, by what the surroundings of a place look like."""
+        """Other poses where the robot may be, by aliased surroundings of a place."""
         best = place.best
-        found = self._regions.counterpart(best, ranked)
-        if found is None:
+        region = self._regions.counterpart(best, ranked)
+        if region is None:
             return None
-        twice = [pair for pair in best.recognition.pairs.tolist() if pair[1] in found.features]
-        recognition = replace(best.recognition, node_from_robot=found.node_from_robot, pairs=np.array(twice))
-        seen = NodeMatch(found.node, recognition)
-        return PlaceHypothesis([seen], found.node_from_robot, found.features, found.nodes)
+        twice = [pair for pair in best.recognition.pairs.tolist() if pair[1] in region.features]
+        recognition = replace(best.recognition, node_from_robot=region.node_from_robot, pairs=np.array(twice))
+        match = NodeMatch(region.node, recognition)
+        return PlaceHypothesis([match], region.node_from_robot, region.features, region.nodes)

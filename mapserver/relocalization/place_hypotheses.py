@@ -1,4 +1,4 @@
-"""Places that were recognised in one view: what says so, how sure it is, and estimates put together."""
+"""Pose hypotheses: places recognised in one view, their evidence, and averaged estimates."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class NodeMatch:
     Attributes:
         node: which.
         recognition: how.
-        alike: the node that it looks like, if that one was recognised in the view and this one in that one.
-        lonely: it rests on one thing, and nothing is seen of what should be seen beside that.
+        alike: the recognised node of which this is an alias, if so.
+        lonely: it rests on one thing, and nothing is seen of what should be visible around that.
     """
 
     node: NodeId
@@ -49,13 +49,13 @@ class NodeMatch:
 
 @dataclass(frozen=True, eq=False)
 class PlaceHypothesis:
-    """Sightings that agree on one pose, best first.
+    """Recognitions that agree on one pose, best first.
 
     Attributes:
         sightings: of one place.
         best_from_robot: pose in the first one's frame, combined.
         features: of the view that they explain together.
-        nodes_around: another place, that tell of this one by what they look like; 0 if it was recognised.
+        nodes_around: of another place, whose aliases imply this one; 0 if it was recognised.
     """
 
     sightings: list[NodeMatch]
@@ -65,60 +65,60 @@ class PlaceHypothesis:
 
     @property
     def best(self) -> NodeMatch:
-        """The one of most landmarks."""
+        """The recognition with most landmarks."""
         return self.sightings[0]
 
     @property
     def is_double(self) -> bool:
-        """Whether it looks like a place that was recognised."""
-        return any(one.alike is not None for one in self.sightings)
+        """Whether it is an alias of a recognised place."""
+        return any(match.alike is not None for match in self.sightings)
 
 
-def is_lonely(node: Node, view: View, found: Recognition) -> bool:
-    """Whether a recognition rests on one thing, and nothing is seen of what should be seen beside it.
+def is_lonely(node: Node, view: View, recognition: Recognition) -> bool:
+    """Whether a recognition rests on one thing, and nothing is seen of what should be visible around it.
 
-    A thing can be moved, and takes all that is told from it along. Landmarks away from it, of which each
-    would be seen as often as those on it are, are then missing. What one person may hide is not.
+    A thing can be moved with all its landmarks. Then landmarks away from it, each with the same detection
+    rate, are missing. Landmarks that one person may occlude do not count.
 
     Args:
         node: the place.
         view: the image's features.
-        found: that the view shows the place.
+        recognition: that the view shows the place.
     """
     points = node.landmarks.points_in_robot(node.camera)
     agreeing = np.zeros(len(points), np.bool_)
-    agreeing[found.pairs[:, 0]] = True
+    agreeing[recognition.pairs[:, 0]] = True
     on_it = points[agreeing & np.isfinite(points[:, 0])]
     if len(on_it) < 3 or extent(on_it) > THING_SIGMA:
         return False
-    there = found.node_from_robot.mean.inverse().apply(points)
-    pixels = view.camera.project(there)
+    points_in_view = recognition.node_from_robot.mean.inverse().apply(points)
+    pixels = view.camera.project(points_in_view)
     expected = view.camera.contains(pixels) & ~agreeing
     away = np.linalg.norm(points[expected][:, None] - on_it[None], axis=2).min(axis=1) > BESIDE
     missing = pixels[expected][away]
-    seen = min(found.evidence["seen"], 0.9)
-    count = len(missing) - hidden(missing[:, 0], view, found)
-    return count * math.log(1.0 - seen) < math.log(MISSING_BY_CHANCE)
+    detection_rate = min(recognition.evidence["seen"], 0.9)
+    count = len(missing) - hidden(missing[:, 0], view, recognition)
+    return count * math.log(1.0 - detection_rate) < math.log(MISSING_BY_CHANCE)
 
 
-def hidden(missing: Array, view: View, found: Recognition) -> int:
-    """How many landmarks one person who stands in the view may hide, at most.
+def hidden(missing: Array, view: View, recognition: Recognition) -> int:
+    """How many landmarks one person in the view may occlude, at most.
 
     Args:
         missing: (M,) px, how far to the right they should be seen.
         view: the image's features.
-        found: that the view shows the place.
+        recognition: that the view shows the place.
     """
     agreeing = np.zeros(len(view), np.bool_)
-    agreeing[found.pairs[:, 1]] = True
+    agreeing[recognition.pairs[:, 1]] = True
     starts = missing[:, None]
     ends = starts + HIDDEN_WIDTH * view.camera.width
 
     def inside(across: Array) -> NDArray[np.int64]:
         return np.asarray(((across >= starts) & (across <= ends)).sum(axis=1), np.int64)
 
-    own, others = inside(view.pixels[agreeing, 0]), inside(view.pixels[~agreeing, 0])
-    possible = (own <= HIDDEN_AGREEING * agreeing.sum()) & (others >= HIDDEN_FEATURES)
+    own, outside = inside(view.pixels[agreeing, 0]), inside(view.pixels[~agreeing, 0])
+    possible = (own <= HIDDEN_AGREEING * agreeing.sum()) & (outside >= HIDDEN_FEATURES)
     return int(inside(missing)[possible].max(initial=0))
 
 
@@ -130,16 +130,21 @@ def extent(points: Array) -> float:
 
 
 def supported(places: Sequence[PlaceHypothesis]) -> list[HypothesisSupport]:
-    """What speaks for each of the places that were recognised in one view."""
-    found = []
+    """Evidence for each of the places recognised in one view."""
+    supports = []
     for place in places:
-        one = place.best.recognition
-        others = max((len(other.features) for other in places if other is not place), default=0)
-        share, against = one.inliers / max(one.usable, 1), others / len(place.features)
-        found.append(
-            HypothesisSupport(one.inliers, share, one.evidence["seen"], len(place.sightings), against)
+        recognition = place.best.recognition
+        rival_features = max((len(rival.features) for rival in places if rival is not place), default=0)
+        share, against = (
+            recognition.inliers / max(recognition.usable, 1),
+            rival_features / len(place.features),
         )
-    return found
+        supports.append(
+            HypothesisSupport(
+                recognition.inliers, share, recognition.evidence["seen"], len(place.sightings), against
+            )
+        )
+    return supports
 
 
 def fuse(first: PoseGaussian, second: PoseGaussian) -> PoseGaussian:
@@ -149,7 +154,7 @@ def fuse(first: PoseGaussian, second: PoseGaussian) -> PoseGaussian:
     view and often the same landmarks are behind both, so adding their information would count them twice.
     """
     difference = (first.mean.inverse() @ second.mean).vector
-    information = [np.linalg.inv(one.covariance + 1e-12 * np.eye(3)) for one in (first, second)]
+    information = [np.linalg.inv(pose.covariance + 1e-12 * np.eye(3)) for pose in (first, second)]
     best: tuple[float, float] = (math.inf, 0.0)
     for weight in np.linspace(0.0, 1.0, 11):
         together = np.linalg.inv((1 - weight) * information[0] + weight * information[1])

@@ -35,7 +35,7 @@ def answer_of(
     )
     certainty = Certainty.AMBIGUOUS
     if verdict.outcome is Outcome.FOUND:
-        # Photographs do not tell how far away from them the view was taken.
+        # The distance from a photograph is unknown.
         certainty = Certainty.FOUND if candidates[0].distance_known else Certainty.PLACE
     return RelocalizeAnswer(certainty, candidates, reason)
 
@@ -78,18 +78,18 @@ def _reason(verdict: Verdict, merged: MergedMap, least_features: int) -> str:
         case Outcome.NOT_RECOGNISED:
             return _nearest_refusal(verdict.registration)
         case Outcome.ONE_WEAK_NODE:
-            return f"not sure: {words}, and no other node says the same"
+            return f"not sure: {words}, and no other node confirms it"
         case Outcome.ONE_THING:
-            return f"not sure: {words}, all on one thing, and nothing of what should be beside it"
+            return f"not sure: {words}, all on one thing, and nothing of what should be around it"
 
 
 def _rivalry(rivals: Sequence[PlaceHypothesis], merged: MergedMap) -> str:
-    """Which places it may be, and what is known of their likeness."""
+    """The possible places, and their aliasing, in words."""
     names = " or ".join(str(place.best.node) for place in rivals)
     most, least = len(rivals[0].features), len(rivals[-1].features)
     words = f"it may be {names}: they explain {most} to {least} features"
     if any(place.is_double for place in rivals):
-        words += ", and look alike on the map"
+        words += ", and look the same on the map"
     if any(place.nodes_around for place in rivals):
         words += f", and so do {max(place.nodes_around for place in rivals)} nodes around them"
     if any(between(merged, rivals[0].best.node, place.best.node) is None for place in rivals):
@@ -100,6 +100,6 @@ def _rivalry(rivals: Sequence[PlaceHypothesis], merged: MergedMap) -> str:
 def _nearest_refusal(registration: Registration) -> str:
     """The reason of the node that came nearest to being recognised."""
     if not registration.refusals:
-        return "the nodes that look like it are gone"
+        return "the similar nodes are gone"
     node, refusal = max(registration.refusals, key=lambda item: (item[1].inliers, item[1].matches, item[0]))
     return f"not recognised; nearest is {node}: {refusal.reason}"

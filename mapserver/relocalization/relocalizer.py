@@ -1,4 +1,4 @@
-"""Tells a lost robot where it is: retrieve candidates, register the view with them, decide between places.
+"""Relocalization of lost robots: retrieve candidates, register the view with them, decide between places.
 
 An answer is FOUND only if every place that explains the view about as well is the same place. Whether two
 places are the same is asked of the merged map: the poses that they give must agree within what the map and
@@ -30,7 +30,7 @@ class RelocalizationSettings:
     Attributes:
         recognition: when a view counts as recognised.
         regions: when a place counts as being there twice, by its surroundings.
-        faint: a node that looks so much less like the view than one that was recognised is not looked at.
+        faint: candidates with less than this share of a recognised node's similarity are not registered.
     """
 
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
@@ -39,11 +39,11 @@ class RelocalizationSettings:
 
 
 class Relocalizer:
-    """Answers where views were taken. It stands for one merged map; make another for the next.
+    """Answers where views were taken. It belongs to one merged map; make another for the next.
 
     Attributes:
         registration: compares views with nodes.
-        aliasing: which places look alike.
+        aliasing: which places look the same.
         selection: decides between places.
     """
 
@@ -58,11 +58,11 @@ class Relocalizer:
         """Take what is known.
 
         Args:
-            index: which nodes look like a view; may know nodes that the merged map does not know yet.
+            index: finds candidates of a view; may have nodes that are not in the merged map yet.
             node_of: gives a node by its id, for example `Merger.node`.
             merged: where nodes are.
             settings: how.
-            alike: which nodes look alike; outlives the merged map, so that it is found out once.
+            alike: cache of aliased nodes; outlives the merged map.
         """
         s = settings or RelocalizationSettings()
         self._index, self._node_of, self._merged = index, node_of, merged
@@ -75,16 +75,16 @@ class Relocalizer:
         self.selection = HypothesisSelector(merged, self.aliasing, least)
 
     def answer(self, view: View) -> RelocalizeAnswer:
-        """Say where a view was taken, or that it is not known, with the reason in words."""
+        """Where a view was taken, or unknown, with the reason in words."""
         candidates = retrieve(view, self._index, self._least_features)
         registration = self.registration.register(candidates)
         return self.conclude(registration)
 
     def conclude(self, registration: Registration) -> RelocalizeAnswer:
-        """Say what follows from the nodes that were recognised."""
+        """The answer that follows from the recognised nodes."""
         verdict = self.selection.decide(registration)
         return answer_of(verdict, self._merged, self._node_of, self._least_features)
 
     def prepare(self, most: int) -> int:
-        """Find out what at most so many nodes look like before anybody asks, and say how many are left."""
+        """Evaluate the aliases of at most so many nodes in advance, and return how many are left."""
         return self.aliasing.prepare(most)

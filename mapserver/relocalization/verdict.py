@@ -25,7 +25,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 GATE = 16.3
 """Chi-square with 3 degrees of freedom within which two estimates agree."""
 FLOOR_XY = 0.05
-"""Error between two estimates that no covariance tells of, m."""
+"""Error between two estimates beyond their covariances, m."""
 FLOOR_HEADING = 0.03
 """Heading error between two estimates that no covariance tells of, rad."""
 COMPARABLE = 0.6
@@ -42,7 +42,7 @@ class Outcome(Enum):
     NO_CANDIDATE = auto()
     NOT_RECOGNISED = auto()
     ONE_WEAK_NODE = auto()
-    """One node speaks alone, by few landmarks."""
+    """A single node supports it, with few landmarks."""
     ONE_THING = auto()
     """All landmarks that agree are on one thing, which may have been moved."""
 
@@ -65,7 +65,7 @@ class Verdict:
 
 
 class HypothesisSelector:
-    """Groups what was recognised into places, and decides between them. It stands for one merged map."""
+    """Groups recognitions into places, and decides between them. It belongs to one merged map."""
 
     def __init__(self, merged: MergedMap, aliasing: PerceptualAliasing, least_features: int) -> None:
         """Take where nodes are, and which places look alike.
@@ -73,14 +73,14 @@ class HypothesisSelector:
 
         Args:
             merged: where nodes are.
-            aliasing: which other places look like one that was recognised.
+            aliasing: which other places look like a recognised one.
             least_features: a view with fewer has no candidates.
         """
         self._merged, self._aliasing = merged, aliasing
         self._least_features = least_features
 
     def decide(self, registration: Registration) -> Verdict:
-        """Say where the robot is if only one place comes into question, or why not."""
+        """The robot's pose if only one place is possible, or why not."""
         places = self.places(registration)
         rivals = self._rivals(places)
         outcome = self._refusal(registration, places, rivals)
@@ -111,12 +111,12 @@ class HypothesisSelector:
                 Outcome.ONE_WEAK_NODE,
                 len(matches) == 1 and matches[0].recognition.inliers < ALONE,
             ),
-            (Outcome.ONE_THING, all(one.lonely for one in matches)),
+            (Outcome.ONE_THING, all(match.lonely for match in matches)),
         )
         return next((outcome for outcome, holds in reasons if holds), None)
 
     def places(self, registration: Registration) -> list[PlaceHypothesis]:
-        """Group the nodes that were recognised, and those that look like the best of them, into places.
+        """Group the recognised nodes, and the aliases of the best of them, into places.
 
         Nodes agree if their poses do, within what the map and the recognitions are certain of. The best
         supported place is the first.
@@ -124,29 +124,29 @@ class HypothesisSelector:
         matches, candidates = list(registration.matches), registration.candidates
         if matches:
             matches += self._aliasing.matches(candidates.view, matches[0], candidates.ranked)
-        left = sorted(matches, key=lambda one: (-one.recognition.inliers, one.node))
+        left = sorted(matches, key=lambda match: (-match.recognition.inliers, match.node))
         places = []
         while left:
             best, left = left[0], left[1:]
-            combined, agreeing, others = best.recognition.node_from_robot, [best], []
-            for one in left:
-                estimate = self._in_frame_of(best.node, one)
+            combined, agreeing, remaining = best.recognition.node_from_robot, [best], []
+            for match in left:
+                estimate = self._in_frame_of(best.node, match)
                 if estimate is None or not _agree(best.recognition.node_from_robot, estimate):
-                    others.append(one)
+                    remaining.append(match)
                     continue
-                agreeing.append(one)
+                agreeing.append(match)
                 combined = fuse(combined, estimate)
-            features = frozenset(int(f) for one in agreeing for f in one.recognition.pairs[:, 1])
+            features = frozenset(int(f) for match in agreeing for f in match.recognition.pairs[:, 1])
             places.append(PlaceHypothesis(agreeing, combined, features))
-            left = others
+            left = remaining
         return sorted(places, key=lambda place: (-len(place.features), place.best.node))
 
-    def _in_frame_of(self, node: NodeId, one: NodeMatch) -> PoseGaussian | None:
+    def _in_frame_of(self, node: NodeId, match: NodeMatch) -> PoseGaussian | None:
         """A match's estimate in another node's frame; None if the map does not join the two."""
-        if node == one.node:
-            return one.recognition.node_from_robot
-        relative = self._merged.relative(node, one.node)
-        return None if relative is None else relative @ one.recognition.node_from_robot
+        if node == match.node:
+            return match.recognition.node_from_robot
+        relative = self._merged.relative(node, match.node)
+        return None if relative is None else relative @ match.recognition.node_from_robot
 
     def _rivals(self, places: Sequence[PlaceHypothesis]) -> list[PlaceHypothesis]:
         """Places that explain the view about as well as the first, which is among them."""

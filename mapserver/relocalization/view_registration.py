@@ -36,7 +36,7 @@ class Registration:
 
 
 class ViewRegistration:
-    """Registers views with nodes. It stands for one merged map."""
+    """Registers views with nodes. It belongs to one merged map."""
 
     def __init__(
         self,
@@ -51,19 +51,19 @@ class ViewRegistration:
             node_of: gives a node by its id.
             merged: where nodes are.
             recognition: when a view counts as recognised.
-            faint: once a node suffices, candidates that look less alike than this share of it are left out.
+            faint: once a node suffices, candidates with less than this share of its similarity are left out.
         """
         self._node_of, self._merged = node_of, merged
         self._settings, self._faint = recognition, faint
 
     def register(self, candidates: Candidates) -> Registration:
-        """Compare a view with its candidates, as far as it can matter."""
+        """Register a view with its candidates, as long as the answer can change."""
         view = candidates.view
         matches: list[NodeMatch] = []
         refusals: list[tuple[NodeId, Refusal]] = []
         best_score = 0.0
         for node_id, score in candidates.ranked:
-            sure = any(one.recognition.inliers >= ALONE for one in matches)
+            sure = any(recognised.recognition.inliers >= ALONE for recognised in matches)
             node = self._node_of(node_id)
             if node is None or (sure and score < self._faint * best_score):
                 continue

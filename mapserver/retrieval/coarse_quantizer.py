@@ -67,15 +67,15 @@ class CoarseQuantizer:
             _learned(sample[family == k].astype(np.float32), max(count // heads, 1))
             for k in range(len(above))
         ]  # fmt: skip
-        starts = np.concatenate([[0], np.cumsum([len(one) for one in below])])
+        starts = np.concatenate([[0], np.cumsum([len(cell) for cell in below])])
         return cls(above, np.concatenate(below), starts.astype(np.int64))
 
     def nearest(self, vectors: Vectors) -> Ids:
         """(N,) which mean each of (N, 32) vectors belongs to."""
         if len(vectors) < FEW:
             # The same two searches; family by family costs a call each.
-            found: Ids = self.searched.search(vectors, 1, params=probing(1))[1][:, 0]
-            return found
+            cells: Ids = self.searched.search(vectors, 1, params=probing(1))[1][:, 0]
+            return cells
         family = nearest(vectors, self.heads)
         order = np.argsort(family, kind="stable")
         out = np.empty(len(vectors), np.int64)
@@ -118,8 +118,8 @@ def nearest(vectors: Vectors, means: Vectors) -> Ids:
     """(N,) which of (M, 32) means is nearest to each of (N, 32) vectors."""
     if not len(vectors):
         return np.zeros(0, np.int64)
-    found: Ids = faiss.knn(vectors, means, 1)[1][:, 0]
-    return found
+    cells: Ids = faiss.knn(vectors, means, 1)[1][:, 0]
+    return cells
 
 
 def _learned(sample: Vectors, count: int) -> Vectors:

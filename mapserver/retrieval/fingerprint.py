@@ -1,4 +1,4 @@
-"""A number by which a node's descriptors are known again, whatever the order in which they are met.
+"""Fingerprint of a node's descriptors, independent of their order.
 
 A node's fingerprint is the sum of one number a landmark, so it can be taken from a node and as well from
 landmarks that lie scattered in an index. It guards against mistakes, not against malice.
@@ -14,7 +14,7 @@ Prints = NDArray[np.uint64]
 FACTORS = np.array(
     [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93], np.uint64
 )
-"""Odd, with bits that look thrown; one for each eight bytes of a descriptor."""
+"""Odd random numbers; one for each eight bytes of a descriptor."""
 LAST = np.uint64(0xFF51AFD7ED558CCD)
 """Of the mixing at the end, as in MurmurHash3 (Appleby)."""
 

@@ -1,10 +1,10 @@
-"""The place index as a file, so that a server that starts again need not sort every landmark in anew.
+"""The place index as a file, so that a restarted server need not insert every landmark again.
 
     line "mapweave places", header (JSON), means, blocks of landmarks ..., nodes, SHA-256 of all before
 
-The parts are arrays in NumPy's format. The file says only what the index held; whether that is still so is
-asked of the store, node by node, by the descriptors themselves (PlaceIndex.extend). A digest stands at the
-end, because damage that reads well would put landmarks into cells where they are not found.
+The parts are arrays in NumPy's format. The file is compared with
+the store, node by node, by fingerprints of the descriptors (PlaceIndex.extend). A digest is at the end,
+because undetected damage would put landmarks into cells where they are not found.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ Positions = Mapping[MapId, Position]
 def save(path: Path, index: PlaceIndex, made_from: Positions) -> bool:
     """Write the file, or replace it at once when all is on the disk.
 
-    Searches and new nodes wait for a block at a time, not for the file. What changes meanwhile may be in it
-    or not.
+    Searches and new nodes wait for a block at a time, not for the file. Concurrent changes may be in it or
+    not.
 
     Args:
         path: of the file; its folder must be there.
@@ -50,7 +50,7 @@ def save(path: Path, index: PlaceIndex, made_from: Positions) -> bool:
         made_from: the logs behind it.
 
     Returns:
-        Whether it was written: an index that has no cells yet is made anew as fast as it is read.
+        Whether it was written: an index without cells is built as fast as it is read.
 
     Raises:
         InvalidFile: the disk does not take it.
@@ -169,7 +169,7 @@ def _means(file: IO[bytes]) -> CoarseQuantizer:
 
 
 def _blocks(file: IO[bytes], means: int) -> Iterator[Block]:
-    # Whoever takes these does so in C++, without a look.
+    # The C++ code that takes these does not check them.
     while len(codes := _get(file)):
         block = Block(codes, _get(file), _get(file).astype(np.int64))
         shapes = (codes.shape, block.ids.shape, block.cells.shape)
@@ -191,7 +191,7 @@ def _get(file: IO[bytes]) -> NDArray[Any]:
 
 
 def _check_digest(file: IO[bytes], path: Path) -> None:
-    """Read all of it once before any of it is believed."""
+    """Read all of it once before any of it is used."""
     digest, size = hashlib.sha256(), os.fstat(file.fileno()).st_size
     left = size - digest.digest_size
     if left < len(MAGIC) or file.read(len(MAGIC)) != MAGIC:

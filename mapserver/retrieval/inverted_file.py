@@ -68,8 +68,8 @@ class InvertedFile:
         Args:
             first: id.
             last: id.
-            codes: (N, 32) of all of them, in any order: says in which cells they lie. Without it, or if it
-                is not true, the ids in all cells are looked through.
+            codes: (N, 32) of all of them, in any order: gives their cells. Without it, or if it is wrong, the
+                ids in all cells are searched.
         """
         left = None if codes is None else len(codes) - self._taken_out(first, last, codes)
         if left != 0:

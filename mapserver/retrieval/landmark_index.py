@@ -1,6 +1,6 @@
 """The nearest of all landmarks of the fleet: one by one while they are few, by cells that grow when many.
 
-Cells are learned anew as landmarks come; until new ones are ready the old ones serve, with all that has come.
+Cells are trained again as landmarks come; until new ones are ready the old ones are used, with all landmarks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mapweave.mapserver.retrieval.inverted_file import Block, InvertedFile
 log = logging.getLogger(__name__)
 
 MOST_WITHIN = 256
-"""Landmarks that are told as alike to one: where thousands are all alike, pairs of them grow by the square.
+"""Largest number of similar landmarks of one: where thousands are similar, their pairs grow by the square.
 While `within` works there are about 200 nodes, and each shows a thing once."""
 AT_ONCE = 1 << 19
 """Landmarks that are copied at once when new cells are filled from old ones."""
@@ -36,9 +36,9 @@ class LandmarkIndexSettings:
     Attributes:
         small: up to as many every one is compared; beyond, those of some cells.
         exact: up to as many `within` works.
-        growth: cells are learned anew when there are so many times as many landmarks.
+        growth: cells are trained again when there are so many times as many landmarks.
         probes: cells that are searched for a feature of a view.
-        patience: landmarks beyond which cells are learned beside the questions, not between them.
+        patience: landmarks beyond which cells are trained in the background of questions, not between them.
     """
 
     small: int = 10_000
@@ -145,9 +145,9 @@ class LandmarkIndex:
         return rows.astype(np.int64), squared[rows, places], ids[rows, places]
 
     def keep_up(self) -> None:
-        """Wait for cells that are being learned if too much has come meanwhile: it is kept twice."""
+        """Wait for the training of cells if too many landmarks have come since: they are kept twice."""
         with self.lock:
-            missed = sum(len(one.ids) for one in self._missed if isinstance(one, AddedRows))
+            missed = sum(len(change.ids) for change in self._missed if isinstance(change, AddedRows))
         if missed > self._settings.patience:
             self.settle()
 
@@ -202,7 +202,7 @@ class LandmarkIndex:
         self._learner.start()
 
     def _learn(self, n: int, end: int) -> None:
-        """In a thread of its own: make new cells, catch up with what came meanwhile, and hand over."""
+        """In a thread of its own: train new cells, add landmarks that came since, and hand over."""
         try:
             cells = self._new(n, end)
             while True:
@@ -245,8 +245,8 @@ class LandmarkIndex:
 
 
 def _catch_up(cells: InvertedFile, missed: list[AddedRows | RemovedRows]) -> None:
-    for one in missed:
-        if isinstance(one, AddedRows):
-            cells.add(one.codes, one.ids)
+    for change in missed:
+        if isinstance(change, AddedRows):
+            cells.add(change.codes, change.ids)
         else:
-            cells.remove(one.first, one.last, one.codes)
+            cells.remove(change.first, change.last, change.codes)

@@ -2,7 +2,7 @@
 
 A node can be found as soon as it is announced. Superseded nodes of an earlier drive leave the index, so that
 a new node costs the same on every drive. Nodes of today stay in it, superseded or not: while maps are being
-made, links between all of them tell true merges from false ones.
+made, links between all of them distinguish true merges from false ones.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 SUFFIX = ".places"
 """Of the index's file, behind the store's name."""
 EVERY = 600.0
-"""Seconds between two looks whether there is something new to save."""
+"""Seconds between two checks whether there is something new to save."""
 WORTHWHILE = 0.02
 """Share of the nodes that must be new before a running server saves the index."""
 SETTLED = 3600.0
@@ -39,17 +39,17 @@ NodeOf = Callable[[NodeId], Node | None]
 
 
 class PlaceDatabase:
-    """Nodes by what they look like, in memory or beside a store.
+    """Nodes by their landmarks, in memory or with a store.
 
     One thread, the merging one, changes it, but for `announce`; any thread may ask.
     """
 
     def __init__(self, store: Store | None = None, path: Path | None = None) -> None:
-        """Begin with what was saved, as far as the store still holds it.
+        """Begin with the saved index, as far as it agrees with the store.
 
         Args:
-            store: says which nodes there are; None: start empty, and never save.
-            path: of the store's file; the index lies beside it.
+            store: has the nodes; None: start empty, and never save.
+            path: of the store's file; the index is next to it.
         """
         self._store = store
         self._path = None if path is None else path.with_name(path.name + SUFFIX)
@@ -69,7 +69,7 @@ class PlaceDatabase:
         return node_id in self._index
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
-        """At most k nodes with how much they look like a view, best first; see `PlaceIndex.query`."""
+        """At most k nodes with their similarity to a view, best first; see `PlaceIndex.query`."""
         return self._index.query(view, k, exclude)
 
     def overlaps(
@@ -82,15 +82,15 @@ class PlaceDatabase:
             node_of: gives another node by its id.
             before: pairs of nodes in which it was; of these also those that were left out are compared.
         """
-        found = self._index.overlaps(node, node_of)
-        for other_id in {one for pair in before for one in pair} & self._left_out:
-            other = node_of(other_id)
-            if other is not None and other_id != node.id:
-                codes, others = (bounded(one).landmarks.codes for one in (node, other))
-                value = voting.pair_overlap(codes, others, ALIKE)
+        overlaps_by_node = self._index.overlaps(node, node_of)
+        for candidate_id in {node_id for pair in before for node_id in pair} & self._left_out:
+            candidate = node_of(candidate_id)
+            if candidate is not None and candidate_id != node.id:
+                codes, candidate_codes = (bounded(node_id).landmarks.codes for node_id in (node, candidate))
+                value = voting.pair_overlap(codes, candidate_codes, ALIKE)
                 if value >= LEAST_OVERLAP:
-                    found[other_id] = value
-        return found
+                    overlaps_by_node[candidate_id] = value
+        return overlaps_by_node
 
     # Update.
 
@@ -101,11 +101,11 @@ class PlaceDatabase:
     def observe(self, node: Node) -> None:
         """Take note of a node before it is put: what its robot saw long before is no longer of today."""
         self._left_out.discard(node.id)
-        told = node.id.epoch, node.stamp_ns
-        self._newest[node.id.agent] = max(told, self._newest.get(node.id.agent, told))
+        newest = node.id.epoch, node.stamp_ns
+        self._newest[node.id.agent] = max(newest, self._newest.get(node.id.agent, newest))
 
     def put(self, nodes: Iterable[Node]) -> None:
-        """Put nodes, or put them anew; many at once cost less than one by one."""
+        """Put nodes, or replace them; many at once cost less than one by one."""
         self._index.extend(nodes)
 
     def remove(self, node: Node | None, node_id: NodeId) -> None:
@@ -158,7 +158,7 @@ class PlaceDatabase:
             self._save()
 
     def close(self) -> None:
-        """Save for the last time; nobody may change the database any more."""
+        """Save for the last time; the database must not change afterwards."""
         self._save()
 
     def _restored(self) -> PlaceIndex:
@@ -169,12 +169,12 @@ class PlaceDatabase:
             index = load(self._path, logs)
         except InvalidFile as error:
             if logs:
-                log.info("the place index is made anew: %s", error)
+                log.info("the place index is built again: %s", error)
             return PlaceIndex()
-        gone = index.retain(self._store.present())
+        removed = index.retain(self._store.present())
         log.info(
             "the place index of %d nodes is as it was saved; %d are gone; %.1f s",
-            len(index), gone, time.monotonic() - began,
+            len(index), removed, time.monotonic() - began,
         )  # fmt: skip
         return index
 
@@ -183,7 +183,7 @@ class PlaceDatabase:
         if self._store is None or self._path is None or state == self._saved:
             return
         try:
-            # The logs first: what comes meanwhile may be in the index, but is not claimed.
+            # The logs first: later changes may be in the index, but are not claimed.
             save(self._path, self._index, self._store.positions())
         except InvalidFile as error:
             log.warning("%s; the next start takes longer", error)

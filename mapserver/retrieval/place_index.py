@@ -1,4 +1,4 @@
-"""Which nodes look like a view: a growing index over the descriptors of all landmarks of the fleet."""
+"""The place index: finds nodes that look like a view, by the descriptors of all landmarks of the fleet."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
 
 SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
-FEW_GONE = 20
+FEW_REMOVED = 20
 """Of more nodes that go at once, the index is read through once for where they lie."""
 AT_ONCE = 1024
 """Nodes that are taken in at once."""
@@ -45,7 +45,7 @@ REACH = 0.6
 
 
 class PlaceIndex:
-    """Nodes by the looks of their landmarks. A node is searchable as soon as it is added.
+    """Nodes by the descriptors of their landmarks. A node is searchable as soon as it is added.
 
     One thread may fill it while others search. It is locked for a search, or for a few nodes that come.
     """
@@ -80,7 +80,7 @@ class PlaceIndex:
 
     @property
     def version(self) -> tuple[int, int]:
-        """Something else whenever a node has come, gone or changed its looks."""
+        """Changes whenever a node is added, removed or changed."""
         with self._lock:
             return self._next, len(self._slots)
 
@@ -110,7 +110,7 @@ class PlaceIndex:
 
         Args:
             node_id: which.
-            codes: (N, 32) of its landmarks, if they are known: they say where in the index it is.
+            codes: (N, 32) of its landmarks, if they are known: they give its cells.
         """
         with self._lock:
             slot = self._slots.pop(node_id, None)
@@ -123,13 +123,13 @@ class PlaceIndex:
                 self._landmarks.remove(slot << SLOT_BITS, (slot + 1) << SLOT_BITS, codes)
 
     def retain(self, node_ids: Collection[NodeId]) -> int:
-        """Forget all nodes but these, and say how many they were."""
+        """Forget all nodes but these, and return how many were forgotten."""
         kept = frozenset(node_ids)
-        gone = {slot: node_id for node_id, slot in self.slots.items() if node_id not in kept}
-        codes = self._codes_of(gone) if len(gone) > FEW_GONE else {}
-        for slot, node_id in gone.items():
+        removed = {slot: node_id for node_id, slot in self.slots.items() if node_id not in kept}
+        codes = self._codes_of(removed) if len(removed) > FEW_REMOVED else {}
+        for slot, node_id in removed.items():
             self.remove(node_id, codes.get(slot))
-        return len(gone)
+        return len(removed)
 
     def _codes_of(self, slots: Collection[int]) -> dict[int, NDArray[np.uint8]]:
         """The descriptors of some nodes, by their slots: read out of the index in one pass."""
@@ -140,14 +140,14 @@ class PlaceIndex:
             chosen = wanted[np.minimum(block.ids >> SLOT_BITS, len(wanted) - 1)]
             ids.append(block.ids[chosen])
             codes.append(block.codes[chosen])
-        found = np.concatenate(ids)
-        order = np.argsort(found)
-        slot = found[order] >> SLOT_BITS
+        all_ids = np.concatenate(ids)
+        order = np.argsort(all_ids)
+        slot = all_ids[order] >> SLOT_BITS
         parts = np.split(np.concatenate(codes)[order], np.flatnonzero(np.diff(slot)) + 1)
         return dict(zip(np.unique(slot).tolist(), parts, strict=False))
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
-        """Rank nodes by how much they look like a view, see mapweave.mapserver.retrieval.voting.votes.
+        """Rank nodes by their similarity to a view, see mapweave.mapserver.retrieval.voting.votes.
 
         Args:
             view: the image's features.
@@ -166,19 +166,19 @@ class PlaceIndex:
             if len(codes) == 0 or len(self._landmarks) == 0:
                 return []
             squared, ids = self._landmarks.nearest(codes, self._settings.votes)
-            # -1 is nobody's, shifted too.
-            found, scores = voting.votes(squared, ids >> SLOT_BITS, REACH)
+            # -1 belongs to no node, shifted too.
+            slots, scores = voting.votes(squared, ids >> SLOT_BITS, REACH)
             if len(exclude):
                 unwanted = [self._slots[node_id] for node_id in exclude if node_id in self._slots]
-                found, scores = found[wanted := ~np.isin(found, unwanted)], scores[wanted]
+                slots, scores = slots[wanted := ~np.isin(slots, unwanted)], scores[wanted]
             if not len(scores):
                 return []
             best = np.flatnonzero(scores >= np.sort(scores)[-min(k, len(scores))])
-            ranked = [(self._nodes[int(found[i])], float(scores[i])) for i in best]
+            ranked = [(self._nodes[int(slots[i])], float(scores[i])) for i in best]
         return sorted(ranked, key=lambda item: (-item[1], item[0]))[:k]
 
     def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
-        """Which nodes share how many alike descriptors with a node, see mapweave.merge.pose_graph.candidates.
+        """Overlaps of a node: shared similar descriptors, see mapweave.merge.pose_graph.candidates.
 
         Every overlap is exact. Up to `exact` landmarks all nodes are compared; of a larger fleet those that
         most landmarks vote for, see `query`.
@@ -198,23 +198,23 @@ class PlaceIndex:
             if alike is not None:
                 rows, squared, ids = alike
                 columns, slots = ids & ((1 << SLOT_BITS) - 1), ids >> SLOT_BITS
-                found, values = voting.overlaps(rows, columns, squared, slots, ALIKE, LEAST_OVERLAP)
-                told = zip(found.tolist(), values.tolist(), strict=True)
-                others = {self._nodes[slot]: value for slot, value in told}
+                ranked, values = voting.overlaps(rows, columns, squared, slots, ALIKE, LEAST_OVERLAP)
+                pairs = zip(ranked.tolist(), values.tolist(), strict=True)
+                overlaps_by_node = {self._nodes[slot]: value for slot, value in pairs}
         if alike is None:
             return self._voted(node, node_of)
-        others.pop(node.id, None)
-        return others
+        overlaps_by_node.pop(node.id, None)
+        return overlaps_by_node
 
     def _voted(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
         s, codes = self._settings, node.landmarks.codes
-        told: dict[NodeId, float] = {}
-        for other_id, _ in self._ranked(codes, s.compared, [node.id]):
-            other = node_of(other_id)
-            if other is not None:
-                others = bounded(other).landmarks.codes
-                told[other_id] = voting.pair_overlap(codes, others, ALIKE)
-        return {other: value for other, value in told.items() if value >= LEAST_OVERLAP}
+        overlaps_by_node: dict[NodeId, float] = {}
+        for candidate_id, _ in self._ranked(codes, s.compared, [node.id]):
+            candidate = node_of(candidate_id)
+            if candidate is not None:
+                candidate_codes = bounded(candidate).landmarks.codes
+                overlaps_by_node[candidate_id] = voting.pair_overlap(codes, candidate_codes, ALIKE)
+        return {candidate: value for candidate, value in overlaps_by_node.items() if value >= LEAST_OVERLAP}
 
     def settle(self) -> None:
         """Wait until cells that are being learned are in use."""
@@ -227,14 +227,14 @@ class PlaceIndex:
             slots: where each node's landmarks are. Landmarks of no node are forgotten.
             landmarks: filled, with the ids of those slots.
         """
-        ours = np.zeros(max(slots.values(), default=-1) + 2, np.bool_)
-        ours[np.fromiter(slots.values(), np.int64, len(slots))] = True
-        prints, strays = np.zeros(len(ours), np.uint64), set[int]()
+        own = np.zeros(max(slots.values(), default=-1) + 2, np.bool_)
+        own[np.fromiter(slots.values(), np.int64, len(slots))] = True
+        prints, strays = np.zeros(len(own), np.uint64), set[int]()
         for block in landmarks.blocks():
-            # The last one is nobody's.
-            slot = np.minimum(block.ids >> SLOT_BITS, len(ours) - 1)
+            # The last one belongs to no node.
+            slot = np.minimum(block.ids >> SLOT_BITS, len(own) - 1)
             np.add.at(prints, slot, landmark_prints(block.codes, block.ids & ((1 << SLOT_BITS) - 1)))
-            strays.update((block.ids[~ours[slot]] >> SLOT_BITS).tolist())
+            strays.update((block.ids[~own[slot]] >> SLOT_BITS).tolist())
         for stray in sorted(strays):
             landmarks.remove(stray << SLOT_BITS, (stray + 1) << SLOT_BITS)
         self._landmarks, self._lock = landmarks, landmarks.lock
@@ -247,9 +247,9 @@ class PlaceIndex:
         """Take in nodes at once."""
         codes, ids = [np.zeros((0, CODE_BYTES), np.uint8)], [np.zeros(0, np.int64)]
         for node in map(bounded, nodes):
-            known, seal = self._slots.get(node.id), fingerprint(node.landmarks.codes)
-            if known is not None:
-                if self._prints[known] == seal:
+            stored, seal = self._slots.get(node.id), fingerprint(node.landmarks.codes)
+            if stored is not None:
+                if self._prints[stored] == seal:
                     continue
                 self._put(codes, ids)
                 self.remove(node.id)

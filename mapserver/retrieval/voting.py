@@ -1,4 +1,4 @@
-"""From landmarks that are alike to nodes that are: the votes for a view, and the overlaps of a node."""
+"""Voting: from similar landmarks to similar nodes, for candidates of a view and overlaps of a node."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Real = NDArray[np.float64]
 
 
 def votes(squared: NDArray[np.float32], slots: Whole, reach: float) -> tuple[Whole, Real]:
-    """What the features of a view say together.
+    """Votes of the features of a view.
 
-    Each feature votes for the nodes of its nearest descriptors, by nearness and once a node. What it has to
-    give is divided by the root of the number of nodes it votes for, as rare words weigh more in a text; a
-    feature that half the fleet sees says little about where it is.
+    Each feature votes for the nodes of its nearest descriptors, by nearness and once a node. Its weight is
+    divided by the root of the number of nodes it votes for, as rare words weigh more in a text: a feature
+    that half the fleet sees is little evidence.
 
     Args:
         squared: (N, k) squared distances of N features' nearest landmarks, nearest first.
-        slots: (N, k) whose landmarks they are; below 0 is nobody's.
+        slots: (N, k) the nodes of the landmarks; below 0 for none.
         reach: distance at which a vote counts nothing.
 
     Returns:
@@ -32,14 +32,14 @@ def votes(squared: NDArray[np.float32], slots: Whole, reach: float) -> tuple[Who
     """
     weights = np.where(slots >= 0, 1.0 - squared.astype(np.float64) / reach**2, 0.0)
     feature, place = np.nonzero(weights > 0)
-    whose = slots[feature, place]
+    owners = slots[feature, place]
     # The nearest descriptor comes first, so the first vote of a feature for a node is its best.
-    _, first = np.unique(feature * (whose.max(initial=0) + 1) + whose, return_index=True)
-    feature, whose, given = feature[first], whose[first], weights[feature[first], place[first]]
+    _, first = np.unique(feature * (owners.max(initial=0) + 1) + owners, return_index=True)
+    feature, owners, given = feature[first], owners[first], weights[feature[first], place[first]]
     given /= np.sqrt(np.bincount(feature, minlength=len(squared)))[feature]
-    found, which = np.unique(whose, return_inverse=True)
-    scores: NDArray[Any] = np.bincount(which, given, minlength=len(found))
-    return found, scores.astype(np.float64)
+    nodes, which = np.unique(owners, return_inverse=True)
+    scores: NDArray[Any] = np.bincount(which, given, minlength=len(nodes))
+    return nodes, scores.astype(np.float64)
 
 
 def overlaps(
@@ -50,28 +50,28 @@ def overlaps(
 
     Args:
         rows: (K,) landmark of the node.
-        columns: (K,) landmark of the other that is alike.
+        columns: (K,) similar landmark of the other.
         squared: (K,) squared distances, all below alike^2.
         slots: (K,) which other.
         alike: distance at which a pair counts nothing.
-        least: overlap from which on it is told.
+        least: overlap from which on it is returned.
 
     Returns:
         (M,) slots, rising, and (M,) overlaps of at least `least`.
     """
-    found, which, hits = np.unique(slots, return_inverse=True, return_counts=True)
+    nodes, which, hits = np.unique(slots, return_inverse=True, return_counts=True)
     # A node with fewer hits than the least overlap cannot reach it.
     enough = hits[which] >= least
     rows, columns, which = rows[enough], columns[enough], which[enough]
     weights = 1.0 - np.asarray(squared[enough], np.float64) / alike**2
-    sums = np.minimum(*(_best(which, side, weights, len(found)) for side in (rows, columns)))
-    told = np.flatnonzero(sums >= least)
-    return found[told], sums[told]
+    sums = np.minimum(*(_best(which, side, weights, len(nodes)) for side in (rows, columns)))
+    kept = np.flatnonzero(sums >= least)
+    return nodes[kept], sums[kept]
 
 
-def pair_overlap(codes: NDArray[np.uint8], others: NDArray[np.uint8], alike: float) -> float:
+def pair_overlap(codes: NDArray[np.uint8], other_codes: NDArray[np.uint8], alike: float) -> float:
     """The same of two nodes' (N, 32) and (M, 32) codes, all compared with all."""
-    squared = squared_distances(codes.astype(np.float32), others.astype(np.float32))
+    squared = squared_distances(codes.astype(np.float32), other_codes.astype(np.float32))
     squared *= np.float32(landmark_tables().step ** 2)
     rows, columns = np.nonzero(squared < alike**2)
     return overlap(rows, columns, squared[rows, columns], alike)

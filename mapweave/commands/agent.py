@@ -70,7 +70,7 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the robot until its body ends or the process is told to stop."""
+    """Run the robot until its driver ends or the process is stopped."""
     from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.claim import Claim
     from mapweave.agent.drivers.recorded import RecordedRobot
@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
         if arguments.record is not None:
             robot = RecordedRobot(robot, arguments.record, print_line=print_error)
-        # Who is told to stop while it waits for its body stops waiting.
+        # A stop signal ends the wait for the robot.
         threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
         missions: dict[str, Mission] = {"explore": Explore(), "carried": Carried(), "idle": Idle()}
         options = AgentOptions(
@@ -164,6 +164,6 @@ def open_robot(
 
 
 def close_on(stop: threading.Event, robot: Robot) -> None:
-    """Close a robot once the process is told to stop: who waits for an observation stops waiting."""
+    """Close a robot once the process is stopped, which ends a wait for an observation."""
     stop.wait()
     robot.close()

@@ -21,7 +21,7 @@ def add_to(actions: Any) -> None:
     parser: argparse.ArgumentParser = actions.add_parser(
         "explain",
         help="why two nodes or two maps are linked, or are not",
-        description="Say why two nodes (r0.1.17 r1.1.5) are linked or are not, or why two maps (r0.1 r1.1) "
+        description="Explain why two nodes (r0.1.17 r1.1.5) are linked or not, or why two maps (r0.1 r1.1) "
         "are one or are not, with every number behind it; without ends, of each two maps. A running server "
         "is asked, or a map file.",
     )
@@ -61,9 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.draw is not None:
             raise InvalidValue(f"--draw needs two nodes: {EXAMPLE}")
         maps = None if ends is None else (MapId(*ends[0][:2]), MapId(*ends[1][:2]))
-        told = explained_maps(arguments, maps)
-        values = json_values(told)
-        lines = [line for one in told.maps for line in maps_words(one)] or ["there are no two maps"]
+        explanation = explained_maps(arguments, maps)
+        values = json_values(explanation)
+        lines = [line for item in explanation.maps for line in maps_words(item)] or ["there are no two maps"]
     print(json.dumps(values) if arguments.json else "\n".join(lines))
     return 0
 
@@ -88,7 +88,7 @@ def explained_nodes(arguments: argparse.Namespace, a: NodeId, b: NodeId) -> Pair
 def explained_maps(arguments: argparse.Namespace, ends: tuple[MapId, MapId] | None) -> FleetExplanation:
     """Two maps of a map file, or of what a server has; each two of them without ends."""
     from mapweave.commands.map_ends import ask
-    from mapweave.hybridmap.explanation import MAX_MAPS_TOLD, FleetExplanation
+    from mapweave.hybridmap.explanation import MAX_MAPS_LISTED, FleetExplanation
     from mapweave.hybridmap.query import ExplainRequest
     from mapweave.wire.keys import Keys
     from mapweave.wire.messages import decode, encode
@@ -100,7 +100,7 @@ def explained_maps(arguments: argparse.Namespace, ends: tuple[MapId, MapId] | No
 
     merged, _ = _merged(arguments)
     if ends is None:
-        return FleetExplanation(explain_fleet(merged, MAX_MAPS_TOLD))
+        return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED))
     return FleetExplanation((explain_maps(merged, *ends),))
 
 

@@ -1,4 +1,4 @@
-"""`mapweave map history`: what has become of the maps, and what people have ruled, with dates."""
+"""`mapweave map history`: joins, splits and manual constraints, with dates."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def add_to(actions: Any) -> None:
     """Declare the action."""
     parser: argparse.ArgumentParser = actions.add_parser(
         "history",
-        help="what has joined, come apart and been ruled, with dates",
-        description="Say what has become of the maps that a running server keeps, oldest first: which became "
+        help="joins, splits and manual constraints, with dates",
+        description="List the history of the maps that a running server keeps, oldest first: which became "
         "one, which came apart and what took their links away, which are kept apart since two robots cannot "
-        "have been where their links say, and what people have ruled. The server keeps the newest 500 on its "
-        "disk, and every ruling; a map file (--map) holds what was known when it was written.",
+        "have been where their links put them, and constraints. The server keeps the newest 500 on its "
+        "disk, and every constraint; a map file (--map) has the history until it was written.",
     )
     parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
     parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
@@ -38,15 +38,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.most < 1:
         raise InvalidValue(f"--most {arguments.most}: give 1 or more")
-    told = _history(arguments)
+    events = _history(arguments)
     if arguments.json:
-        print(json.dumps(json_values(told)))
+        print(json.dumps(json_values(events)))
         return 0
-    happenings = told.history
+    happenings = events.history
     left_out = len(happenings) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
     lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:10}  {h.words}" for h in happenings[-arguments.most :]]
-    print("\n".join(lines) if lines else "nothing has joined, come apart or been ruled yet")
+    print("\n".join(lines) if lines else "no joins, splits or manual constraints yet")
     return 0
 
 

@@ -20,8 +20,8 @@ def add_to(actions: Any) -> None:
     parser: argparse.ArgumentParser = actions.add_parser(
         "route",
         help="the way from node to node, and why it leads so, or why there is none",
-        description="Say which way robots are led from one node to another (r0.1.17 r1.1.5), step by step; "
-        "why not a shorter one; or why there is no way at all: what of it nobody could drive, what is "
+        description="Explain the route from one node to another (r0.1.17 r1.1.5), step by step; "
+        "why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
         "blocked, or which maps would have to be one. A running server is asked, or a map file. "
         "Exit status 0: there is a way; 2: there is none; 1: could not ask.",
     )
@@ -50,19 +50,19 @@ def run(arguments: argparse.Namespace) -> int:
         need("viz")
     start, goal = node_of(arguments.start), node_of(arguments.goal)
     blocked = tuple((node_of(a), node_of(b)) for a, b in arguments.blocked)
-    told = explained_route(arguments, start, goal, blocked)
-    values, lines = json_values(told), route_words(told)
-    if arguments.draw is not None and told.found:
-        draw_route(arguments, told)
+    explanation = explained_route(arguments, start, goal, blocked)
+    values, lines = json_values(explanation), route_words(explanation)
+    if arguments.draw is not None and explanation.found:
+        draw_route(arguments, explanation)
         values["picture"] = str(arguments.draw)
         lines.append(f"  picture   {arguments.draw}")
     print(json.dumps(values) if arguments.json else "\n".join(lines))
-    if arguments.draw is not None and not told.found:
+    if arguments.draw is not None and not explanation.found:
         print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
-    return 0 if told.found else 2
+    return 0 if explanation.found else 2
 
 
-def draw_route(arguments: argparse.Namespace, told: RouteExplanation) -> None:
+def draw_route(arguments: argparse.Namespace, explanation: RouteExplanation) -> None:
     """Draw a way on the part of the map through which it leads."""
     import numpy as np
 
@@ -76,12 +76,12 @@ def draw_route(arguments: argparse.Namespace, told: RouteExplanation) -> None:
         content = unpack_map_file(ask(arguments, Keys.any_server_map, b"")[0].payload)
     else:
         content = read_map_file(arguments.map, "merged")
-    part, _ = content.poses[told.start]
+    part, _ = content.poses[explanation.start]
     poses = {node: p.mean for node, (number, p) in content.poses.items() if number == part}
-    way = [poses[node] for node in (told.start, *(hop.b for hop in told.hops))]
+    way = [poses[node] for node in (explanation.start, *(hop.b for hop in explanation.hops))]
     places = np.array([[pose.x, pose.y] for pose in way])
     drive = Drive(places, way[0], way[-1], "the way", begun="start")
-    title = f"{told.start} to {told.goal}\n{told.reason}"
+    title = f"{explanation.start} to {explanation.goal}\n{explanation.reason}"
     edges = list(HybridMap(content.changes).edges.values())
     draw_map(MapPicture(title, poses, edges, drives=[drive]), arguments.draw)
 

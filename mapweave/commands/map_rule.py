@@ -1,4 +1,4 @@
-"""Rulings on the command line: their options, and how a server or a file is told."""
+"""Manual constraints on the command line: their options, and how they reach a server or a file."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def add_ruling(parser: argparse.ArgumentParser) -> None:
-    """Declare what every ruling may be given."""
+    """Declare the options of every manual constraint."""
     parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
-    parser.add_argument("--by", metavar="NAME", help="who says so (default: the name you are logged in by)")
+    parser.add_argument("--by", metavar="NAME", help="your name (default: the login name)")
     parser.add_argument("--undo", action="store_true", help="take it back")
     parser.add_argument("--map", type=Path, metavar="FILE", help="in this map file; no server is asked")
     parser.add_argument("-o", "--out", type=Path, metavar="OUT", help="with --map: write there instead")
@@ -26,40 +26,40 @@ def add_ruling(parser: argparse.ArgumentParser) -> None:
 
 
 def rule(arguments: argparse.Namespace, ends: Ends) -> None:
-    """Rule, and say what has come of it; afterwards `arguments.map` is the file that holds it.
+    """Set the constraint, and print its effect; afterwards `arguments.map` is the file that holds it.
 
     Raises:
-        MapweaveError: there is nothing to rule, or nobody who would keep it.
+        MapweaveError: the constraint has no effect, or there is no place to keep it.
     """
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.manual_constraint import ManualConstraint
 
     if arguments.out is not None and arguments.map is None:
-        raise InvalidValue("--out goes with --map: what a server is told it keeps itself")
-    ruling = ManualConstraint(
+        raise InvalidValue("--out goes with --map: a server keeps its own record")
+    constraint = ManualConstraint(
         ends, not arguments.undo, arguments.by or _login(), time.time_ns(), arguments.because
     )
     if arguments.map is None:
-        _tell_server(arguments, ruling)
+        _send_to_server(arguments, constraint)
     else:
-        _rewrite(arguments, ruling)
+        _rewrite(arguments, constraint)
         arguments.map = arguments.out or arguments.map
 
 
 def _login() -> str:
     try:
         return getpass.getuser()
-    except (OSError, KeyError):  # nobody of that number is known to the machine
-        return "somebody"
+    except (OSError, KeyError):  # no user of that number
+        return "a person"
 
 
-def _tell_server(arguments: argparse.Namespace, ruling: ManualConstraint) -> None:
+def _send_to_server(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.commands.map_ends import ask
     from mapweave.wire.keys import Keys
     from mapweave.wire.log_messages import decode_record
     from mapweave.wire.messages import encode
 
-    for reply in ask(arguments, Keys.any_rule, encode(ruling)):
+    for reply in ask(arguments, Keys.any_rule, encode(constraint)):
         print(decode_record(reply.payload)["said"])
     _settled(arguments)
 
@@ -80,7 +80,7 @@ def _settled(arguments: argparse.Namespace) -> None:
     print("it is kept; the server is still merging, ask `mapweave map explain` later")
 
 
-def _rewrite(arguments: argparse.Namespace, ruling: ManualConstraint) -> None:
+def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.commands.map_merge import merged_with_progress
     from mapweave.commands.network import settings_of
     from mapweave.hybridmap.manual_constraint import ManualConstraints
@@ -95,10 +95,10 @@ def _rewrite(arguments: argparse.Namespace, ruling: ManualConstraint) -> None:
     settings = settings_of(arguments).merge
     content = read_map_file(arguments.map, "merged")
     before = merged_of(content, settings)
-    check_manual_constraint(before, ManualConstraints(content.rulings), ruling)
+    check_manual_constraint(before, ManualConstraints(content.rulings), constraint)
     parts = parts_of({arguments.map: content})
-    merged = merged_with_progress(parts.maps, parts.rulings + ManualConstraints([ruling]), settings)
+    merged = merged_with_progress(parts.maps, parts.rulings + ManualConstraints([constraint]), settings)
     out = arguments.out or arguments.map
-    history = (*parts.history, *between(before, merged, ruling.stamp_ns))
+    history = (*parts.history, *between(before, merged, constraint.stamp_ns))
     write_map_file(out, map_file_of(merged, history))
     print(f"{out}: {merged.summary()}")

@@ -30,7 +30,7 @@ def add_to(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Record until the robot ends or the process is told to stop."""
+    """Record until the robot ends or the process is stopped."""
     from rich.console import Console
 
     from mapweave.agent.drivers.checked import CheckedRobot

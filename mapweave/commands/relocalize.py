@@ -31,11 +31,11 @@ def add_to(commands: Any) -> None:
     parser.add_argument("image", type=Path, help="png, jpg, pgm or bmp")
     parser.add_argument(
         "--camera", type=Path, metavar="FILE",
-        help="camera.toml with the intrinsics (default: beside the image or one folder up)",
+        help="camera.toml with the intrinsics (default: next to the image or one folder up)",
     )  # fmt: skip
     parser.add_argument(
         "--draw", type=Path, metavar="PNG",
-        help="draw the best candidate's landmarks beside the image, joined where they match",
+        help="draw the best candidate's landmarks next to the image, joined where they match",
     )  # fmt: skip
     parser.add_argument("--timeout", type=float, default=5.0, metavar="S", help="longest wait for an answer")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     places = [arguments.image.parent / "camera.toml", arguments.image.parent.parent / "camera.toml"]
     camera_file = arguments.camera or next((p for p in places if p.exists()), None)
     if camera_file is None:
-        raise DeviceError("no camera.toml beside the image: give the intrinsics with --camera FILE")
+        raise DeviceError("no camera.toml next to the image: give the intrinsics with --camera FILE")
     if arguments.draw is not None and arguments.draw.suffix.lower() != ".png":
         raise DeviceError(f"{arguments.draw}: the picture will be a PNG; end its name with .png")
     camera, distortion = read_camera(camera_file)
@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
-    """Ask until somebody answers; a server that is busy is asked again when it said."""
+    """Ask until a server answers; a busy server is asked again at its retry time."""
     from mapweave.hybridmap.errors import NotConnected
 
     where, end = ", ".join(network.endpoints), time.monotonic() + patience

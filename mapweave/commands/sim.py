@@ -190,13 +190,13 @@ def run_batch(arguments: argparse.Namespace) -> int:
 
 
 def run_serve(arguments: argparse.Namespace) -> int:
-    """Serve the simulated bodies until told to stop."""
+    """Serve the simulated robots until stopped."""
     from mapweave.processes.simulator import run_sim
     from mapweave.scenarios.scenario import load_scenario, scenario_path
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.zenoh_bus import ZenohBus
 
-    # Whom time waits for, and whose agent is gone.
+    # Which robots time waits for, and which agents have gone.
     logging.basicConfig(format="%(message)s")
     logging.getLogger("mapweave.sim").setLevel(logging.INFO)
     settings = settings_of(arguments)

@@ -33,7 +33,7 @@ def run_sim(
         robots: in it.
         seed: of everything random.
         stop: ends it.
-        held: time passes only when somebody asks for it.
+        held: time passes only on request.
 
     Raises:
         MapweaveError: the world holds no place for so many robots.

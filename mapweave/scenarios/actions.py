@@ -12,7 +12,7 @@ from mapweave.sim import events
 from mapweave.sim.robots import camera_from_table
 from mapweave.storage.settings_file import build
 
-EVERYBODY = "all"
+ALL_ROBOTS = "all"
 GOALS = ("foreign", "own", "photographed")
 
 
@@ -31,7 +31,7 @@ class SetMission:
     """
 
     mission: str
-    robot: str = EVERYBODY
+    robot: str = ALL_ROBOTS
 
     def __post_init__(self) -> None:
         """Refuse an unknown mission (InvalidValue)."""

@@ -167,7 +167,7 @@ class ScenarioRunner:
             case actions.Wait():
                 pass
             case actions.SetMission(mission, robot):
-                names = sorted(self._alive - self._cut) if robot == actions.EVERYBODY else [robot]
+                names = sorted(self._alive - self._cut) if robot == actions.ALL_ROBOTS else [robot]
                 for name in names:
                     self._command(name, MISSIONS[mission])
                 self.note(f"{', '.join(names)}: {mission}")

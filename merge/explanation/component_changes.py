@@ -22,7 +22,7 @@ def joined_maps(merged: MergedMap) -> list[frozenset[MapId]]:
     for component in merged.components:
         inside = sorted({node.map for node in component})
         graph.add_nodes_from(inside)
-        graph.add_edges_from((inside[0], other) for other in inside[1:])
+        graph.add_edges_from((inside[0], map_id) for map_id in inside[1:])
     return sorted((frozenset(part) for part in nx.connected_components(graph)), key=min)
 
 
@@ -39,10 +39,10 @@ def partings(
     Returns:
         For example `r1.1 and r3.1 are no longer one map: 8 links refused (r1 would have seen ...)`.
     """
-    part_of = {one: part for part in joined_maps(after) for one in part}
+    part_of = {map_id: part for part in joined_maps(after) for map_id in part}
     out: list[str] = []
     for whole in before:
-        met = {part_of[one] for one in whole if one in part_of}
+        met = {part_of[map_id] for map_id in whole if map_id in part_of}
         parts = sorted({part & whole for part in met}, key=lambda p: (-len(p), min(p)))
         for part in parts[1:]:
             lost = _refused_now(part, whole, after) if links is None else _lost(part, links, after)
@@ -60,13 +60,15 @@ def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str,
     Returns:
         For example `r1.1 and r3.1 are one map now, by 8 links`.
     """
-    part_of = {one: part for part in before for one in part}
+    part_of = {map_id: part for part in before for map_id in part}
     wholes = []
     for whole in joined_maps(after):
-        groups = {part_of.get(one, frozenset([one])) & whole for one in whole}
-        # The largest first, then by name: who was heard of first is a matter of the network.
+        groups = {part_of.get(map_id, frozenset([map_id])) & whole for map_id in whole}
+        # The largest first, then by name: the order of arrival depends on the network.
         wholes.append(sorted(groups, key=lambda part: (-len(part), min(part))))
-    seat = {one: (k, n) for k, parts in enumerate(wholes) for n, part in enumerate(parts) for one in part}
+    seat = {
+        map_id: (k, n) for k, parts in enumerate(wholes) for n, part in enumerate(parts) for map_id in part
+    }
     ties: dict[tuple[int, int], Counter[int]] = {}
     for link in after.links:
         a, b = seat[link.a.map], seat[link.b.map]
@@ -87,20 +89,20 @@ def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str,
 
 
 def _briefly(maps: frozenset[MapId]) -> str:
-    """For example `r0.1+r2.1`: with `and` nobody would know which are on which side."""
-    named = "+".join(str(one) for one in sorted(maps))
+    """For example `r0.1+r2.1`: with `and` the sides would be ambiguous."""
+    named = "+".join(str(map_id) for map_id in sorted(maps))
     return named if len(maps) <= MOST_NAMED else f"{len(maps)} maps with {min(maps)}"
 
 
 def _refused_now(part: frozenset[MapId], whole: frozenset[MapId], after: MergedMap) -> str:
-    """What stands between a part and the rest, where nobody knows any more which links held it."""
+    """Reasons between a part and the rest, when the lost links are not known any more."""
     reasons: Counter[str] = Counter()
     for r in after.refused:
         ends = {r.a.map in part, r.b.map in part}
         if r.link is not None and r.edge is None and len(ends) == 2 and {r.a.map, r.b.map} <= whole:
             reasons[r.reason] += 1
-    told = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
-    return "; ".join(told) or "no link joins them any more"
+    reasons_in_words = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
+    return "; ".join(reasons_in_words) or "no link joins them any more"
 
 
 def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> str:
@@ -110,20 +112,20 @@ def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> 
     reasons = Counter(r.reason for r in after.refused if r.pair in pairs and r.edge is None)
     retired = after.rulings.retired
     away = [next((end.map for end in pair if end.map in retired), None) for pair in pairs]
-    gone = [
+    removed = [
         pair
         for pair, which in zip(pairs, away, strict=True)
         if which is None and (pair[0] not in after.poses or pair[1] not in after.poses)
     ]
-    told = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
-    for which, count in sorted(Counter(one for one in away if one is not None).items()):
-        told.append(f"{_links(count)} gone, since {reason_of(retired[which])}")
-    if gone:
-        told.append(f"{_links(len(gone))} gone with a node")
-    left = len(pairs) - sum(reasons.values()) - len(gone) - sum(one is not None for one in away)
+    reasons_in_words = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
+    for which, count in sorted(Counter(map_id for map_id in away if map_id is not None).items()):
+        reasons_in_words.append(f"{_links(count)} gone, since {reason_of(retired[which])}")
+    if removed:
+        reasons_in_words.append(f"{_links(len(removed))} gone with a node")
+    left = len(pairs) - sum(reasons.values()) - len(removed) - sum(map_id is not None for map_id in away)
     if left > 0:
-        told.append(f"{_links(left)} no longer among the pairs that look most alike")
-    return "; ".join(told) or "a map has fallen into pieces"
+        reasons_in_words.append(f"{_links(left)} no longer among the most similar pairs")
+    return "; ".join(reasons_in_words) or "a map has fallen into pieces"
 
 
 def _links(count: int) -> str:

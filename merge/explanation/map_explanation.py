@@ -26,9 +26,9 @@ from mapweave.registration.recognition import RecognitionSettings
 
 Pair = tuple[MapId, MapId]
 MOST_NEAR = 5
-"""Pairs that are told of each two maps."""
+"""Pairs that are listed for each two maps."""
 CLOSELY = 16
-"""So many two maps of a fleet are looked at closely: comparing alike pairs once more takes 50 ms each."""
+"""Pairs of maps of a fleet that are examined closely: comparing similar nodes once more takes 50 ms each."""
 
 
 def explain_maps(
@@ -63,7 +63,7 @@ def explain_fleet(
         most: pairs at most.
         verification: as in the merge.
     """
-    part_of = {one: number for number, part in enumerate(joined_maps(merged)) for one in part}
+    part_of = {map_id: number for number, part in enumerate(joined_maps(merged)) for map_id in part}
     refused: Counter[Pair] = Counter()
     alike: Counter[Pair] = Counter()
     for r in merged.refused:
@@ -71,18 +71,18 @@ def explain_fleet(
             (alike if r.link is None else refused)[min(r.a.map, r.b.map), max(r.a.map, r.b.map)] += 1
 
     def interest(pair: Pair) -> tuple[bool, int, int, Pair]:
-        first, second = (part_of.get(one) for one in pair)
+        first, second = (part_of.get(map_id) for map_id in pair)
         return first is not None and first == second, -refused[pair], -alike[pair], pair
 
     pairs = heapq.nsmallest(most, combinations(sorted(merged.maps), 2), key=interest)
-    found = _between(merged, pairs)
+    between = _between(merged, pairs)
     components = [{node.map for node in component} for component in merged.components]
     return tuple(
         _explained(
             merged,
             pair,
-            found[pair],
-            any(one.issuperset(pair) for one in components),
+            between[pair],
+            any(map_id.issuperset(pair) for map_id in components),
             verification,
             k < CLOSELY,
         )
@@ -103,34 +103,34 @@ def _between(merged: MergedMap, pairs: Collection[Pair]) -> dict[Pair, _Between]
     """Of all pairs at once: a large fleet has many refusals."""
     out = {pair: _Between() for pair in pairs}
     for link in merged.links:
-        if found := out.get((min(link.a.map, link.b.map), max(link.a.map, link.b.map))):
-            found.links.append(link)
+        if between := out.get((min(link.a.map, link.b.map), max(link.a.map, link.b.map))):
+            between.links.append(link)
     for r in merged.refused:
-        if r.edge is None and (found := out.get((min(r.a.map, r.b.map), max(r.a.map, r.b.map)))):
-            (found.unverified if r.link is None else found.refused).append(r)
+        if r.edge is None and (between := out.get((min(r.a.map, r.b.map), max(r.a.map, r.b.map)))):
+            (between.unverified if r.link is None else between.refused).append(r)
     return out
 
 
 def _explained(
     merged: MergedMap,
     pair: Pair,
-    found: _Between,
+    between: _Between,
     joined: bool,
     verification: RecognitionSettings | None,
     closely: bool,
 ) -> MapsExplanation:
-    """Of two maps; only looked at closely are alike pairs compared once more."""
-    links, refused = found.links, found.refused
+    """Of two maps; only a close examination compares similar pairs once more."""
+    links, refused = between.links, between.refused
     if joined:
         nearest = _weakest(merged, links)
     else:
         nearest = _strongest(refused)
         if closely and len(nearest) < MOST_NEAR:
-            nearest = (*nearest, *_most_alike(merged, found.unverified, verification))[:MOST_NEAR]
+            nearest = (*nearest, *_most_alike(merged, between.unverified, verification))[:MOST_NEAR]
     reason = (
         _why_joined(merged, *pair, links)
         if joined
-        else _why_apart(merged, *pair, refused, found.unverified, nearest)
+        else _why_apart(merged, *pair, refused, between.unverified, nearest)
     )
     return MapsExplanation(
         *pair,
@@ -139,7 +139,7 @@ def _explained(
         len(links),
         sum(link.weight for link in links),
         len(refused),
-        len(found.unverified),
+        len(between.unverified),
         nearest,
         merged.rulings.about(*pair),
     )
@@ -153,11 +153,11 @@ def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[
         ways = f"{driven} of them can be driven" if driven else "they tie poses, none can be driven"
         return f"{first} and {second} are one map: {many} them, with {landmarks} landmarks behind; {ways}"
     graph: nx.Graph = nx.Graph((link.a.map, link.b.map) for link in merged.links)
-    # A map may be in several pieces, so a way over maps is no more than a hint where to look.
+    # A map may be in several pieces, so a way over maps is only a hint.
     way = nx.shortest_path(graph, first, second) if first in graph and second in graph else [first, second]
     over = ", ".join(map(str, way[1:-1])) or "each other's pieces"
     apart = any(set(r.ends) == {first, second} for r in merged.rulings.in_force)
-    more = ", as was ruled; to part them undo the links of that way too" if apart else ""
+    more = ", by a manual constraint; to separate them undo the links of that way too" if apart else ""
     return f"{first} and {second} are one map by way of {over}; no link joins the two directly{more}"
 
 
@@ -176,42 +176,42 @@ def _why_apart(
 ) -> str:
     head = f"{first} and {second} are not one map"
     ends = ((first, second), (first, first), (second, second))
-    ruling = next((r for r in merged.rulings.in_force if r.ends in ends), None)
-    if ruling is not None:
-        return f"{head}: {reason_of(ruling)}"
+    constraint = next((r for r in merged.rulings.in_force if r.ends in ends), None)
+    if constraint is not None:
+        return f"{head}: {reason_of(constraint)}"
     if refused:
         reasons = Counter(r.reason for r in refused)
-        told = [
+        reasons_in_words = [
             reason if count == len(refused) else f"{reason} ({count} of them)"
             for reason, count in reasons.most_common(2)
         ]
         many = (
-            "1 link was found and does not stand"
+            "1 link was found and refused"
             if len(refused) == 1
-            else (f"{len(refused)} links were found and none stands")
+            else (f"{len(refused)} links were found and all refused")
         )
-        return f"{head}: {many}: {'; '.join(told)}"
+        return f"{head}: {many}: {'; '.join(reasons_in_words)}"
     if unverified:
         best = f"; nearest are {nearest[0].a} and {nearest[0].b}: {nearest[0].lacks}" if nearest else ""
         many = "1 pair of nodes looks" if len(unverified) == 1 else f"{len(unverified)} pairs of nodes look"
-        return f"{head}: {many} alike and no two show a common pose{best}"
-    return f"{head}: no node of one shares enough alike features with any of the other to be compared"
+        return f"{head}: {many} similar and no two have a common pose{best}"
+    return f"{head}: no node of one shares enough similar features with any of the other to be compared"
 
 
 def _strongest(refused: Sequence[RefusedLink]) -> tuple[NearMiss, ...]:
     """Refused links with the most landmarks behind them that are found nowhere else."""
     links = [(refusal.link, refusal.reason) for refusal in refused if refusal.link is not None]
     links.sort(key=lambda item: (-item[0].weight, item[0].pair))
-    return tuple(_near(link, reason) for link, reason in links[:MOST_NEAR])
+    return tuple(_near_miss(link, reason) for link, reason in links[:MOST_NEAR])
 
 
 def _weakest(merged: MergedMap, links: Sequence[Link]) -> tuple[NearMiss, ...]:
-    """Links that stand with the fewest landmarks behind them: whoever doubts a merge looks at these first."""
+    """Accepted links with the fewest landmarks: the weakest of a merge."""
     few = sorted(links, key=lambda link: (link.weight, link.pair))[:MOST_NEAR]
-    return tuple(_near(link, reach_words(merged, link.edge())) for link in few)
+    return tuple(_near_miss(link, reach_words(merged, link.edge())) for link in few)
 
 
-def _near(link: Link, words: str) -> NearMiss:
+def _near_miss(link: Link, words: str) -> NearMiss:
     inliers = int(link.evidence.get("inliers", link.weight))
     if link.doubles:
         words = f"{link.doubles} of these are found at other places too; {words}"
@@ -221,7 +221,7 @@ def _near(link: Link, words: str) -> NearMiss:
 def _most_alike(
     merged: MergedMap, unverified: Sequence[RefusedLink], verification: RecognitionSettings | None
 ) -> tuple[NearMiss, ...]:
-    """Pairs without a common pose that share the most alike landmarks, compared once more."""
+    """Pairs without a common pose that share the most similar landmarks, compared once more."""
     s = verification or RecognitionSettings()
     alike: list[tuple[int, NodeId, NodeId, str]] = []
     for refusal in unverified:

@@ -13,7 +13,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.explanation.own_edges import claims, consequences, own_edge, said
+from mapweave.merge.explanation.own_edges import claims, consequences, edge_in_words, own_edge
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import prior_odds, probability, standpoints
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
@@ -49,34 +49,34 @@ def explain_nodes(
     """
     if a == b:
         raise InvalidValue(f"{a} twice: give two nodes")
-    one, two = (node_of(merged, node) for node in sorted((a, b)))
-    link, own = _link(merged, one.id, two.id), own_edge(merged, one.id, two.id)
-    refusal = _refusal(merged, one.id, two.id, own is not None)
+    first, second = (node_of(merged, node) for node in sorted((a, b)))
+    link, own = _link(merged, first.id, second.id), own_edge(merged, first.id, second.id)
+    refusal = _refusal(merged, first.id, second.id, own is not None)
     geometry = link or (refusal.link if refusal else None)
     if geometry is not None:
         own = None
     elif own is not None:
         geometry = link_of(own)
-    found = replace(
-        _looked_at(one, two, geometry, verification),
-        claims=(*claims(merged, one.id, two.id, own), *consequences(merged, link, one.id, two.id)),
-        rulings=merged.rulings.about(one.id, two.id),
+    explanation = replace(
+        _evidence(first, second, geometry, verification),
+        claims=(*claims(merged, first.id, second.id, own), *consequences(merged, link, first.id, second.id)),
+        rulings=merged.rulings.about(first.id, second.id),
     )
-    retired = next((r for m, r in merged.rulings.retired.items() if m in (one.id.map, two.id.map)), None)
+    retired = next((r for m, r in merged.rulings.retired.items() if m in (first.id.map, second.id.map)), None)
     if retired is not None:
-        return replace(found, standing=Standing.UNDONE, reason=reason_of(retired))
+        return replace(explanation, standing=Standing.UNDONE, reason=reason_of(retired))
     witnesses: tuple[Witness, ...] = ()
     verified = geometry is not None and (own is None or own.kind in CLAIMS)
-    if geometry is None and found.a_from_b is not None:
-        geometry = Link(one.id, two.id, found.a_from_b, found.shared, found.evidence)
+    if geometry is None and explanation.a_from_b is not None:
+        geometry = Link(first.id, second.id, explanation.a_from_b, explanation.shared, explanation.evidence)
     if geometry is not None and (own is None or own.kind in CLAIMS):
-        witnesses = _witnesses(merged, geometry, consistency)
-    standing, reason = _verdict(merged, (one, two), link, own, refusal, witnesses, verification)
-    found = replace(found, standing=standing, reason=reason, witnesses=witnesses)
+        witnesses = _other_links(merged, geometry, consistency)
+    standing, reason = _verdict(merged, (first, second), link, own, refusal, witnesses, verification)
+    explanation = replace(explanation, standing=standing, reason=reason, witnesses=witnesses)
     if geometry is None:
-        return found
-    misfit, credence = _judged(merged, geometry, kept=link is not None or own is not None)
-    return replace(found, misfit=misfit, probability=credence if verified else None)
+        return explanation
+    misfit, link_probability_ = _judged(merged, geometry, kept=link is not None or own is not None)
+    return replace(explanation, misfit=misfit, probability=link_probability_ if verified else None)
 
 
 def _verdict(
@@ -89,19 +89,19 @@ def _verdict(
     verification: RecognitionSettings | None,
 ) -> tuple[Standing, str]:
     """What has become of two nodes, and why, in words."""
-    one, two = ends
+    first, second = ends
     if link is not None:
         count = sum(w.agrees and w.kept for w in witnesses)
-        return Standing.LINKED, f"{_landmarks(link)}, {_others(count)}"
-    ruling = merged.rulings.against(one.id, two.id)
-    if ruling is not None and refusal is not None and refusal.link is not None:
-        return Standing.UNDONE, reason_of(ruling)
+        return Standing.LINKED, f"{_landmarks(link)}, {_other_links_in_words(count)}"
+    constraint = merged.rulings.against(first.id, second.id)
+    if constraint is not None and refusal is not None and refusal.link is not None:
+        return Standing.UNDONE, reason_of(constraint)
     if own is not None:
         more = f"; the merge has compared them too: {refusal.reason}" if refusal else ""
-        return Standing.OWN, f"{said(own)}{more}"
+        return Standing.OWN, f"{edge_in_words(own)}{more}"
     if refusal is not None:
         return Standing.REFUSED, refusal.reason
-    fresh = verify(one, two, verification)
+    fresh = verify(first, second, verification)
     words = fresh.reason if isinstance(fresh, RefusedLink) else _landmarks(fresh)
     return Standing.UNCOMPARED, f"they share too little, or others share more; compared now: {words}"
 
@@ -110,7 +110,7 @@ def node_of(merged: MergedMap, node: NodeId) -> Node:
     """A node of a merged map.
 
     Raises:
-        InvalidValue: it is not there; the words say what is.
+        InvalidValue: unknown; the message lists what there is.
     """
     merged.check(node)
     return merged.maps[node.map].nodes[node]
@@ -135,12 +135,12 @@ def residuals_px(a: Node, b: Node, a_from_b: Pose2, shared: NDArray[np.int64]) -
     return out
 
 
-def _looked_at(
+def _evidence(
     a: Node, b: Node, link: Link | None, verification: RecognitionSettings | None
 ) -> PairExplanation:
-    """What the landmarks say. A link brings its pose; else the nodes are compared again.
+    """The evidence of the landmarks. A link has its pose; else the nodes are compared again.
 
-    So what the merge refused because too little agrees is told with the little that does.
+    So a refusal for too few inliers is explained with these inliers.
     """
     s = verification or RecognitionSettings()
     matches = match(a.landmarks.codes, b.landmarks.codes, s.matching)
@@ -163,8 +163,8 @@ def _link(merged: MergedMap, a: NodeId, b: NodeId) -> Link | None:
 
 def _refusal(merged: MergedMap, a: NodeId, b: NodeId, joined: bool) -> RefusedLink | None:
     """What became of a comparison of the two; else of what the robot claimed."""
-    found = [r for r in merged.refused if r.pair == (a, b) and (r.edge is None or not joined)]
-    return max(found, key=lambda r: (r.edge is None, r.link is not None, r.edge or a), default=None)
+    refusals = [r for r in merged.refused if r.pair == (a, b) and (r.edge is None or not joined)]
+    return max(refusals, key=lambda r: (r.edge is None, r.link is not None, r.edge or a), default=None)
 
 
 def _landmarks(link: Link) -> str:
@@ -174,7 +174,7 @@ def _landmarks(link: Link) -> str:
     return f"{inliers} landmarks agree on one pose, {link.doubles} of them found at other places too"
 
 
-def _others(count: int) -> str:
+def _other_links_in_words(count: int) -> str:
     more = "1 more link" if count == 1 else f"{count} more links"
     return f"and {more} between the same pieces of map agree{'s' if count == 1 else ''}"
 
@@ -182,40 +182,42 @@ def _others(count: int) -> str:
 def _judged(merged: MergedMap, link: Link, kept: bool) -> tuple[Misfit | None, float | None]:
     component = merged.component_of(link.a)
     if component is None or component != merged.component_of(link.b):
-        # How many links of all stand tells nothing of these: maps that show alike things bring many.
+        # The share of accepted links says nothing of these: aliased maps have many links.
         return None, None
-    (found,) = standpoints([link], merged.graphs[component], kept=kept)
-    misfit = Misfit(found.merged_a_from_b, found.off, found.strain2, found.alone)
-    return misfit, probability(found.log_factor, prior_odds(merged))
+    (standpoint,) = standpoints([link], merged.graphs[component], kept=kept)
+    misfit = Misfit(standpoint.merged_a_from_b, standpoint.off, standpoint.strain2, standpoint.alone)
+    return misfit, probability(standpoint.log_factor, prior_odds(merged))
 
 
-def _witnesses(merged: MergedMap, link: Link, consistency: ConsistencySettings | None) -> tuple[Witness, ...]:
+def _other_links(
+    merged: MergedMap, link: Link, consistency: ConsistencySettings | None
+) -> tuple[Witness, ...]:
     """All other links that were found between the two pieces of map, as the merge compares them."""
     s = consistency or ConsistencySettings()
-    maps = {one: merged.maps[one] for one in {link.a.map, link.b.map}}
+    maps = {map_id: merged.maps[map_id] for map_id in {link.a.map, link.b.map}}
     pieces = fragment_by_node(fragments_of(_without_undone(merged, maps), s))
     ends = {pieces[link.a].name, pieces[link.b].name}
-    kept = {other.pair for other in merged.links}
-    found = [*merged.links, *(r.link for r in merged.refused if r.link is not None and r.edge is None)]
-    near = [
-        other
-        for other in found
-        if other.pair != link.pair
-        and other.a in pieces
-        and other.b in pieces
-        and {pieces[other.a].name, pieces[other.b].name} == ends
+    kept = {candidate.pair for candidate in merged.links}
+    links = [*merged.links, *(r.link for r in merged.refused if r.link is not None and r.edge is None)]
+    near_links = [
+        candidate
+        for candidate in links
+        if candidate.pair != link.pair
+        and candidate.a in pieces
+        and candidate.b in pieces
+        and {pieces[candidate.a].name, pieces[candidate.b].name} == ends
     ]
-    ((names, group),) = group_links([link, *near], pieces).items()
+    ((names, group),) = group_links([link, *near_links], pieces).items()
     distances2 = loop_distances2(group, pieces[names[0]], pieces[names[1]], s)
-    own = next(k for k, other in enumerate(group) if other.key == link.key)
+    own = next(k for k, candidate in enumerate(group) if candidate.key == link.key)
     return tuple(
         Witness(
-            *other.pair,
+            *candidate.pair,
             float(distances2[own, k]),
             bool(distances2[own, k] < s.gate),
-            other.key in kept,
+            candidate.key in kept,
         )
-        for k, other in enumerate(group)
+        for k, candidate in enumerate(group)
         if k != own
     )
 

@@ -1,4 +1,4 @@
-"""What robots themselves say of two nodes by the edges of their maps, and what follows for routes."""
+"""The robots' own edges between two nodes, and what follows for routes."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
-SAID = {
-    EdgeKind.MAPPED: "drove from the one to the other while it mapped",
-    EdgeKind.TURNED: "turned on the spot from the one to the other",
-    EdgeKind.DRIVEN: "has driven from the one to the other",
-    EdgeKind.LOOP: "has recognised the one at the other",
-    EdgeKind.MERGED: "has recognised the one at the other",
+WORDS = {
+    EdgeKind.MAPPED: "drove from one to the other while it mapped",
+    EdgeKind.TURNED: "turned on the spot from one to the other",
+    EdgeKind.DRIVEN: "has driven from one to the other",
+    EdgeKind.LOOP: "has recognised one at the other",
+    EdgeKind.MERGED: "has recognised one at the other",
 }
 
 
-def said(edge: Edge) -> str:
-    """For example `r0 turned on the spot from the one to the other (edge r0.1.5)`."""
-    return f"{edge.id.agent} {SAID[edge.kind]} (edge {edge.id})"
+def edge_in_words(edge: Edge) -> str:
+    """For example `r0 turned on the spot from one to the other (edge r0.1.5)`."""
+    return f"{edge.id.agent} {WORDS[edge.kind]} (edge {edge.id})"
 
 
 def own_edge(merged: MergedMap, a: NodeId, b: NodeId) -> Edge | None:
@@ -41,27 +41,29 @@ def own_edge(merged: MergedMap, a: NodeId, b: NodeId) -> Edge | None:
         return None
     false = {refusal.edge for refusal in merged.refused if refusal.pair == (a, b)}
     edges = merged.maps[a.map].edges.values()
-    found = [edge for edge in edges if {edge.a, edge.b} == {a, b} and edge.id not in false]
+    own_edges = [edge for edge in edges if {edge.a, edge.b} == {a, b} and edge.id not in false]
     return min(
-        found, key=lambda e: (e.kind in CLAIMS, float(np.trace(e.a_from_b.covariance)), e.id), default=None
+        own_edges,
+        key=lambda e: (e.kind in CLAIMS, float(np.trace(e.a_from_b.covariance)), e.id),
+        default=None,
     )
 
 
-def claims(merged: MergedMap, a: NodeId, b: NodeId, told: Edge | None = None) -> Iterator[str]:
+def claims(merged: MergedMap, a: NodeId, b: NodeId, named: Edge | None = None) -> Iterator[str]:
     """One sentence for each edge of a robot between two nodes.
 
     Args:
         merged: the merged map.
         a: the smaller id.
         b: the greater id.
-        told: an edge of which the reason tells already; only whether it can be driven is left to say.
+        named: an edge that the reason names already; only its reachability is added.
     """
     refused = {r.edge: r.reason for r in merged.refused if r.edge is not None}
-    for one in merged.maps.values():
-        for edge in one.edges.values():
+    for hybrid_map in merged.maps.values():
+        for edge in hybrid_map.edges.values():
             if {edge.a, edge.b} != {a, b}:
                 continue
-            words = [] if told is not None and edge.id == told.id else [said(edge)]
+            words = [] if named is not None and edge.id == named.id else [edge_in_words(edge)]
             if edge.id in refused:
                 words.append(f"refused: {refused[edge.id]}")
             elif edge.kind in CLAIMS:
@@ -90,7 +92,7 @@ def consequences(merged: MergedMap, link: Link | None, a: NodeId, b: NodeId) -> 
 def reach_words(merged: MergedMap, edge: Edge) -> str:
     """Whether routes may use an edge; landmarks that have faded hold no servo."""
     a, b = (merged.maps[node.map].nodes[node] for node in (edge.a, edge.b))
-    there = left(edge.shared, a, b, (merged.faded.get(edge.a), merged.faded.get(edge.b)))
-    words = reachability_of(replace(edge, shared=there), a, b).reason
-    faded = len(left(edge.shared, a, b)) - len(there)
+    visible = left(edge.shared, a, b, (merged.faded.get(edge.a), merged.faded.get(edge.b)))
+    words = reachability_of(replace(edge, shared=visible), a, b).reason
+    faded = len(left(edge.shared, a, b)) - len(visible)
     return f"{words} ({faded} more have faded)" if faded else words

@@ -38,7 +38,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 MOVED = 0.05
-"""Two nodes may move to each other by this before their views are compared anew, m."""
+"""Two nodes may move relative to each other by this before their views are compared again, m."""
 
 
 LEAST_SHOWN = 15
@@ -211,7 +211,7 @@ def things(node: Node, size: float) -> NDArray[np.bool_]:
 
 
 HIDDEN = 0.05
-"""Probability that a thing is hidden during a visit by what nobody knows of."""
+"""Probability that a thing is occluded during a visit by something unmapped."""
 MISTAKEN = 0.01
 """Probability that a landmark that is gone is found all the same."""
 GOES = 0.02

@@ -123,11 +123,11 @@ FOUND = 20
 DETOUR = 1.5
 """A way between neighbours may become longer by this, m."""
 DEPTHS = 0.7
-"""A node that stands for another knows at least this share of the number of depths that the other knows,"""
+"""A successor has at least this share of the superseded node's number of depths,"""
 ENOUGH = 60
 """or at least this many."""
 AGAIN = 120.0
-"""Nodes of one map stand for each other only if this much time lies between them, s: views of one visit
+"""Nodes of one map supersede each other only if this much time is between them, s: views of one visit
 complete each other."""
 GATE = 16.3
 """Chi-square with 3 degrees of freedom within which a comparison of two nodes bears out the merged map."""

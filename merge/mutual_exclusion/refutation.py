@@ -1,4 +1,4 @@
-"""Refutation: which groups of links cannot be true, because robots are bodies."""
+"""Refutation: which groups of links cannot be true, because robots exclude each other."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from mapweave.merge.settings import ExclusionSettings
 
 Key = tuple[NodeId, NodeId]
 """Names of two fragments, smaller first."""
-SIGHT = 8.0
+REACH = 8.0
 """Robots further apart than this neither meet nor see each other, m."""
 
 
 class Refutation:
-    """Knows where every robot was when, as far as its clock is known."""
+    """Keeps the trajectories of all robots with known clocks."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class Refutation:
         exclusion: ExclusionSettings,
         trajectories: TrajectoryCache | None = None,
     ) -> None:
-        """Read the trails.
+        """Read the trajectories.
 
         Args:
             maps: with the nodes of all fragments.
@@ -46,15 +46,17 @@ class Refutation:
         self._by_node = fragment_by_node(fragments)
         self._exclusion = exclusion
         cache = trajectories or TrajectoryCache()
-        trails = ((f.name, cache.trajectories(f, maps[f.name.map])) for f in fragments)
-        self._trails: dict[NodeId, tuple[BodyTrajectory, ...]] = {name: some for name, some in trails if some}
+        by_fragment = ((f.name, cache.trajectories(f, maps[f.name.map])) for f in fragments)
+        self._trajectories: dict[NodeId, tuple[BodyTrajectory, ...]] = {
+            name: some for name, some in by_fragment if some
+        }
 
-    def verdict(self, story: Sequence[Link]) -> str:
-        """Why links that agree with each other cannot be true; empty if they can, as far as anybody knows."""
-        ends = {self._by_node[node].name: self._by_node[node] for link in story for node in link.pair}
-        if len(ends.keys() & self._trails.keys()) < 2:
+    def verdict(self, links: Sequence[Link]) -> str:
+        """Why links that agree with each other cannot be true; empty if they may be."""
+        ends = {self._by_node[node].name: self._by_node[node] for link in links for node in link.pair}
+        if len(ends.keys() & self._trajectories.keys()) < 2:
             return ""
-        graph = ComponentSolver(list(ends.values())).solve(story)[0]
+        graph = ComponentSolver(list(ends.values())).solve(links)[0]
         return next((clash.reason for _, clash in self._clashes([graph])), "")
 
     def key_of(self, link: Link) -> Key:
@@ -77,7 +79,7 @@ class Refutation:
         Args:
             solved: the components.
             kept: the links that made them.
-            changed: fragments whose robots may clash with others since it was looked at last; None: all.
+            changed: fragments whose robots may collide with others since the last test; None: all.
         """
         clashes = dict(self._clashes(solved, changed))
         if not clashes:
@@ -96,41 +98,46 @@ class Refutation:
     def _clashes(
         self, solved: Sequence[PoseGraph], changed: Collection[NodeId] | None = None
     ) -> Iterator[tuple[Key, Collision]]:
-        """Pairs of fragments in one component that clash, by whichever clock says so most clearly."""
+        """Pairs of fragments in one component that collide, by the clock with most evidence."""
         for graph in solved:
-            trails = [
-                (name, trail) for name, some in self._trails.items() if name in graph.rows for trail in some
+            trajectories = [
+                (name, trajectory)
+                for name, some in self._trajectories.items()
+                if name in graph.rows
+                for trajectory in some
             ]
-            found: dict[Key, list[Collision]] = {}
-            for k, other in _near(graph, [trail for _, trail in trails]):
-                (first, one), (second, two) = trails[k], trails[other]
+            collisions: dict[Key, list[Collision]] = {}
+            for k, j in _near(graph, [trajectory for _, trajectory in trajectories]):
+                (first, first_trajectory), (second, second_trajectory) = trajectories[k], trajectories[j]
                 if first == second or (changed is not None and not {first, second} & set(changed)):
                     continue
-                clash = clash_of(graph, one, two, self._exclusion)
+                clash = clash_of(graph, first_trajectory, second_trajectory, self._exclusion)
                 if clash is not None:
-                    found.setdefault((first, second), []).append(clash)
-            for key, clashes in found.items():
+                    collisions.setdefault((first, second), []).append(clash)
+            for key, clashes in collisions.items():
                 yield key, max(clashes, key=lambda clash: clash.evidence)
 
 
-def _near(graph: PoseGraph, trails: Sequence[BodyTrajectory]) -> Iterator[tuple[int, int]]:
-    """Pairs of trails of different robots that overlap in time, by one clock, and come near each other.
+def _near(graph: PoseGraph, trajectories: Sequence[BodyTrajectory]) -> Iterator[tuple[int, int]]:
+    """Pairs of trajectories of different robots that overlap in time, by one clock, and come near each other.
 
-    Of a thousand robots in a large building few ever meet, and to look closely takes long.
+    Of a thousand robots in a large building few ever meet, and a full test is slow.
     """
-    if not trails:
+    if not trajectories:
         return
-    clocks = np.unique([trail.clock for trail in trails], return_inverse=True)[1]
-    agents = np.unique([trail.agent for trail in trails], return_inverse=True)[1]
-    times = np.array([(trail.times[0], trail.times[-1]) for trail in trails])
-    places = [graph.means[graph.index(trail.nodes), :2] for trail in trails]
-    low, high = np.array([(one.min(axis=0), one.max(axis=0)) for one in places]).transpose(1, 0, 2)
-    for k in range(len(trails) - 1):
+    clocks = np.unique([trajectory.clock for trajectory in trajectories], return_inverse=True)[1]
+    agents = np.unique([trajectory.agent for trajectory in trajectories], return_inverse=True)[1]
+    times = np.array([(trajectory.times[0], trajectory.times[-1]) for trajectory in trajectories])
+    places = [graph.means[graph.index(trajectory.nodes), :2] for trajectory in trajectories]
+    low, high = np.array([(positions.min(axis=0), positions.max(axis=0)) for positions in places]).transpose(
+        1, 0, 2
+    )
+    for k in range(len(trajectories) - 1):
         rest = slice(k + 1, None)
-        near = (clocks[rest] == clocks[k]) & (agents[rest] != agents[k])
-        near &= (times[rest, 0] <= times[k, 1]) & (times[rest, 1] >= times[k, 0])
-        near &= ((low[rest] <= high[k] + SIGHT) & (high[rest] >= low[k] - SIGHT)).all(axis=1)
-        yield from ((k, k + 1 + other) for other in np.flatnonzero(near).tolist())
+        overlapping = (clocks[rest] == clocks[k]) & (agents[rest] != agents[k])
+        overlapping &= (times[rest, 0] <= times[k, 1]) & (times[rest, 1] >= times[k, 0])
+        overlapping &= ((low[rest] <= high[k] + REACH) & (high[rest] >= low[k] - REACH)).all(axis=1)
+        yield from ((k, k + 1 + offset) for offset in np.flatnonzero(overlapping).tolist())
 
 
 def _weakest_on_the_way(weights: Mapping[Key, int], start: NodeId, end: NodeId) -> Key:

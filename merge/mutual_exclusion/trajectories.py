@@ -1,4 +1,4 @@
-"""Trails: when a robot was where, as far as its nodes and their wakes tell."""
+"""Trajectories: when a robot was where, by its nodes and their trajectory segments."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 NANOSECONDS = 1e9
 DRIFT = 0.02
-"""How far a robot on its way is off beside its node, as a share of the way between them, one sigma."""
+"""Error of a robot's pose relative to its node, as a share of the way between them, one sigma."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyTrajectory:
-    """N moments of a robot, by one clock: the images of its nodes, and their wakes.
+    """N moments of a robot, by one clock: the images of its nodes, and their trajectory segments.
 
     Attributes:
         clock: not empty.
-        nodes: N, in the order of time: the node that tells of each moment.
-        node_from_robot: (N, 3) m, m and rad: where the robot was beside it; zeros for the node's own image.
+        nodes: N, in the order of time: the node of each moment.
+        node_from_robot: (N, 3) m, m and rad: the robot's pose in it; zeros for the node's own image.
         times: (N,) s, ascending.
-        radius: of the robot, m; 0 if not all nodes tell.
-        looks: what its proximity sensors saw at each moment.
+        radius: of the robot, m; 0 if unknown.
+        looks: its proximity readings at each moment.
     """
 
     clock: str
@@ -47,7 +47,7 @@ class BodyTrajectory:
 
     @property
     def drifts(self) -> Array:
-        """(N,) m, how far the robot may have been elsewhere beside its node, standard deviation."""
+        """(N,) m, standard deviation of the robot's position relative to its node."""
         out: Array = DRIFT * np.hypot(self.node_from_robot[:, 0], self.node_from_robot[:, 1])
         return out
 
@@ -63,26 +63,32 @@ class BodyTrajectory:
 
 
 def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
-    """The trails of one robot's nodes, one a clock; nodes whose clock nobody knows are left out."""
+    """The trajectories of one robot's nodes, one a clock; nodes of unknown clocks are left out."""
     by_clock: dict[str, list[Node]] = {}
     for node in nodes:
         if node.clock:
             by_clock.setdefault(node.clock, []).append(node)
-    trails = []
-    for clock, known in sorted(by_clock.items()):
-        known.sort(key=lambda node: (node.stamp_ns, node.id))
-        radius = min(node.radius for node in known)
-        # Wakes of neighbours may overlap by a rounded moment: the order of time is made here.
-        teller = np.concatenate([np.arange(len(known)), np.repeat(range(len(known)), _lengths(known))])
-        wakes = [node.wake for node in known if len(node.wake)]
-        ages = np.concatenate([np.zeros(len(known)), *(wake.ages for wake in wakes)])
-        offsets = np.concatenate([np.zeros((len(known), 3)), *(wake.node_from_robot for wake in wakes)])
-        times = _seconds(known)[teller] + ages
+    trajectories = []
+    for clock, nodes_of_clock in sorted(by_clock.items()):
+        nodes_of_clock.sort(key=lambda node: (node.stamp_ns, node.id))
+        radius = min(node.radius for node in nodes_of_clock)
+        # Segments of neighbours may overlap by a rounded moment: they are ordered by time here.
+        teller = np.concatenate(
+            [np.arange(len(nodes_of_clock)), np.repeat(range(len(nodes_of_clock)), _lengths(nodes_of_clock))]
+        )
+        segments = [node.wake for node in nodes_of_clock if len(node.wake)]
+        ages = np.concatenate([np.zeros(len(nodes_of_clock)), *(segment.ages for segment in segments)])
+        offsets = np.concatenate(
+            [np.zeros((len(nodes_of_clock), 3)), *(segment.node_from_robot for segment in segments)]
+        )
+        times = _seconds(nodes_of_clock)[teller] + ages
         order = np.argsort(times, kind="stable")
-        looks = RangeScans.of([node.ranges for node in known], [node.wake for node in known]).take(order)
-        ids = tuple(known[k].id for k in teller[order])
-        trails.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, looks))
-    return tuple(trails)
+        scans = RangeScans.of(
+            [node.ranges for node in nodes_of_clock], [node.wake for node in nodes_of_clock]
+        ).take(order)
+        ids = tuple(nodes_of_clock[k].id for k in teller[order])
+        trajectories.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, scans))
+    return tuple(trajectories)
 
 
 class TrajectoryCache:
@@ -90,15 +96,15 @@ class TrajectoryCache:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._known: dict[NodeId, tuple[Fragment, tuple[BodyTrajectory, ...]]] = {}
+        self._entries: dict[NodeId, tuple[Fragment, tuple[BodyTrajectory, ...]]] = {}
 
-    def trajectories(self, fragment: Fragment, one: HybridMap) -> tuple[BodyTrajectory, ...]:
-        """See `trajectories_of`; `one` holds the fragment's nodes."""
-        known = self._known.get(fragment.name)
-        if known is None or known[0] is not fragment:
-            found = trajectories_of([one.nodes[node] for node in fragment.nodes])
-            known = self._known[fragment.name] = fragment, found
-        return known[1]
+    def trajectories(self, fragment: Fragment, hybrid_map: HybridMap) -> tuple[BodyTrajectory, ...]:
+        """See `trajectories_of`; `hybrid_map` holds the fragment's nodes."""
+        entry = self._entries.get(fragment.name)
+        if entry is None or entry[0] is not fragment:
+            of_fragment = trajectories_of([hybrid_map.nodes[node] for node in fragment.nodes])
+            entry = self._entries[fragment.name] = fragment, of_fragment
+        return entry[1]
 
 
 def _seconds(nodes: Sequence[Node]) -> Array:
@@ -114,10 +120,10 @@ class Stay:
     """Where a robot was at T moments.
 
     Attributes:
-        known: (T,) whether anybody knows.
-        places: (T, 2) m, in the frame of the trail's places.
-        spreads: (T, 2, 2) m^2, covariances: the robot wanders between the moments of its trail.
-        nearest: (T,) index of the moment of the trail that is nearest in time.
+        known: (T,) whether the pose is known.
+        places: (T, 2) m, in the frame of the trajectory's places.
+        spreads: (T, 2, 2) m^2, covariances: the robot moves freely between the moments of its trajectory.
+        nearest: (T,) index of the trajectory's moment that is nearest in time.
     """
 
     known: NDArray[np.bool_]
@@ -127,9 +133,9 @@ class Stay:
 
 
 LONGEST_GAP = 5.2
-"""Between moments that are further apart in time nobody knows where the robot was, s."""
+"""Between moments further apart in time the robot's pose is unknown, s."""
 LONGEST_WAY = 1.0
-"""Between moments that are further apart in space nobody knows where the robot was, m."""
+"""Between moments further apart in space the robot's pose is unknown, m."""
 ALONG = 0.15
 """How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
 standard deviation: it stops and goes. In the simulator it is within 1 cm of the straight line, but up to a
@@ -140,30 +146,30 @@ CLOCK_ERROR = 0.05
 """Standard deviation between two robots with the same clock, s."""
 
 
-def stay(trail: BodyTrajectory, places: Array, times: Array) -> Stay:
+def stay(trajectory: BodyTrajectory, places: Array, times: Array) -> Stay:
     """Where a robot was, on the straight lines between its moments, which it drives at a pace of its own.
 
     Args:
-        trail: of N moments.
+        trajectory: of N moments.
         places: (N, 2) m, where it was then.
         times: (T,) s.
     """
-    before = np.clip(np.searchsorted(trail.times, times, side="right") - 1, 0, max(len(places) - 2, 0))
+    before = np.clip(np.searchsorted(trajectory.times, times, side="right") - 1, 0, max(len(places) - 2, 0))
     after = np.minimum(before + 1, len(places) - 1)
-    gaps = np.maximum(trail.times[after] - trail.times[before], 1e-9)
+    gaps = np.maximum(trajectory.times[after] - trajectory.times[before], 1e-9)
     lines = places[after] - places[before]
     lengths = np.hypot(lines[:, 0], lines[:, 1])
-    share = np.clip((times - trail.times[before]) / gaps, 0.0, 1.0)
+    share = np.clip((times - trajectory.times[before]) / gaps, 0.0, 1.0)
     at_moment = (share == 0.0) | (share == 1.0)
-    known = (times >= trail.times[0]) & (times <= trail.times[-1])
-    known &= at_moment | ((gaps <= LONGEST_GAP) & (lengths <= LONGEST_WAY))
+    inside = (times >= trajectory.times[0]) & (times <= trajectory.times[-1])
+    inside &= at_moment | ((gaps <= LONGEST_GAP) & (lengths <= LONGEST_WAY))
     nearest = np.where(share < 0.5, before, after)
     bow = 4.0 * share * (1.0 - share) * lengths
     ahead = lines / np.maximum(lengths, 1e-9)[:, None]
     along2 = (ALONG * bow) ** 2 + (CLOCK_ERROR * lengths / gaps) ** 2
     aside2 = (ASIDE * bow) ** 2
     outer = ahead[:, :, None] * ahead[:, None, :]
-    spreads = (along2 - aside2)[:, None, None] * outer + (aside2 + trail.drifts[nearest] ** 2)[
+    spreads = (along2 - aside2)[:, None, None] * outer + (aside2 + trajectory.drifts[nearest] ** 2)[
         :, None, None
     ] * np.eye(2)
-    return Stay(known, places[before] + share[:, None] * lines, spreads, nearest)
+    return Stay(inside, places[before] + share[:, None] * lines, spreads, nearest)

@@ -34,13 +34,13 @@ class DecisionCache:
         """See `mapweave.merge.outlier_rejection.segmentation.fragments_of`; only maps that have changed are
         cut.
         """
-        found: list[Fragment] = []
-        for map_id, one in maps.items():
-            known = self._maps.get(map_id)
-            if known is None or known[0] is not one:
-                known = self._maps[map_id] = one, fragments_of({map_id: one}, s)
-            found += known[1]
-        return sorted(found, key=lambda fragment: fragment.name)
+        all_fragments: list[Fragment] = []
+        for map_id, hybrid_map in maps.items():
+            entry = self._maps.get(map_id)
+            if entry is None or entry[0] is not hybrid_map:
+                entry = self._maps[map_id] = hybrid_map, fragments_of({map_id: hybrid_map}, s)
+            all_fragments += entry[1]
+        return sorted(all_fragments, key=lambda fragment: fragment.name)
 
     def weighed(self, links: Sequence[Link], weighed: Sequence[Link]) -> list[Link]:
         """Links as they were weighed now; one that has the weight it had before is the same object as before.
@@ -49,15 +49,15 @@ class DecisionCache:
             links: as they were verified.
             weighed: the same by `mapweave.merge.outlier_rejection.distinctness.weigh`, in the same order.
         """
-        found = []
+        weighed_links = []
         for link, now in zip(links, weighed, strict=True):
             if now is not link:
                 before = self._weighed.get(link.pair)
                 if before is None or before[0] is not link or before[1].doubles != now.doubles:
                     before = self._weighed[link.pair] = link, now
                 now = before[1]
-            found.append(now)
-        return found
+            weighed_links.append(now)
+        return weighed_links
 
     def groups(
         self,
@@ -67,13 +67,13 @@ class DecisionCache:
         verdict: Verdict,
         exact: bool = True,
     ) -> dict[Key, LinkGroup]:
-        """See `LinkGroup.of`; links between two fragments are sorted anew only if any of them is new.
+        """See `LinkGroup.of`; links between two fragments are sorted again only if any of them is new.
 
         Args:
             links: each once.
             by_node: the fragment of each node.
-            s: when links are believed.
-            verdict: on sets that are supported alike; it depends on the two fragments alone.
+            s: when links are accepted.
+            verdict: on sets with equal support; it depends on the two fragments alone.
             exact: also if either fragment has changed elsewhere.
 
         Returns:
@@ -82,13 +82,13 @@ class DecisionCache:
         out = {}
         for (a, b), some in group_links(links, by_node).items():
             first, second = by_node[a], by_node[b]
-            known = self._groups.get((a, b))
-            same = known is not None and known.first is first and known.second is second
-            if known is None or not (same or not exact) or not _same(known.given, some):
-                known = self._groups[a, b] = LinkGroup.of(some, first, second, s, verdict)
-            out[a, b] = known
+            entry = self._groups.get((a, b))
+            same = entry is not None and entry.first is first and entry.second is second
+            if entry is None or not (same or not exact) or not _same(entry.given, some):
+                entry = self._groups[a, b] = LinkGroup.of(some, first, second, s, verdict)
+            out[a, b] = entry
         return out
 
 
-def _same(one: Sequence[Link], other: Sequence[Link]) -> bool:
-    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
+def _same(first: Sequence[Link], second: Sequence[Link]) -> bool:
+    return len(first) == len(second) and all(a is b for a, b in zip(first, second, strict=True))

@@ -1,17 +1,17 @@
-"""Credence: how probable it is that a link is right, by the rest of the map.
+"""Link probability: how probable it is that a link is right, by the rest of the map.
 
-What two images show cannot tell one place from another that looks the same. So the odds begin with how many
-of this merge's verified links stand. Everything else that is joined then predicts how the two nodes stand to
-each other: a link that is right is off from that by what the covariances say, one into a place that merely
-looks alike by anything within the floor that is mapped. The ratio of these two densities is Bayes' factor.
+Two images cannot distinguish two places that look the same. So the prior odds are those of this merge's
+verified links. The rest of the merged map then predicts the relative pose of the two nodes: a right link
+differs from that within the covariances, a link into an aliased place by anything within the mapped floor.
+The ratio of these two densities is Bayes' factor.
 
-A link is taken out of the graph before it is compared with it, without solving anew: with P the covariance of
-the two nodes' relative pose, W the information of the link as the solver weighed it, and e the residual,
+A link is taken out of the graph before it is compared with it, without solving again: with P the covariance
+of the two nodes' relative pose, W the information of the link as the solver weighed it, and e the residual,
 the rest of the graph has the covariance (P^-1 - W)^-1, and the residual against it is (I - P W)^-1 e (the
 leave-one-out residual of least squares; exact where the graph is linear).
 
-The number holds for links that are right or wrong each for itself. Links into a whole room that looks the
-same agree with one another; against these the merge has other means
+The probability assumes that links are right or wrong independently. Links into a whole room that looks the
+same agree with one another; against these the merge has other rules
 (mapweave.merge.mutual_exclusion.refutation and mapweave.merge.outlier_rejection.pairwise_consistency).
 """
 
@@ -34,12 +34,12 @@ from mapweave.merge.settings import ConsistencySettings
 AT_ONCE = 64
 """Links whose covariances are solved for together: all at once would take memory by the square."""
 LEAST_AREA = 4.0
-"""What is mapped is never smaller than this, m^2: a single look around."""
+"""What is mapped is never smaller than this, m^2: a single full turn."""
 _S = ConsistencySettings()
 FLOOR = np.diag([_S.floor_xy**2, _S.floor_xy**2, _S.floor_heading**2])
-"""Error that no covariance tells of, as where links are compared with each other."""
+"""Error beyond the covariances, as where links are compared with each other."""
 NO_INFORMATION = 1e-6
-"""Share of a link's own information below which the rest of the graph says nothing."""
+"""Share of a link's own information below which the rest of the graph is no evidence."""
 
 
 class Standpoint(NamedTuple):
@@ -49,7 +49,7 @@ class Standpoint(NamedTuple):
         merged_a_from_b: of its two nodes, by everything that is joined, the link included if it is kept.
         off: (3,) m, m, rad, from the link's b to the merged one, in the link's b.
         strain2: `off` in the link's own uncertainty, chi-square with 3 degrees of freedom.
-        alone: whether nothing but the link says how the two stand to each other.
+        alone: whether only this link connects the two.
         log_factor: natural logarithm of Bayes' factor for the link, 0 if it is alone.
     """
 
@@ -61,9 +61,9 @@ class Standpoint(NamedTuple):
 
 
 def prior_odds(merged: MergedMap) -> float:
-    """Odds that a verified link is right before its place in the map is looked at: as many as stand.
+    """Prior odds that a verified link is right: the ratio of accepted to refused links.
 
-    Those that people have ruled out count neither way. Half a link is added to either side (Jeffreys' prior).
+    Links excluded by manual constraints do not count. Half a link is added to either side (Jeffreys' prior).
     """
     refused = sum(
         r.link is not None and r.edge is None and merged.rulings.against(*r.pair) is None
@@ -79,15 +79,15 @@ def probability(log_factor: float, odds: float) -> float:
 
 
 def link_probabilities(merged: MergedMap) -> dict[tuple[NodeId, NodeId], float]:
-    """Probability of each link that stands, by its pair."""
+    """Probability of each accepted link, by its pair."""
     odds = prior_odds(merged)
     out: dict[tuple[NodeId, NodeId], float] = {}
     for graph in merged.graphs:
         inside = [link for link in merged.links if link.a in graph.rows]
         for k in range(0, len(inside), AT_ONCE):
             some = inside[k : k + AT_ONCE]
-            for link, found in zip(some, standpoints(some, graph, kept=True), strict=True):
-                out[link.pair] = probability(found.log_factor, odds)
+            for link, standpoint in zip(some, standpoints(some, graph, kept=True), strict=True):
+                out[link.pair] = probability(standpoint.log_factor, odds)
     return out
 
 
@@ -130,8 +130,8 @@ def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> St
     spread = own + rest + FLOOR
     # In the plane anywhere on the floor that is mapped, in heading anyhow.
     anywhere = -math.log(area * 2.0 * math.pi)
-    there = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * spread)[1])
-    if there <= anywhere:
+    log_density = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * spread)[1])
+    if log_density <= anywhere:
         return Standpoint(merged, off, strain2, True, 0.0)
-    factor = there - 0.5 * float(moved @ np.linalg.solve(spread, moved)) - anywhere
+    factor = log_density - 0.5 * float(moved @ np.linalg.solve(spread, moved)) - anywhere
     return Standpoint(merged, off, strain2, False, factor)

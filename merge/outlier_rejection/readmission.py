@@ -1,10 +1,10 @@
-"""Readmission: the few links that most of the map speaks against, tried once more by solving with them.
+"""Readmission: the few refused links of a map, tried once more by solving with them.
 
-How far a link is off is judged along the tangent of the solution without it. Where headings are little known
-that is not good enough: the map bends by more than its tangent tells. If nearly all links of a map are
-believed, those that are not are likely to be right too, and if they are not far off worth a solution each.
-How much the chi-square of everything rises takes the place of the misfit in Bayes' factor, and the odds begin
-with how many links are believed for one that is not (see mapweave.merge.outlier_rejection.link_probability).
+A link's residual is computed along the tangent of the solution without it. Where headings are uncertain that
+is not good enough: the map bends by more than its tangent. If nearly all links of a map are accepted, the
+refused ones are likely to be right too, and worth a solution each if their residuals are not large. The rise
+of the total chi-square replaces the misfit in Bayes' factor, and the prior odds are accepted over refused
+links (see mapweave.merge.outlier_rejection.link_probability).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mapweave.merge.settings import ConsistencySettings
 FEW = 0.05
 """Share of a component's links up to which those that are refused are tried."""
 NEAR = 10.0
-"""How many times the gate one may be off along the tangent: it saves the solutions that are in vain."""
+"""Largest residual along the tangent, in gates: it saves useless solutions."""
 
 
 def readmitted(
@@ -33,29 +33,33 @@ def readmitted(
 
     Args:
         solver: of the fragments.
-        kept: links that are believed.
+        kept: accepted links.
         refused: links that are not.
-        s: when links are believed.
+        s: when links are accepted.
     """
     out: list[Link] = []
     if not refused:
         return out
     for graph in solver.solve(kept):
         inside = [link for link in refused if link.a in graph.rows and link.b in graph.rows]
-        here = [link for link in kept if link.a in graph.rows] if inside else []
-        if not inside or len(inside) > FEW * (len(here) + len(inside)):
+        accepted = [link for link in kept if link.a in graph.rows] if inside else []
+        if not inside or len(inside) > FEW * (len(accepted) + len(inside)):
             continue
-        log_odds = math.log((len(here) + 0.5) / (len(inside) + 0.5))
-        known = zip(inside, misfits(inside, graph, s), standpoints(inside, graph, kept=False), strict=True)
+        log_odds = math.log((len(accepted) + 0.5) / (len(inside) + 0.5))
+        rated = zip(inside, misfits(inside, graph, s), standpoints(inside, graph, kept=False), strict=True)
         tried = sorted(
-            ((link, far, found) for link, far, found in known if far < NEAR * s.gate and not found.alone),
+            (
+                (link, misfit, standpoint)
+                for link, misfit, standpoint in rated
+                if misfit < NEAR * s.gate and not standpoint.alone
+            ),
             key=lambda item: item[0].key,
         )
-        cost = _cost(solver, here) if tried else 0.0
-        for link, far, found in tried:
-            now = _cost(solver, [*here, link])
-            if log_odds + found.log_factor + 0.5 * (far - (now - cost)) > LEAST_EVIDENCE:
-                here, cost = [*here, link], now
+        cost = _cost(solver, accepted) if tried else 0.0
+        for link, misfit, standpoint in tried:
+            now = _cost(solver, [*accepted, link])
+            if log_odds + standpoint.log_factor + 0.5 * (misfit - (now - cost)) > LEAST_EVIDENCE:
+                accepted, cost = [*accepted, link], now
                 out.append(link)
     return out
 

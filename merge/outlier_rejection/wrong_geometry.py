@@ -1,19 +1,19 @@
-"""Maps with wrong geometry: wherever their links put them, other robots look through their walls.
+"""Maps with wrong geometry: in every placement by their links, other robots see through their walls.
 
 A robot whose wheels slip, or that is carried off unnoticed, makes a map with true views and a wrong way
-between them. Each of its links to a sound map is true, and no rigid placement satisfies them all: they fall
+between them. Each of its links to a correct map is true, and no rigid placement satisfies them all: they fall
 into sets that agree only within themselves (pairwise consistency, Mangelson et al., ICRA 2018). A room that
-looks like another room gives such sets too. Consistency cannot tell the two cases apart. Lines of sight can:
+looks like another room gives such sets too. Consistency cannot distinguish the two cases. Lines of sight can:
 
-* If the map is sound, one placement is true. Under it the landmarks of the map are where others have seen
-  them, or where nobody has looked. The links of all other sets are false.
-* If the map bends or jumps, each placement puts a part of it where it never was. Others then look through its
-  walls, and it looks through theirs: they know landmarks behind them in the same direction.
+* If the map is correct, one placement is true. Under it the landmarks of the map are where others have seen
+  them, or where no robot has observed. The links of all other sets are false.
+* If the map bends or jumps, each placement puts a part of it in a wrong place. Others then see through its
+  walls, and it sees through theirs: they have landmarks behind them in the same direction.
 
 So a map is wrong if lines of sight refute every placement among several maps that agree with each other.
-Clutter and wrong depths are looked through at true places too. How much is measured on the same nodes, each
-put where its own links put it. Where others have not looked nothing is refuted, and the map may be right: it
-may know a room that only looks like theirs.
+Clutter and wrong depths are seen through at true places too. Their share is measured on the same nodes, each
+placed by its own links. Unobserved placements are not refuted, and the map may be right: it may have a room
+that only looks like theirs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians
 
 MOST_LINKS = 60
-"""Links between two pieces of map that are looked at, evenly chosen: pairs of links grow by the square."""
+"""Links between two pieces of map that are tested, evenly chosen: pairs of links grow by the square."""
 MOST_PARTNERS = 5
 """Maps against which one is held: those with which it has most links."""
 AGREEING = 0.9
@@ -49,7 +49,7 @@ more, those of a robot with wrong geometry up to 0.75."""
 LEAST_SHARE = 0.25
 """A set of links is a placement if it has this share of the links of the largest set."""
 RARE = 0.05
-"""Share of nodes, where their own links put them, that are looked through more than is usual."""
+"""Share of nodes, placed by their own links, that are seen through more than usual."""
 REFUTED = 0.001
 """Chance, at most, that so many nodes are under a true placement (binomial)."""
 LEAST_NODES = 4
@@ -80,7 +80,7 @@ class _Tie:
     Attributes:
         links: all between the largest pieces of the two.
         best: the largest set of them that agrees.
-        share: of the links that were looked at that are in it.
+        share: of the tested links that are in it.
     """
 
     links: tuple[Link, ...]
@@ -120,7 +120,7 @@ class WrongGeometrySearch:
             maps: by id; never changed, only replaced.
             links: gives those between two of them.
             stale: pairs of maps whose links have changed, or of which one was replaced, since the last call.
-            left_out: maps that are not heard.
+            left_out: maps that are not used.
 
         Returns:
             The maps that are wrong, by id.
@@ -133,39 +133,41 @@ class WrongGeometrySearch:
                 self._tie(pair, maps, links(pair))
         changed = [set(pair) for pair in stale]
         self._checked = {
-            (one, others): found
-            for (one, others), found in self._checked.items()
-            if not any(pair <= {one, *others} for pair in changed)
+            (map_id, partners): checked
+            for (map_id, partners), checked in self._checked.items()
+            if not any(pair <= {map_id, *partners} for pair in changed)
         }
         ties: dict[MapId, dict[MapId, _Tie]] = {}
         for pair, tie in self._ties.items():
             if not set(pair) & set(left_out):
-                for one, other in (pair, pair[::-1]):
-                    ties.setdefault(one, {})[other] = tie
-        doubts = {one: sum(not tie.agrees for tie in others.values()) for one, others in ties.items()}
+                for map_id, partner in (pair, pair[::-1]):
+                    ties.setdefault(map_id, {})[partner] = tie
+        doubts = {
+            map_id: sum(not tie.agrees for tie in partners.values()) for map_id, partners in ties.items()
+        }
         out: dict[MapId, WrongGeometry] = {}
-        for one in sorted(doubts, key=lambda one: (-doubts[one], one)):
-            if doubts[one] < 2:
+        for map_id in sorted(doubts, key=lambda map_id: (-doubts[map_id], map_id)):
+            if doubts[map_id] < 2:
                 break
-            agreeing = self._agreeing({k: v for k, v in ties[one].items() if k not in out}, ties)
+            agreeing = self._agreeing({k: v for k, v in ties[map_id].items() if k not in out}, ties)
             if len(agreeing) < 2:
                 continue
-            if (one, agreeing) not in self._checked:
-                self._checked[one, agreeing] = False
+            if (map_id, agreeing) not in self._checked:
+                self._checked[map_id, agreeing] = False
                 with suppress(*UNSOLVABLE):
-                    self._checked[one, agreeing] = self._is_wrong(one, agreeing, maps)
-            if self._checked[one, agreeing]:
-                out[one] = WrongGeometry(one, agreeing)
+                    self._checked[map_id, agreeing] = self._is_wrong(map_id, agreeing, maps)
+            if self._checked[map_id, agreeing]:
+                out[map_id] = WrongGeometry(map_id, agreeing)
         return out
 
-    def _main(self, map_id: MapId, one: HybridMap) -> Fragment | None:
+    def _main(self, map_id: MapId, hybrid_map: HybridMap) -> Fragment | None:
         """The largest piece of a map."""
-        pieces = self._memory.fragments({map_id: one}, self._s)
+        pieces = self._memory.fragments({map_id: hybrid_map}, self._s)
         return max(pieces, key=len, default=None)
 
     def _tie(self, pair: MapPair, maps: Mapping[MapId, HybridMap], links: Sequence[Link]) -> None:
         """Sort the links between two maps."""
-        first, second = (self._main(one, maps[one]) if one in maps else None for one in pair)
+        first, second = (self._main(map_id, maps[map_id]) if map_id in maps else None for map_id in pair)
         if first is None or second is None or first is second:
             return
         inside = [link for link in links if link.a in first.graph.rows and link.b in second.graph.rows]
@@ -185,21 +187,21 @@ class WrongGeometrySearch:
         parts = [part for part in nx.connected_components(graph) if sum(not own[k].agrees for k in part) >= 2]
         return tuple(sorted(max(parts, key=len, default=())))
 
-    def _is_wrong(self, one: MapId, agreeing: Sequence[MapId], maps: Mapping[MapId, HybridMap]) -> bool:
+    def _is_wrong(self, map_id: MapId, agreeing: Sequence[MapId], maps: Mapping[MapId, HybridMap]) -> bool:
         """Whether every placement of a map among maps that agree is refuted."""
-        placed = self._main(one, maps[one])
-        pieces = [piece for other in agreeing if (piece := self._main(other, maps[other])) is not None]
+        placed = self._main(map_id, maps[map_id])
+        pieces = [piece for partner in agreeing if (piece := self._main(partner, maps[partner])) is not None]
         assert placed is not None, "a map with links has nodes"
         pairs = [(a, b) for a in agreeing for b in agreeing if a < b and (a, b) in self._ties]
         held = [link for pair in pairs if self._ties[pair].agrees for link in self._ties[pair].best]
         graph = ComponentSolver(pieces).solve(held)[0]
         across = [
-            link if link.a.map == one else link.turned()
-            for other in agreeing
-            for link in thinned(self._ties[min(one, other), max(one, other)].links)
+            link if link.a.map == map_id else link.turned()
+            for partner in agreeing
+            for link in thinned(self._ties[min(map_id, partner), max(map_id, partner)].links)
         ]
         across = [link for link in across if link.b in graph.rows]
-        every = {k: node for which in (one, *agreeing) for k, node in maps[which].nodes.items()}
+        every = {k: node for which in (map_id, *agreeing) for k, node in maps[which].nodes.items()}
         return all_refuted(across, placed, Fragment(graph.anchor, graph, ()), every, self._s)
 
 
@@ -242,7 +244,7 @@ def all_refuted(
     nodes: Mapping[NodeId, Node],
     s: ConsistencySettings,
 ) -> bool:
-    """Whether the lines of sight refute every placement that links give.
+    """Whether lines of sight refute every placement by links.
 
     Args:
         links: from `placed` to `fixed`.
@@ -254,63 +256,71 @@ def all_refuted(
     if not _nodes_agree(links, fixed):
         return False
     sets = link_sets(links, placed, fixed, s)
-    sets = [one for one in sets if len(one) >= LEAST_SHARE * len(sets[0])]
+    sets = [some_links for some_links in sets if len(some_links) >= LEAST_SHARE * len(sets[0])]
     own: dict[NodeId, list[Link]] = {}
     for link in links:
         own.setdefault(link.a, []).append(link)
-    # By its own links each node is where it truly is, whatever the map says of the way there.
-    usual = np.concatenate([_looked_through(some, [one], placed, fixed, nodes) for one, some in own.items()])
+    # By its own links each node is at its true place, regardless of the map's geometry.
+    usual = np.concatenate(
+        [_seen_through_shares(some, [some_links], placed, fixed, nodes) for some_links, some in own.items()]
+    )
     return all(
-        _more(_looked_through(one, sorted(own.keys() - {k.a for k in one}), placed, fixed, nodes), usual)
-        for one in sets
+        _more(
+            _seen_through_shares(
+                some_links, sorted(own.keys() - {k.a for k in some_links}), placed, fixed, nodes
+            ),
+            usual,
+        )
+        for some_links in sets
     )
 
 
 def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
     """Whether the links of each single node agree where it is.
 
-    They do, whatever the geometry of its map. Otherwise many links are false since places look alike, and a
-    map whose links are all false would be refuted everywhere too.
+    They do, with any geometry of its map. Otherwise many links are false by perceptual aliasing, and a map
+    with only false links would be refuted everywhere too.
     """
     places: dict[NodeId, list[Pose2]] = {}
     for link in sorted(links, key=lambda link: -link.weight):
         places.setdefault(link.a, []).append(fixed.graph.pose(link.b) @ link.a_from_b.mean.inverse())
     agree = [
-        best.distance(other) < SAME_XY and abs(wrap_angle(best.heading - other.heading)) < SAME_HEADING
-        for best, *others in places.values()
-        for other in others
+        best.distance(placement) < SAME_XY
+        and abs(wrap_angle(best.heading - placement.heading)) < SAME_HEADING
+        for best, *rest in places.values()
+        for placement in rest
     ]
     return len(agree) >= LEAST_NODES and sum(agree) >= AGREEING * len(agree)
 
 
 def _more(shares: Array, usual: Array) -> bool:
-    """Whether more nodes than chance makes are looked through more than is usual."""
+    """Whether more nodes than by chance are seen through more than usual."""
     if min(len(shares), len(usual)) < LEAST_NODES:
         return False
     many = int((shares > np.quantile(usual, 1.0 - RARE)).sum())
     return bool(bdtrc(many - 1, len(shares), RARE) < REFUTED)
 
 
-def _looked_through(
-    story: Sequence[Link],
+def _seen_through_shares(
+    links: Sequence[Link],
     which: Sequence[NodeId],
     placed: Fragment,
     fixed: Fragment,
     nodes: Mapping[NodeId, Node],
 ) -> Array:
-    """Of each node that can be placed: the share of its comparable landmarks that are looked through.
+    """Of each node that can be placed: the share of its comparable landmarks that are seen through.
 
     Args:
-        story: links from `placed` to `fixed` that place it.
+        links: links from `placed` to `fixed` that place it.
         which: nodes of `placed`.
         placed: piece of map.
         fixed: piece of map.
         nodes: of both.
     """
-    starts, ends = [link.a for link in story], [link.b for link in story]
+    starts, ends = [link.a for link in links], [link.b for link in links]
     measured = PoseGaussians(
-        np.stack([link.a_from_b.mean.vector for link in story]),
-        np.stack([link.a_from_b.covariance for link in story]),
+        np.stack([link.a_from_b.mean.vector for link in links]),
+        np.stack([link.a_from_b.covariance for link in links]),
     ).inverse()
     means, out = fixed.graph.means, []
     for node_id in which:
@@ -326,42 +336,42 @@ def _looked_through(
         counts = np.zeros(2, np.int64)
         for k in np.argsort(away, kind="stable")[:MOST_NEAR]:
             if away[k] < REACH:
-                one, other = nodes[node_id], nodes[fixed.nodes[k]]
-                other_from_one = Pose2.from_vector(means[k]).inverse() @ at
-                counts += looked_through(one, other, other_from_one, sigma_xy, sigma_heading)
-                counts += looked_through(other, one, other_from_one.inverse(), sigma_xy, sigma_heading)
+                a, b = nodes[node_id], nodes[fixed.nodes[k]]
+                b_from_a = Pose2.from_vector(means[k]).inverse() @ at
+                counts += seen_through(a, b, b_from_a, sigma_xy, sigma_heading)
+                counts += seen_through(b, a, b_from_a.inverse(), sigma_xy, sigma_heading)
         if counts[0] >= LEAST_LANDMARKS:
             out.append(counts[1] / counts[0])
     return np.array(out)
 
 
-def looked_through(
+def seen_through(
     node: Node, view: Node, view_from_node: Pose2, sigma_xy: float, sigma_heading: float
 ) -> tuple[int, int]:
     """How many of a node's landmarks a view can confirm or refute, and how many it refutes.
 
-    A view confirms a landmark if it knows one as far away in the same direction. It looks through it, and so
-    refutes it, if it knows one only behind it. Landmarks that lie behind everything that the view knows
-    there are hidden, and say nothing: a map placed outside the walls would have too many of them.
+    A view confirms a landmark if it has one at this distance in the same direction. It sees through it, and
+    so refutes it, if it has one only behind it. Landmarks behind everything that the view has there are
+    occluded, and are no evidence: a map placed outside the walls would have too many of them.
 
     Args:
         node: whose landmarks.
         view: another node.
-        view_from_node: how the two stand,
+        view_from_node: relative pose,
         sigma_xy: standard deviation of that, m,
         sigma_heading: and rad.
     """
-    marks, known = (n.landmarks.take(n.landmarks.has_depth) for n in (node, view))
+    marks, with_depth = (n.landmarks.take(n.landmarks.has_depth) for n in (node, view))
     points = view_from_node.apply(marks.points_in_robot(node.camera))
     pixels = view.camera.project(points)
     inside = view.camera.contains(pixels)
-    if not inside.any() or not len(known):
+    if not inside.any() or not len(with_depth):
         return 0, 0
     depths, pixels = points[inside, 0] - view.camera.mount_forward, pixels[inside]
     own = marks.depth_sigmas[inside].astype(np.float64) ** 2 + sigma_xy**2 + (sigma_heading * depths) ** 2
-    sigmas = np.sqrt(own[:, None] + known.depth_sigmas.astype(np.float64)[None] ** 2)
-    further = known.depths.astype(np.float64)[None] - depths[:, None]
-    off = np.linalg.norm(pixels[:, None] - known.pixels[None], axis=2) / view.camera.fx
+    sigmas = np.sqrt(own[:, None] + with_depth.depth_sigmas.astype(np.float64)[None] ** 2)
+    further = with_depth.depths.astype(np.float64)[None] - depths[:, None]
+    off = np.linalg.norm(pixels[:, None] - with_depth.pixels[None], axis=2) / view.camera.fx
     same_direction = off < AROUND + 2.0 * sigma_heading
     behind = (same_direction & (further > SIGMAS * sigmas + MARGIN)).any(axis=1)
     about = (same_direction & (np.abs(further) <= SIGMAS * sigmas + MARGIN)).any(axis=1)

@@ -35,8 +35,8 @@ MOST_AT_ONCE = 400
 class Component(PoseGraph):
     """A solved pose graph with the measurements that made it; its nodes are in the order of their ids.
 
-    In a large one, how two nodes stand to each other is known by the measurements around them. What lies
-    further away would make it a little more certain and is left out, so covariances are a little too large,
+    In a large one, the relative pose of two nodes is determined by the measurements around them. Measurements
+    further away would make it a little more certain and are left out, so covariances are a little too large,
     never too small.
 
     Attributes:
@@ -134,10 +134,10 @@ class Component(PoseGraph):
         right[columns, np.arange(len(columns))] = 1.0
         joint = factorized(information).solve(right)[columns]
         joint = (0.5 * (joint + joint.T)).reshape(len(seats), 3, len(seats), 3)
-        one, two = np.split(which, 2)
+        first, second = np.split(which, 2)
         ad = -adjoints(inverse_poses(means))
-        cross = ad @ joint[one, :, two, :]
-        out = ad @ joint[one, :, one, :] @ ad.transpose(0, 2, 1) + joint[two, :, two, :]
+        cross = ad @ joint[first, :, second, :]
+        out = ad @ joint[first, :, first, :] @ ad.transpose(0, 2, 1) + joint[second, :, second, :]
         joined = piece[order[i]] == piece[order[j]]
         return out + cross + cross.transpose(0, 2, 1), joined
 
@@ -156,11 +156,11 @@ def _shares(pairs: Rows, i: Rows, j: Rows) -> list[Rows]:
     out: list[list[int]] = []
     involved: set[int] = set()
     for k in pairs.tolist():
-        here = {int(i[k]), int(j[k])}
-        if not out or len(involved | here) > ROWS_AT_ONCE:
+        ends = {int(i[k]), int(j[k])}
+        if not out or len(involved | ends) > ROWS_AT_ONCE:
             out.append([])
             involved = set()
-        involved |= here
+        involved |= ends
         out[-1].append(k)
     return [np.array(some, np.int64) for some in out]
 
@@ -178,7 +178,7 @@ def solve_graph(anchor: NodeId, anchor_pose: Pose2, measurements: Iterable[Measu
     Args:
         anchor: the node that is held.
         anchor_pose: where.
-        measurements: what is known; those that do not connect to the anchor are left out.
+        measurements: those that do not connect to the anchor are left out.
 
     Returns:
         The solved graph. It depends on the set of measurements, not on their order.
@@ -204,13 +204,13 @@ def along_tree(
     graph.add_node(anchor)
     for m in measurements:
         weight = float(m.covariance.trace()) + (100.0 if m.robust else 0.0)
-        known = graph.get_edge_data(m.a, m.b)
-        if m.a != m.b and (known is None or weight < known["weight"]):
+        edge = graph.get_edge_data(m.a, m.b)
+        if m.a != m.b and (edge is None or weight < edge["weight"]):
             graph.add_edge(m.a, m.b, weight=weight, measurement=m)
     tree = nx.minimum_spanning_tree(graph.subgraph(nx.node_connected_component(graph, anchor)))
-    found = {anchor: anchor_pose}
-    for known_node, node in nx.bfs_edges(tree, anchor):
-        m = tree.edges[known_node, node]["measurement"]
-        relative = m.a_from_b.mean if m.a == known_node else m.a_from_b.mean.inverse()
-        found[node] = found[known_node] @ relative
-    return found
+    poses = {anchor: anchor_pose}
+    for parent, node in nx.bfs_edges(tree, anchor):
+        m = tree.edges[parent, node]["measurement"]
+        relative = m.a_from_b.mean if m.a == parent else m.a_from_b.mean.inverse()
+        poses[node] = poses[parent] @ relative
+    return poses

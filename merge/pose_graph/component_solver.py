@@ -50,7 +50,7 @@ class ComponentSolver:
         self._means, self._labels = np.zeros((len(self._nodes), 3)), np.zeros(len(self._nodes), np.int64)
         for k, (fragment, at) in enumerate(zip(fragments, rows, strict=True)):
             self._means[at], self._labels[at] = fragment.graph.means, k
-        self._graphs: dict[int, PoseGraph] = {k: one.graph for k, one in enumerate(fragments)}
+        self._graphs: dict[int, PoseGraph] = {k: piece.graph for k, piece in enumerate(fragments)}
         self._table = Factors.of([], [], [])
         self._seats: dict[Pair, int] = {}
         self._links: list[Link] = []
@@ -68,7 +68,7 @@ class ComponentSolver:
         graphs: Sequence[PoseGraph],
         fragments: Iterable[Fragment],
         links: Sequence[Link],
-        gone: Iterable[Link],
+        removed: Iterable[Link],
     ) -> None:
         """Go on from an earlier solution.
 
@@ -76,21 +76,21 @@ class ComponentSolver:
             graphs: its components.
             fragments: the pieces that they were made of.
             links: of its links, those that still hold.
-            gone: the others.
+            removed: the others.
         """
         seats = {node: (k, row) for k, graph in enumerate(graphs) for row, node in enumerate(graph.nodes)}
-        self._graphs = {len(graphs) + k: one.graph for k, one in enumerate(self.fragments)}
+        self._graphs = {len(graphs) + k: piece.graph for k, piece in enumerate(self.fragments)}
         for number, fragment in enumerate(self.fragments, len(graphs)):
             self._place(fragment, graphs, seats, number)
         self._graphs = {**self._graphs, **dict(enumerate(graphs))}
         self._active = np.sort(self._index(links))
         before, now = set(fragments), set(self.fragments)
-        said = [
+        measurements = [
             {(m.a, m.b, m.a_from_b.mean) for fragment in some for m in fragment.measurements}
             for some in (before - now, now - before)
         ]
-        ends = {node for a, b, _ in said[0] ^ said[1] for node in (a, b)}
-        ends |= {node for link in gone for node in link.pair}
+        ends = {node for a, b, _ in measurements[0] ^ measurements[1] for node in (a, b)}
+        ends |= {node for link in removed for node in link.pair}
         self._touched[self._rows(node for node in ends if node in self._row)] = True
         self._settled = False
 
@@ -101,24 +101,24 @@ class ComponentSolver:
         seats: dict[NodeId, tuple[int, int]],
         number: int,
     ) -> None:
-        """Put a piece where it was, and nodes that are new beside the nearest that was there."""
+        """Put a piece where it was, and new nodes next to their nearest earlier node."""
         at = self._rows(fragment.nodes)
-        known = [seats.get(node, (-1, -1)) for node in fragment.nodes]
-        labels = np.array([label for label, _ in known])
+        placed = [seats.get(node, (-1, -1)) for node in fragment.nodes]
+        labels = np.array([label for label, _ in placed])
         if (labels < 0).all():
             self._labels[at] = number
             return
         label = int(np.bincount(labels[labels >= 0]).argmax())
         self._labels[at] = label
-        there = np.flatnonzero(labels == label)
-        self._means[at[there]] = graphs[label].means[[known[k][1] for k in there.tolist()]]
+        members = np.flatnonzero(labels == label)
+        self._means[at[members]] = graphs[label].means[[placed[k][1] for k in members.tolist()]]
         new = np.flatnonzero(labels != label)
         if len(new):
             numbers = np.array([node.number for node in fragment.nodes])
-            near = there[np.abs(numbers[new][:, None] - numbers[there]).argmin(axis=1)]
+            nearest = members[np.abs(numbers[new][:, None] - numbers[members]).argmin(axis=1)]
             own = fragment.graph.means
-            step = compose_poses(inverse_poses(own[near]), own[new])
-            self._means[at[new]] = compose_poses(self._means[at[near]], step)
+            step = compose_poses(inverse_poses(own[nearest]), own[new])
+            self._means[at[new]] = compose_poses(self._means[at[nearest]], step)
 
     def solve(self, links: Sequence[Link], *, whole: bool = False) -> list[PoseGraph]:
         """Each component that some links make, largest first, then by name.
@@ -142,7 +142,7 @@ class ComponentSolver:
         seats = [self._seats.get(link.key, -1) for link in links]
         if -1 in seats:
             new = [link.canonical() for link, seat in zip(links, seats, strict=True) if seat < 0]
-            # Whatever the order in which links come, the numbers are the same.
+            # The numbers do not depend on the order of links.
             new.sort(key=lambda link: link.key)
             self._seats |= {link.key: len(self._links) + k for k, link in enumerate(new)}
             self._links += new
@@ -188,17 +188,17 @@ class ComponentSolver:
         pieces: nx.Graph = nx.Graph()
         for k in index[between].tolist():
             ends = int(self._labels[self._table.a[k]]), int(self._labels[self._table.b[k]])
-            known, weight = pieces.get_edge_data(*ends), self._links[k].weight
-            if known is None or weight > known["weight"]:
+            edge, weight = pieces.get_edge_data(*ends), self._links[k].weight
+            if edge is None or weight > edge["weight"]:
                 pieces.add_edge(*ends, weight=weight, link=k)
         sizes = np.bincount(self._labels)
         tree = nx.maximum_spanning_tree(pieces)
         for part in sorted(map(sorted, nx.connected_components(tree))):
             root = max(part, key=lambda label: (sizes[label], -label))
-            for near, label in nx.bfs_edges(tree, root):
-                k = tree.edges[near, label]["link"]
+            for parent, label in nx.bfs_edges(tree, root):
+                k = tree.edges[parent, label]["link"]
                 a_from_b, ends = self._table.means[k][None], (self._table.a[k], self._table.b[k])
-                if self._labels[ends[0]] != near:
+                if self._labels[ends[0]] != parent:
                     a_from_b, ends = inverse_poses(a_from_b), ends[::-1]
                 wanted = compose_poses(self._means[ends[0]][None], a_from_b)
                 self._carry(self._labels == label, int(ends[1]), wanted)

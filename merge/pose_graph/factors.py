@@ -18,8 +18,8 @@ Rows = NDArray[np.int64]
 LEAST_SIGMAS = np.array([1e-3, 1e-3, 2e-4])
 """No measurement is better than this, m, m, rad: it keeps the graph well conditioned."""
 LEAST_SHARE = 2e-6
-"""Nor is any direction better known than by this share of the covariance's trace: what is told of it may be
-off by half as much (`mapweave.hybridmap.pose`), and nothing smaller comes through the solver."""
+"""Least share of the covariance's trace in any direction: the wire's rounding is half as large
+(`mapweave.hybridmap.pose`), and the solver cannot resolve less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +40,12 @@ class Measurement:
 
     @property
     def covariance(self) -> Array:
-        """(3, 3), not better than is believable."""
+        """(3, 3), not smaller than the floor."""
         return believable(self.a_from_b.covariance)
 
 
 def believable(covariances: Array) -> Array:
-    """(..., 3, 3) covariances of measurements, each made as large as is believable."""
+    """(..., 3, 3) covariances of measurements, each raised to the floor."""
     share = LEAST_SHARE * np.trace(covariances, axis1=-2, axis2=-1)
     least = np.maximum(LEAST_SIGMAS**2, share[..., None])
     out: Array = covariances + least[..., None] * np.eye(3)
@@ -57,7 +57,7 @@ class Factors:
     """M relative poses between the rows of N nodes.
 
     Attributes:
-        a: (M,) row of the one node.
+        a: (M,) row of the first node.
         b: (M,) row of the other.
         means: (M, 3) m, m, rad, `a_from_b`.
         weights: (M, 3, 3) information.
@@ -72,7 +72,7 @@ class Factors:
     def of(measurements: Sequence[Measurement], a: Sequence[int], b: Sequence[int]) -> Factors:
         """Of measurements between rows."""
         covariances = np.array([m.a_from_b.covariance for m in measurements]).reshape(-1, 3, 3)
-        means = [(m.x, m.y, m.heading) for m in (one.a_from_b.mean for one in measurements)]
+        means = [(m.x, m.y, m.heading) for m in (measurement.a_from_b.mean for measurement in measurements)]
         return Factors(
             np.array(a, np.int64),
             np.array(b, np.int64),
@@ -121,15 +121,15 @@ class Factors:
             least: how many are enough.
             nodes: how many rows there are.
         """
-        found = np.zeros(nodes, np.bool_)
+        reached = np.zeros(nodes, np.bool_)
         ring = np.unique(rows)
         out = [ring]
-        found[ring] = True
+        reached[ring] = True
         while len(ring) and sum(map(len, out)) < least:
             index = self.at(ring)
             ends = np.unique(np.concatenate([self.a[index], self.b[index]]))
-            ring = ends[~found[ends]]
-            found[ring] = True
+            ring = ends[~reached[ends]]
+            reached[ring] = True
             out.append(ring)
         return np.concatenate(out)
 

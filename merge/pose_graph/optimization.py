@@ -46,11 +46,11 @@ def optimized(factors: Factors, means: Array, free: Rows, held: Rows) -> Array:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(TOLERANCE)
     parameters.setAbsoluteErrorTol(TOLERANCE)
-    found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
     moved = rows[inside[rows]]
     out = means.copy()
     # In the order of the keys, which are the rows.
-    out[moved] = gtsam.utilities.extractPose2(found)[inside[rows]]
+    out[moved] = gtsam.utilities.extractPose2(solution)[inside[rows]]
     return out
 
 

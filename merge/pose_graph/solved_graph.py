@@ -73,18 +73,18 @@ class PoseGraph:
         return frozenset(MapId(agent, epoch) for agent, epoch in {node[:2] for node in self.nodes})
 
     @cached_property
-    def _known(self) -> dict[NodeId, PoseGaussian]:
+    def _pose_gaussians(self) -> dict[NodeId, PoseGaussian]:
         """Poses that were asked for: all at once where they are few, else one by one."""
         return self.poses() if len(self.nodes) <= FEW else {}
 
     def pose_gaussian(self, node: NodeId) -> PoseGaussian:
         """A node's pose with its marginal covariance."""
-        known = self._known
-        if node not in known:
-            known[node] = PoseGaussian(
+        poses = self._pose_gaussians
+        if node not in poses:
+            poses[node] = PoseGaussian(
                 self.pose(node), nearest_covariance(self.covariance([node])[0, :, 0, :])
             )
-        return known[node]
+        return poses[node]
 
     def poses(self) -> dict[NodeId, PoseGaussian]:
         """Each node's pose with its marginal covariance."""

@@ -137,10 +137,10 @@ def test_a_status_without_a_field_is_refused(status: Status, data: st.DataObject
 def test_any_status_can_be_encoded(text: str, times: int) -> None:
     """A status quotes servers and drivers: line breaks and long texts must not end the robot's loop."""
     status = Status("looking", text * times, 0, 0, Pose2(), False)
-    said = decode_agent_status(encode_agent_status(AgentStatus(status, 0))).status.detail
-    assert said.isprintable()
-    assert len(said) == min(len(text) * times, MAX_WORDS)
-    assert all(c == d for c, d in zip(text * times, said, strict=False) if c.isprintable())
+    message = decode_agent_status(encode_agent_status(AgentStatus(status, 0))).status.detail
+    assert message.isprintable()
+    assert len(message) == min(len(text) * times, MAX_WORDS)
+    assert all(c == d for c, d in zip(text * times, message, strict=False) if c.isprintable())
 
 
 # The link
@@ -198,11 +198,13 @@ def test_invalid_commands_are_refused_without_effect(
 
 
 def test_the_fleet_receives_the_robots_status(link: FleetClient, other: MemoryBus) -> None:
-    heard: list[AgentStatus] = []
-    other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(decode_agent_status(sample.payload)))
+    received: list[AgentStatus] = []
+    other.subscribe(
+        KEYS.agent_statuses(), lambda sample: received.append(decode_agent_status(sample.payload))
+    )
     status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False, "goto", THERE, Pose2(0.1, 0, 0), 4)
     link.report(status, 123)
-    eventually(lambda: heard == [AgentStatus(status, 123, MAP.epoch)])
+    eventually(lambda: received == [AgentStatus(status, 123, MAP.epoch)])
 
 
 def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
@@ -218,8 +220,8 @@ def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     assert first.status.doing == "starting"
     assert (first.unsent, first.linked, first.epoch) == (3, False, MAP.epoch)
     status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False)
-    heard: list[bytes] = []
-    other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(sample.payload))
+    received: list[bytes] = []
+    other.subscribe(KEYS.agent_statuses(), lambda sample: received.append(sample.payload))
     link.report(status, 5, publish=False)
     waiting[0] = 0
     token = other.announce(KEYS.server_alive("s0"))
@@ -229,7 +231,7 @@ def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     assert second.traffic > first.traffic > 0
     token.close()
     eventually(lambda: not asked().linked)
-    assert not heard
+    assert not received
     link.close()
     bus.close()
 

@@ -63,9 +63,9 @@ def test_a_loop_must_agree_with_the_way_there(monkeypatch, off, closed):
         next_number=2,
     )
     way = earlier.mean.inverse() @ later.mean
-    found = PoseGaussian.from_sigmas(Pose2(way.x - off, way.y, way.heading), 0.02, 0.005)
+    result = PoseGaussian.from_sigmas(Pose2(way.x - off, way.y, way.heading), 0.02, 0.005)
     recognition = SimpleNamespace(
-        node_from_robot=found, pairs=np.zeros((0, 2), np.int64), evidence={"sigma_xy": 0.02, "inliers": 29.0}
+        node_from_robot=result, pairs=np.zeros((0, 2), np.int64), evidence={"sigma_xy": 0.02, "inliers": 29.0}
     )
     monkeypatch.setattr(keyframe_builder, "register", lambda *arguments: recognition)
     edges = made._close_loops(node(5, later))

@@ -206,12 +206,12 @@ def test_ways_are_as_long_as_dijkstras(seed):
     start = np.array([-3.0, 1.5])
     reach = 5.0
     ways = floor.ways(start, reach)
-    found = {tuple(cell): length for cell, length in zip(ways.cells.tolist(), ways.lengths, strict=True)}
+    route = {tuple(cell): length for cell, length in zip(ways.cells.tolist(), ways.lengths, strict=True)}
     expected = nx.single_source_dijkstra_path_length(graph, tuple(floor.cells(start).tolist()))
     near = {cell for cell, length in expected.items() if length <= reach}
     assert len(near) > 500
-    assert near <= set(found) <= set(expected)
-    for cell, length in found.items():
+    assert near <= set(route) <= set(expected)
+    for cell, length in route.items():
         assert length == pytest.approx(expected[cell], abs=1e-6)
 
 

@@ -122,14 +122,14 @@ def test_images_without_features_make_no_node_and_are_reported():
 
 def test_until_the_first_node_the_reason_is_reported(walls):
     pipeline = on(Carried())
-    before, said = Pose2(), []
+    before, lines = Pose2(), []
     for tick, x in enumerate(np.arange(0.0, 0.8, 0.025)):
         status = pipeline.step(walls.observe(before, Pose2(x), tick)).status
         assert status.detail.startswith("no nodes yet: ") == (status.nodes == 0)
-        said.append(status.nodes)
+        lines.append(status.nodes)
         before = Pose2(x)
-    assert said[0] == 0
-    assert said[-1] >= 1
+    assert lines[0] == 0
+    assert lines[-1] >= 1
 
 
 # Missions

@@ -301,31 +301,31 @@ def refused(action) -> str:
 
 @pytest.mark.parametrize("case", WRONG)
 def test_errors_are_reported_in_one_line(folder, case):
-    spoil, said = WRONG[case]
+    spoil, message = WRONG[case]
     spoil(folder)
     words = refused(lambda: Replay(folder))
-    assert said in words
+    assert message in words
     assert str(folder) in words
 
 
 @pytest.mark.parametrize("case", WRONG_SPLITS)
 def test_errors_of_a_split_are_reported_in_one_line(folder, case):
-    spoil, said = WRONG_SPLITS[case]
+    spoil, message = WRONG_SPLITS[case]
     spoil(folder)
     words = refused(lambda: Replay(folder, "b"))
-    assert said in words
+    assert message in words
     assert str(folder / "splits.toml") in words
 
 
 @pytest.mark.parametrize("case", WRONG_IMAGES)
 def test_errors_of_an_image_are_reported_at_its_turn(folder, case):
     replay = Replay(folder)
-    spoil, said = WRONG_IMAGES[case]
+    spoil, message = WRONG_IMAGES[case]
     spoil(folder)
     replay.sense()
     replay.sense()
     words = refused(replay.sense)
-    assert said in words
+    assert message in words
     assert "frame2.png" in words
 
 

@@ -80,9 +80,9 @@ def test_a_long_silence_does_not_count_against_what_the_robot_was_doing(walls):
     steady, interrupted = commands
     assert any(command.forward for command in steady[40:])
     # The images of the pause are the same image: the filter has learnt from it a little more.
-    for one, other in zip(steady, interrupted, strict=True):
-        assert one.forward == pytest.approx(other.forward, abs=0.05)
-        assert one.turn == pytest.approx(other.turn, abs=0.05)
+    for a, b in zip(steady, interrupted, strict=True):
+        assert a.forward == pytest.approx(b.forward, abs=0.05)
+        assert a.turn == pytest.approx(b.turn, abs=0.05)
 
 
 @pytest.mark.parametrize("mission", [Idle(), Carried()])
@@ -92,8 +92,8 @@ def test_an_agent_without_wheels_needs_no_rangers(walls, mission):
 
 
 def test_a_robot_that_promises_none_drives_without(walls):
-    body = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3))
-    drive = Drive(walls, on(Explore(), body=body))
+    description = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3))
+    drive = Drive(walls, on(Explore(), body=description))
     assert any(step.command != Command() for step in drive.run(20, NONE))
 
 

@@ -19,23 +19,23 @@ def test_same_estimates_over_a_whole_run(shape: str) -> None:
     """State and covariance to 1e-6 at each of 500 steps, landmarks coming into view and leaving it."""
     run = draw_run(np.random.default_rng([21, SHAPES.index(shape)]), shape, landmarks=12, camera=AHEAD)
     assert np.isnan(run.pixels).any()
-    ours, theirs = Ours(run, plain(run)), Theirs(run)
+    own, theirs = Ours(run, plain(run)), Theirs(run)
     for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
-        ours.step(odometry, pixels)
+        own.step(odometry, pixels)
         theirs.step(odometry, pixels)
-        assert max(gap(ours.belief, theirs.belief)) < 1e-6
+        assert max(gap(own.belief, theirs.belief)) < 1e-6
 
 
 def test_a_wrong_model_does_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the agreement is worth: wheels of twice the noise are noticed."""
     run = draw_run(np.random.default_rng(22), "arc", steps=20, landmarks=12)
-    ours = Ours(run, plain(run))
+    own = Ours(run, plain(run))
     monkeypatch.setattr(ekf_speed, "WHEEL_NOISE", 2 * WHEEL_NOISE)
     theirs = Theirs(run)
     for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
-        ours.step(odometry, pixels)
+        own.step(odometry, pixels)
         theirs.step(odometry, pixels)
-    assert min(gap(ours.belief, theirs.belief)) > 1e-5
+    assert min(gap(own.belief, theirs.belief)) > 1e-5
 
 
 def test_transition_is_the_motions_derivative() -> None:

@@ -68,12 +68,12 @@ def test_complex_steps_are_derivatives(chart: Coordinates) -> None:
 
 def test_the_textbook_filter_agrees_with_ours_for_the_same_choices() -> None:
     run = short_run(2)
-    ours = Ours(run, plain(run))
+    own = Ours(run, plain(run))
     for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
-        ours.step(odometry, pixels)
+        own.step(odometry, pixels)
     textbook = followed(run, Choice(Rays(), moving=True))
     x = np.concatenate([textbook.pose_vector, textbook.landmarks.ravel()])
-    assert max(gap((x, textbook.covariance), ours.belief)) < 1e-7
+    assert max(gap((x, textbook.covariance), own.belief)) < 1e-7
 
 
 def test_a_step_linearised_again_agrees_with_ours() -> None:
@@ -82,12 +82,12 @@ def test_a_step_linearised_again_agrees_with_ours() -> None:
     settings = FilterSettings(
         pixel_sigma=run.pixel_sigma, relinearisations=1, gate_probability=1 - 1e-15, slip_sigmas=np.inf
     )
-    ours, once = Ours(run, settings), Ours(run, plain(run))
+    own, once = Ours(run, settings), Ours(run, plain(run))
     for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
-        ours.step(odometry, pixels)
+        own.step(odometry, pixels)
         once.step(odometry, pixels)
     textbook = followed(run, Choice(Rays(), moving=True, relinearisations=1))
-    pose_vector = ours.belief[0][:3]
+    pose_vector = own.belief[0][:3]
     off = np.abs(textbook.pose_vector - pose_vector).max()
     assert off < 5e-5
     assert off < 0.2 * np.abs(once.belief[0][:3] - pose_vector).max()
@@ -146,11 +146,11 @@ def test_an_iterated_update_ends_where_the_posterior_does_not_slope() -> None:
 
 def test_divergence_is_counted_and_gives_no_number() -> None:
     kept, off, lost = Outcome(1.0, 3.0, 4.0), Outcome(11.0, 99.0, 99.0), Outcome(math.inf, math.nan, math.nan)
-    told = summary([kept, kept, off, lost])
-    assert told["ratio_median"] == 6.0
-    assert told["ratio_p90"] == math.inf
-    assert told["diverged"] == 0.5
-    assert (told["nees_pose"], told["nees_landmark"]) == (3.0, 4.0)
+    result = summary([kept, kept, off, lost])
+    assert result["ratio_median"] == 6.0
+    assert result["ratio_p90"] == math.inf
+    assert result["diverged"] == 0.5
+    assert (result["nees_pose"], result["nees_landmark"]) == (3.0, 4.0)
     assert math.isnan(summary([lost])["nees_pose"])
 
 
@@ -168,8 +168,8 @@ def test_the_command_lists_all_filters(
         monkeypatch.setenv(name, "1")  # the command sets them, and would for all tests that follow
     monkeypatch.setattr(sys, "argv", ["ekf_variants", "--runs", "1", "--steps", "10", "--json"])
     main()
-    told = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert set(told) == {
+    values = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert set(values) == {
         "ratio_median",
         "ratio_p90",
         "nees_pose",
@@ -177,7 +177,7 @@ def test_the_command_lists_all_filters(
         "diverged",
         "nees_interval",
     }
-    assert list(told["ratio_median"]) == [*TEXTBOOK, *OURS]
+    assert list(values["ratio_median"]) == [*TEXTBOOK, *OURS]
 
 
 def test_zero_runs_are_refused_in_one_line(

@@ -35,7 +35,7 @@ def test_a_node_shows_what_is_visible_in_its_field_of_view(pose: Pose2) -> None:
     squares = floor_squares(PLAN)
     shown = shows(Look(0.0, pose, 0.5), squares, PLAN)
     steps = np.linspace(0.0, 1.0, 400)[:, None]
-    for square, found in zip(squares, shown, strict=True):
+    for square, outcome in zip(squares, shown, strict=True):
         line = np.array([pose.x, pose.y]) + steps * (square - [pose.x, pose.y])
         off = math.atan2(square[1] - pose.y, square[0] - pose.x) - pose.heading
         seen = (
@@ -45,14 +45,14 @@ def test_a_node_shows_what_is_visible_in_its_field_of_view(pose: Pose2) -> None:
         )
         # Lines that only just miss a corner may differ.
         if PLAN.clearances(line).min() > 0.01 or PLAN.clearances(line).min() == 0.0:
-            assert found == seen
+            assert outcome == seen
     assert 0.01 < shown.mean() < 0.5
 
 
 def test_floor_is_mapped_from_the_first_view_on() -> None:
     west, east = Pose2(1.0, 2.0, 0.0), Pose2(7.0, 2.0, math.pi)
-    looks = {"r0": [Look(5.0, west, 0.5), Look(9.0, west, 0.5)], "r1": [Look(7.0, east, 0.5)], "r2": []}
-    floor = mapped_floor(PLAN, looks)
+    views = {"r0": [Look(5.0, west, 0.5), Look(9.0, west, 0.5)], "r1": [Look(7.0, east, 0.5)], "r2": []}
+    floor = mapped_floor(PLAN, views)
     squares = floor_squares(PLAN)
     first, second = (shows(Look(0.0, pose, 0.5), squares, PLAN) for pose in (west, east))
     assert not (first & second).any()
@@ -62,8 +62,8 @@ def test_floor_is_mapped_from_the_first_view_on() -> None:
     assert floor.overlap(100.0) == 0.0
     assert floor.whole == pytest.approx(len(squares) * SQUARE**2)
     assert 0.7 * 32.0 < floor.whole < 32.0
-    looks["r1"].append(Look(8.0, west, 0.5))
-    both = mapped_floor(PLAN, looks)
+    views["r1"].append(Look(8.0, west, 0.5))
+    both = mapped_floor(PLAN, views)
     assert both.overlap(7.9) == 0.0
     assert both.overlap(8.0) == pytest.approx(first.sum() / (first | second).sum())
 

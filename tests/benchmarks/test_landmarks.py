@@ -76,9 +76,9 @@ def test_a_missing_folder_is_reported_in_one_line(
     with pytest.raises(SystemExit) as error:
         run(monkeypatch, "--images", str(folder), "--places", "0")
     assert error.value.code == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert said[-1].startswith("landmarks: ")
-    assert str(folder) in said[-1]
+    output = capsys.readouterr().err.strip().splitlines()
+    assert output[-1].startswith("landmarks: ")
+    assert str(folder) in output[-1]
 
 
 @pytest.mark.parametrize("wrong", [["--pairs", "1"], ["--seed", "-1"], ["--places", "-1"], ["--pairs", "x"]])
@@ -132,8 +132,8 @@ def test_epipolar_geometry_of_points_that_were_really_seen_twice() -> None:
 
 def test_ratios_are_of_the_pairs_that_floats_match() -> None:
     floats = Tally([100, 50, 3], [110, 60, 40], [10, 10, 10], ["a"] * 3)
-    ours = Tally([90, 10, 30], [100, 40, 40], [1, 2, 3], ["a"] * 3)
-    one = figures({"float sift": floats, "ours": ours})["ours"]
+    own = Tally([90, 10, 30], [100, 40, 40], [1, 2, 3], ["a"] * 3)
+    one = figures({"float sift": floats, "ours": own})["ours"]
     assert one["inliers_ratio"] == pytest.approx(100 / 150, abs=1e-4)
     assert one["pairs_matched_ratio"] == pytest.approx(2 / 2)
     assert one["precision"] == pytest.approx(100 / 140, abs=1e-4)

@@ -46,5 +46,5 @@ def test_bad_input_is_reported_in_one_line(
     monkeypatch.setattr("sys.argv", ["life_sim", "--drives", "0"])
     with pytest.raises(SystemExit) as ended:
         main()
-    told = capsys.readouterr().err
-    assert ended.value.code == 2 and told.count("\n") == 1 and "at least one drive" in told
+    result = capsys.readouterr().err
+    assert ended.value.code == 2 and result.count("\n") == 1 and "at least one drive" in result

@@ -42,12 +42,12 @@ def test_the_command_draws_and_prints(
     arguments = ["--steps", "40", "--runs", "line", "--seed", "2", "--out", str(out), "--json"]
     monkeypatch.setattr(sys, "argv", ["mapping_run", *arguments])
     main()
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told["seed"] == 2
-    assert told["abandoned"] == {"line": ""}
-    assert told["seconds"] == {"line": 4.0}
+    values = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert values["seed"] == 2
+    assert values["abandoned"] == {"line": ""}
+    assert values["seconds"] == {"line": 4.0}
     for key in ("pose_error_m", "wheels_error_m", "landmark_rmse_m", "nees_pose", "step_ms"):
-        assert math.isfinite(told[key]["line"])
+        assert math.isfinite(values[key]["line"])
     for name in PICTURES:
         image = cv2.imread(str(out / name))
         assert image.shape[0] > 300
@@ -86,26 +86,26 @@ def test_mismatched_comparisons_are_reported() -> None:
     seen: dict[str, float | None] = {"person_in_view_s": 3.0, "landmarks_left": 9.0}
     unseen: dict[str, float | None] = {"person_in_view_s": 0.0, "landmarks_left": 0.0}
     assert notes({"line": unseen | {"landmarks_left": 1.0}, "person": seen}, {"line": "", "person": ""}) == []
-    told = notes({"line": seen, "person": unseen}, {"line": "carried off", "person": ""})
-    assert [line.split(":")[0] for line in told] == ["line", "person", "person"]
-    assert "carried off" in told[0]
-    assert "no person came into view" in told[1]
-    assert "no landmark was left" in told[2]
+    result = notes({"line": seen, "person": unseen}, {"line": "carried off", "person": ""})
+    assert [line.split(":")[0] for line in result] == ["line", "person", "person"]
+    assert "carried off" in result[0]
+    assert "no person came into view" in result[1]
+    assert "no landmark was left" in result[2]
 
 
 def test_a_run_is_near_the_truth(run: MappingDrive) -> None:
     """Bounds with room for chance: `python -m benchmarks.mapping_run` measures the figures."""
-    told = figures(run)
+    result = figures(run)
     assert not run.given_up
-    assert told["reach_m"] == pytest.approx(0.6, abs=0.05)
-    assert told["pose_rmse_m"] < 0.02
-    assert told["pose_error_deg"] < 0.5
-    assert told["pose_rmse_deg"] < told["wheels_rmse_deg"]
-    assert told["converged_share"] > 0.3
-    assert told["depth_error_percent_median"] < 10.0
-    assert told["track_error_px"] < 2.0
-    assert told["track_length_max"] == 121.0
-    assert told["landmarks_left"] <= told["landmarks"] <= told["tracks"]
+    assert result["reach_m"] == pytest.approx(0.6, abs=0.05)
+    assert result["pose_rmse_m"] < 0.02
+    assert result["pose_error_deg"] < 0.5
+    assert result["pose_rmse_deg"] < result["wheels_rmse_deg"]
+    assert result["converged_share"] > 0.3
+    assert result["depth_error_percent_median"] < 10.0
+    assert result["track_error_px"] < 2.0
+    assert result["track_length_max"] == 121.0
+    assert result["landmarks_left"] <= result["landmarks"] <= result["tracks"]
 
 
 def test_a_person_in_the_view_changes_nothing_else() -> None:
@@ -196,10 +196,10 @@ def test_the_score_of_a_known_error_is_that_error() -> None:
     camera, n = robot.camera, 4000
     rays = np.column_stack([rng.uniform(-0.5, 0.5, n), rng.uniform(-0.4, 0.4, n), rng.uniform(0.2, 0.6, n)])
     covariance = np.diag([1e-6, 1e-6, 4e-4])
-    believed = rays + rng.normal(size=(n, 3)) * np.sqrt(np.diag(covariance))
+    estimated = rays + rng.normal(size=(n, 3)) * np.sqrt(np.diag(covariance))
     ids = np.arange(n)
     covariances = np.broadcast_to(covariance, (n, 3, 3))
-    known = LandmarkEstimates.of_rays(ids, believed, covariances, camera)
+    known = LandmarkEstimates.of_rays(ids, estimated, covariances, camera)
     true = LandmarkEstimates.of_rays(ids, rays, covariances, camera)
     assert landmark_nees(known, true.points_in_robot, camera).mean() == pytest.approx(3.0, abs=0.15)
     at = Pose2(0.4, -0.1, 0.2)
@@ -213,12 +213,12 @@ def test_the_score_of_a_known_error_is_that_error() -> None:
         "made", robot, make_world("arena", 0), Pose2(), ids, at.apply(true.points_in_robot), np.ones(n, bool),
         FilterSettings(), (moment, moment), {}, "",
     )  # fmt: skip
-    told = figures(run)
-    assert told["pose_error_m"] == pytest.approx(0.03)
-    assert told["wheels_rmse_deg"] == pytest.approx(2.0)
-    assert told["nees_pose"] == pytest.approx(2.0, rel=1e-3)
-    assert told["track_error_px"] == pytest.approx(0.5)
-    assert told["reprojection_px_median"] == pytest.approx(0.5)
+    result = figures(run)
+    assert result["pose_error_m"] == pytest.approx(0.03)
+    assert result["wheels_rmse_deg"] == pytest.approx(2.0)
+    assert result["nees_pose"] == pytest.approx(2.0, rel=1e-3)
+    assert result["track_error_px"] == pytest.approx(0.5)
+    assert result["reprojection_px_median"] == pytest.approx(0.5)
     np.testing.assert_allclose(track_errors(run, moment), np.tile([0.3, -0.4], (n, 1)), atol=1e-9)
     np.testing.assert_allclose(reprojection_errors(run, moment)[0], [0.3, -0.4], atol=1e-9)
     expected = np.linalg.norm(off.apply(true.points_in_robot) - run.points, axis=1)

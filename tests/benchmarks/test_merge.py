@@ -46,7 +46,7 @@ def test_a_split_graph_has_the_cost_of_the_whole() -> None:
         edges.append(G2oEdge.measured(i, j, mean, np.diag(sigmas**2)))
     graph = G2oGraph(dict(enumerate(true)), edges)
     maps, links, nodes = split(graph, 4)
-    assert len(links) == 12 + 3 and sum(len(one.edges) for one in maps.values()) == 36
+    assert len(links) == 12 + 3 and sum(len(hybrid_map.edges) for hybrid_map in maps.values()) == 36
     best = batch_optimum(graph)
     assert best < graph.chi2()
     for name in ("least_squares", "gnc", "mapweave"):

@@ -15,16 +15,16 @@ from synthetic.building import Building
 def test_links_that_are_drawn_are_those_that_would_be_found() -> None:
     """Verification confirms most pairs that are specified to show the same, with their relative poses."""
     building = Building.draw(3, 24, 5)
-    told = np.ones(building.rooms.shape, np.bool_)
+    result = np.ones(building.rooms.shape, np.bool_)
     nodes = {b.node.id: b.node for r in range(3) for _, b in building.log(r) if isinstance(b, NodePut)}
-    overlaps, links = building.knowledge(told)
+    overlaps, links = building.knowledge(result)
     assert overlaps.keys() == links.keys() and len(links) > 10
-    found = [verify(nodes[a], nodes[b]) for a, b in list(links)[:12]]
-    good = [one for one in found if isinstance(one, Link)]
+    outcome = [verify(nodes[a], nodes[b]) for a, b in list(links)[:12]]
+    good = [item for item in outcome if isinstance(item, Link)]
     assert len(good) >= 8
-    for one in good:
-        true = building.world_from(one.a).inverse() @ building.world_from(one.b)
-        assert one.a_from_b.mean.distance(true) < 0.4
+    for item in good:
+        true = building.world_from(item.a).inverse() @ building.world_from(item.b)
+        assert item.a_from_b.mean.distance(true) < 0.4
 
 
 def test_a_small_fleet_becomes_one_map() -> None:

@@ -45,15 +45,15 @@ def test_rays_agree_with_the_renderer(world: World) -> None:
         tips = WEBCAM.back_project(np.stack([columns, rows], axis=1), np.ones(len(rows)))
         eye = np.array([pose.x, pose.y, WEBCAM.mount_height])
         ways = tips @ turn.T + [pose.x, pose.y, 0.0] - eye
-        found = lengths(panels, eye, ways)
+        result = lengths(panels, eye, ways)
         drawn = image[rows, columns].astype(int)
         meets = drawn < count
-        assert (found[~meets] > 50.0).mean() > 0.95 if (~meets).any() else True
+        assert (result[~meets] > 50.0).mean() > 0.95 if (~meets).any() else True
         normals = np.cross(panels.along, panels.down)[drawn[meets]]
         expected = ((panels.corner[drawn[meets]] - eye) * normals).sum(axis=1) / (ways[meets] * normals).sum(
             axis=1
         )
-        agreed += int((abs(found[meets] / expected - 1.0) < 1e-6).sum())
+        agreed += int((abs(result[meets] / expected - 1.0) < 1e-6).sum())
         compared += int(meets.sum())
     # At edges of panels the renderer blends, and greys that are blended are other panels'.
     assert compared > 1000 and agreed / compared > 0.97
@@ -119,8 +119,8 @@ def test_maps_that_are_joined_wrongly_are_counted() -> None:
 
 
 def test_a_failed_or_killed_run_is_reported() -> None:
-    said = json.dumps(asdict(RUN))
-    assert outcome("office", 3, 0, f"noise\n{said}\n", "") == RUN
+    text = json.dumps(asdict(RUN))
+    assert outcome("office", 3, 0, f"noise\n{text}\n", "") == RUN
     for status, out, words, reason in (
         (-signal.SIGKILL, "", "", "killed by signal 9"),
         (1, "", "a warning\noffice, seed 3: no room\n", "no room"),
@@ -130,13 +130,13 @@ def test_a_failed_or_killed_run_is_reported() -> None:
     ):
         failure = outcome("office", 3, status, out, words)
         assert isinstance(failure, Failure) and reason in failure.reason
-    found = summary(7, ["office", "warehouse"], [RUN, Failure("warehouse", 7000, "was killed by signal 9")])
-    assert found["runs"] == {"office": 1, "warehouse": 0}
-    assert found["merged_ate_m_median"] == {"office": 0.02, "warehouse": None}
-    assert found["false_merges"] == {"office": 0, "warehouse": None}
-    assert found["link_recall"]["office"] == pytest.approx(0.2)
-    assert [one["reason"] for one in found["failed"]] == ["was killed by signal 9"]
-    json.dumps(found, allow_nan=False)
+    values = summary(7, ["office", "warehouse"], [RUN, Failure("warehouse", 7000, "was killed by signal 9")])
+    assert values["runs"] == {"office": 1, "warehouse": 0}
+    assert values["merged_ate_m_median"] == {"office": 0.02, "warehouse": None}
+    assert values["false_merges"] == {"office": 0, "warehouse": None}
+    assert values["link_recall"]["office"] == pytest.approx(0.2)
+    assert [item["reason"] for item in values["failed"]] == ["was killed by signal 9"]
+    json.dumps(values, allow_nan=False)
 
 
 def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,16 +147,16 @@ def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.Monkey
     }
     monkeypatch.setattr(merge_sim, "SCENARIOS", wrong)
     results = measure(["none", "small"], 1, 0, 2, Console(file=sys.stderr, quiet=True))
-    assert [type(one) for one in results] == [Failure, Failure]
+    assert [type(result) for result in results] == [Failure, Failure]
     assert isinstance(results[0], Failure) and "no scenario 'no-such-scenario'" in results[0].reason
     assert isinstance(results[1], Failure) and "twin room's length" in results[1].reason
 
 
 def test_median_and_sums_over_runs() -> None:
     other = Run("office", 4, 60, 3, 2, 0.04, 5, 1, 1, 20, 4, 0, 0, 0, None, 150.0, 80.0)
-    found = figures([RUN, other])
-    assert found["merged_ate_m_median"] == pytest.approx(0.03)
-    assert found["components"] == 1.5 and found["whole"] == 0.5
-    assert found["false_merges"] == 1 and found["false_links"] == 1
-    assert found["link_recall"] == pytest.approx(12 / 60) and found["place_recall"] == 0.7
-    assert found["link_recall_one_side"] == pytest.approx(0.7) and found["verified_one_side"] == 0.8
+    values = figures([RUN, other])
+    assert values["merged_ate_m_median"] == pytest.approx(0.03)
+    assert values["components"] == 1.5 and values["whole"] == 0.5
+    assert values["false_merges"] == 1 and values["false_links"] == 1
+    assert values["link_recall"] == pytest.approx(12 / 60) and values["place_recall"] == 0.7
+    assert values["link_recall_one_side"] == pytest.approx(0.7) and values["verified_one_side"] == 0.8

@@ -67,8 +67,8 @@ def test_the_shortest_way_leads_around_the_corner(floor: Floor) -> None:
     toward = math.atan2(*(left - corners[0])[::-1])
     arc = wrap_angle(toward - touch - math.pi / 2)
     expected = 2 * (length + RADIUS * abs(arc)) + 0.2
-    found = floor.ways_from(start).to(goal)
-    assert expected - 0.06 <= found <= 1.03 * expected + 0.06
+    route = floor.ways_from(start).to(goal)
+    assert expected - 0.06 <= route <= 1.03 * expected + 0.06
 
 
 def test_free_ways_are_about_straight_and_symmetric(floor: Floor) -> None:
@@ -216,5 +216,5 @@ def test_bad_input_is_reported_in_one_line(
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 1
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and said[0].startswith(f"navigate: {wrong[0]} {wrong[1]}")
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 1 and output[0].startswith(f"navigate: {wrong[0]} {wrong[1]}")

@@ -76,10 +76,10 @@ def test_the_bag_of_words_is_tf_idf_and_cosine() -> None:
         expected[node.id] = (
             sum(n * idf.get(w, 0.0) * bag[w] * idf.get(w, 0.0) for w, n in asked.items()) / norm
         )
-    found = WordIndex(nodes, vocabulary).query(view, 5)
+    nearest = WordIndex(nodes, vocabulary).query(view, 5)
     best = sorted(expected.items(), key=lambda item: -item[1])[:5]
-    assert [node for node, _ in found] == [node for node, _ in best]
-    assert [score for _, score in found] == pytest.approx([score for _, score in best])
+    assert [node for node, _ in nearest] == [node for node, _ in best]
+    assert [score for _, score in nearest] == pytest.approx([score for _, score in best])
 
 
 def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
@@ -90,12 +90,12 @@ def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
     ]
     none = Differences(np.zeros((1, 32), np.float32), np.full((1, 128), 3, np.int16))
     made = Distractors(donors, none, 7)
-    one, again, other = made.place(3), made.place(3), made.place(4)
-    codes = one.node.landmarks.codes
-    assert np.array_equal(codes, again.node.landmarks.codes) and np.array_equal(one.sift, again.sift)
-    assert one.node.id == NodeId("d", 1, 3) and not np.array_equal(codes, other.node.landmarks.codes)
+    a, again, b = made.place(3), made.place(3), made.place(4)
+    codes = a.node.landmarks.codes
+    assert np.array_equal(codes, again.node.landmarks.codes) and np.array_equal(a.sift, again.sift)
+    assert a.node.id == NodeId("d", 1, 3) and not np.array_equal(codes, b.node.landmarks.codes)
     owners = []
-    for code, sift in zip(codes, one.sift, strict=True):
+    for code, sift in zip(codes, a.sift, strict=True):
         (owner,) = [k for k, d in enumerate(donors) if (d.node.landmarks.codes == code).all(axis=1).any()]
         landmark = int((donors[owner].node.landmarks.codes == code).all(axis=1).argmax())
         # The whole descriptor is of the same landmark, changed by its own difference.
@@ -113,9 +113,9 @@ def test_the_loss_of_the_index_is_measured_on_the_same_views() -> None:
             Reply(query, Certainty.FOUND if one == "y" else Certainty.UNKNOWN, 1, 0, 0, 1) for one in recalled
         ]
 
-    told = lost(replies("yyyyyynnnn"), replies("yyyyynyynn"))
-    assert told["only_exhaustive"] == 2 and told["only_index"] == 1 and told["recall_lost"] == 0.1
-    assert told["recall_lost_low"] < 0 < 0.1 < told["recall_lost_high"]
+    result = lost(replies("yyyyyynnnn"), replies("yyyyynyynn"))
+    assert result["only_exhaustive"] == 2 and result["only_index"] == 1 and result["recall_lost"] == 0.1
+    assert result["recall_lost_low"] < 0 < 0.1 < result["recall_lost_high"]
     many = lost(replies("y" * 400), replies("y" * 400))
     assert -0.02 < many["recall_lost_low"] < 0 < many["recall_lost_high"] < 0.02
     asked = asked_of([query] * 200, 10_000)
@@ -132,10 +132,10 @@ def test_pictures_are_taken_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         raise AssertionError("they are there")
 
     second = taken("arena", nobody, wishes)
-    for one, two in zip(first, second, strict=True):
-        assert len(one) > 10 and one.camera == two.camera and one.world_from_robot == two.world_from_robot
-        assert np.array_equal(one.sift, two.sift) and np.array_equal(one.pixels, two.pixels)
-        assert np.array_equal(one.depths, two.depths, equal_nan=True)
+    for a, b in zip(first, second, strict=True):
+        assert len(a) > 10 and a.camera == b.camera and a.world_from_robot == b.world_from_robot
+        assert np.array_equal(a.sift, b.sift) and np.array_equal(a.pixels, b.pixels)
+        assert np.array_equal(a.depths, b.depths, equal_nan=True)
     (kept,) = tmp_path.iterdir()
     kept.write_bytes(kept.read_bytes()[:100])
     third = taken("arena", lambda: Photographer(world, (1,)), wishes)
@@ -157,9 +157,9 @@ def test_twins_are_visited_in_the_same_way() -> None:
     world = make_world("twins", 5)
     east = world.plan.room("room 1").x - world.plan.room("room 0").x
     poses = twin_lookouts(world, 12, np.random.default_rng(6))
-    for one, two in zip(poses[::2], poses[1::2], strict=True):
-        assert Pose2(one.x + east, one.y, one.heading).distance(two) < 0.3
-        assert abs(one.heading - two.heading) < 0.25
+    for a, b in zip(poses[::2], poses[1::2], strict=True):
+        assert Pose2(a.x + east, a.y, a.heading).distance(b) < 0.3
+        assert abs(a.heading - b.heading) < 0.25
 
 
 def test_places_far_from_each_other() -> None:
@@ -188,9 +188,9 @@ def test_answers_are_judged_by_the_truth() -> None:
     picture = Picture(here, CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
 
     def told(pose: Pose2, site: int, kind: str = "near") -> dict[str, float]:
-        believed = PoseGaussian.from_sigmas(pose, 0.1, 0.05)
+        estimated = PoseGaussian.from_sigmas(pose, 0.1, 0.05)
         answer = RelocalizeAnswer(
-            Certainty.FOUND, (Whereabouts(node.id, believed, None, -1, 20, 0.9),), "because"
+            Certainty.FOUND, (Whereabouts(node.id, estimated, None, -1, 20, 0.9),), "because"
         )
         return figures([judged(Query(kind, picture, site), answer, truth)])
 
@@ -212,12 +212,12 @@ def test_the_fit_finds_the_weights_that_made_the_data() -> None:
         )
         for _ in range(8_000)
     ]
-    numbers = np.array([one.numbers for one in supports])
+    numbers = np.array([support.numbers for support in supports])
     right = rng.random(len(numbers)) < 1 / (1 + np.exp(-numbers @ weights))
-    seen = [([one], [bool(there)]) for one, there in zip(supports, right, strict=True)]
-    found = fit(seen)
-    assert np.allclose(found, weights, atol=0.5)
-    for row in reliability(seen, found):
+    seen = [([support], [bool(there)]) for support, there in zip(supports, right, strict=True)]
+    result = fit(seen)
+    assert np.allclose(result, weights, atol=0.5)
+    for row in reliability(seen, result):
         if row["places"] > 200:
             assert row["right"] == pytest.approx(row["predicted"], abs=0.05)
 

@@ -21,12 +21,12 @@ from mapweave.wire.messages import encode
 def test_figures_by_hand() -> None:
     total, other = Tally([0.1, 0.2], [0.1, 2.0], refused=3, right=1), Tally([0.3], [0.3], right=1, lost=1)
     total.add(other)
-    told = figures(total, [0.01, 0.03], took=1.5)
-    assert (told["answered"], told["answers_per_s"], told["lost"]) == (3, 2.0, 1)
-    assert (told["p50_ms"], told["max_ms"]) == (200.0, 300.0)
-    assert told["refused_share"] == pytest.approx(3 / 7, abs=1e-3)
-    assert told["right_share"] == pytest.approx(2 / 3, abs=1e-3)
-    assert told["wait_p95_ms"] > 1000.0
+    result = figures(total, [0.01, 0.03], took=1.5)
+    assert (result["answered"], result["answers_per_s"], result["lost"]) == (3, 2.0, 1)
+    assert (result["p50_ms"], result["max_ms"]) == (200.0, 300.0)
+    assert result["refused_share"] == pytest.approx(3 / 7, abs=1e-3)
+    assert result["right_share"] == pytest.approx(2 / 3, abs=1e-3)
+    assert result["wait_p95_ms"] > 1000.0
     assert math.isnan(figures(Tally(), [], 1.0)["p95_ms"])
 
 
@@ -37,8 +37,8 @@ def test_an_answer_is_right_where_it_was_taken(tmp_path: Path) -> None:
     node = NodeId(*query[1], 1)
 
     def answer(off: Pose2) -> bytes:
-        told = building.truth[node].inverse() @ (query[2] @ off)
-        place = Whereabouts(node, PoseGaussian.from_sigmas(told, 0.1, 0.1), None, 0, 20, 0.9)
+        result = building.truth[node].inverse() @ (query[2] @ off)
+        place = Whereabouts(node, PoseGaussian.from_sigmas(result, 0.1, 0.1), None, 0, 20, 0.9)
         return encode(RelocalizeAnswer(Certainty.FOUND, (place,), ""))
 
     assert is_right(building, query, answer(Pose2()))
@@ -64,13 +64,13 @@ def test_a_small_run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixtu
     ]
     monkeypatch.setattr(sys, "argv", arguments)
     relocalize_load.main()
-    found = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
-    assert (found["robots"], found["nodes"], found["seed"]) == (2, 20, 5)
-    for server in (found, found["in_turn"]):
+    values = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
+    assert (values["robots"], values["nodes"], values["seed"]) == (2, 20, 5)
+    for server in (values, values["in_turn"]):
         assert server["answered"] >= 2
         assert server["lost"] == 0
         assert server["right_share"] > 0.8
-    assert found["in_turn"]["refused_share"] == 0.0
+    assert values["in_turn"]["refused_share"] == 0.0
     with pytest.raises(SystemExit) as ended:
         monkeypatch.setattr(sys, "argv", ["relocalize_load", "--robots", "0"])
         relocalize_load.main()

@@ -25,16 +25,19 @@ def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path: Path) -> None
         for node, pose in zip(nodes, tour, strict=True)
     ]
     none = Differences(np.zeros((1, 32), np.float32), np.zeros((1, 128), np.int16))
-    distractors, told = Distractors(places, none, 7), list[int]()
-    fill(tmp_path / "store", places, distractors, 20, told.append)
+    distractors, result = Distractors(places, none, 7), list[int]()
+    fill(tmp_path / "store", places, distractors, 20, result.append)
     store = Store(tmp_path / "store")
-    assert sum(told) == len(store.present()) == 20
-    maps = {one: HybridMap(change.body for change in store.replay(one)) for one in store.maps()}
-    assert {one: len(found.nodes) for one, found in maps.items()} == {MapId("d0", 1): 14, MapId("m0", 1): 6}
-    for found in maps.values():
-        assert nx.is_connected(found.graph)
-        for edge in found.edges.values():
-            a, b = (found.nodes[end].map_from_robot.mean for end in (edge.a, edge.b))
+    assert sum(result) == len(store.present()) == 20
+    maps = {map_id: HybridMap(change.body for change in store.replay(map_id)) for map_id in store.maps()}
+    assert {map_id: len(outcome.nodes) for map_id, outcome in maps.items()} == {
+        MapId("d0", 1): 14,
+        MapId("m0", 1): 6,
+    }
+    for outcome in maps.values():
+        assert nx.is_connected(outcome.graph)
+        for edge in outcome.edges.values():
+            a, b = (outcome.nodes[end].map_from_robot.mean for end in (edge.a, edge.b))
             assert (a @ edge.a_from_b.mean).distance(b) < 1e-5
     puts = (change.body for change in store.replay(MapId("d0", 1)) if isinstance(change.body, NodePut))
     for k, put in enumerate(puts):

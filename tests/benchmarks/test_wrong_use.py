@@ -41,10 +41,10 @@ def test_errors_are_reported_in_one_line(
     monkeypatch.setattr("sys.argv", [name, *wrong])
     with pytest.raises(SystemExit) as ended:
         module.main()
-    said = capsys.readouterr().err + (ended.value.code if isinstance(ended.value.code, str) else "")
+    output = capsys.readouterr().err + (ended.value.code if isinstance(ended.value.code, str) else "")
     assert ended.value.code not in (0, None)
-    assert "Traceback" not in said
-    assert "seed" in said.splitlines()[-1] or wrong[0].strip("-") in said.splitlines()[-1]
+    assert "Traceback" not in output
+    assert "seed" in output.splitlines()[-1] or wrong[0].strip("-") in output.splitlines()[-1]
     assert not any(tmp_path.rglob("*.*")), "nothing is left behind"
 
 

@@ -18,8 +18,8 @@ def fake_sift(n: int, seed: int) -> np.ndarray:
 
 
 def real_sift(image: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    keypoints, found = cv2.SIFT_create(nfeatures=most).detectAndCompute(image, None)
-    return np.array([k.pt for k in keypoints]), found
+    keypoints, result = cv2.SIFT_create(nfeatures=most).detectAndCompute(image, None)
+    return np.array([k.pt for k in keypoints]), result
 
 
 def grey(image: np.ndarray) -> np.ndarray:

@@ -54,22 +54,24 @@ def test_applying_a_change_twice_changes_nothing_more(log: list[ChangeBody], bod
 
 
 def test_retiring_a_node_takes_its_edges_along() -> None:
-    one = HybridMap([NodePut(node(1)), NodePut(node(2)), EdgePut(edge(9, 1, 2)), NodeRetired(node(2).id)])
-    assert not one.edges
-    assert one.components() == [{node(1).id}]
+    hybrid_map = HybridMap(
+        [NodePut(node(1)), NodePut(node(2)), EdgePut(edge(9, 1, 2)), NodeRetired(node(2).id)]
+    )
+    assert not hybrid_map.edges
+    assert hybrid_map.components() == [{node(1).id}]
 
 
 def test_edge_between_takes_the_most_certain_and_the_direction_asked() -> None:
-    one = HybridMap(
+    hybrid_map = HybridMap(
         [NodePut(node(1)), NodePut(node(2)), EdgePut(edge(8, 1, 2, 0.5)), EdgePut(edge(9, 2, 1, 0.1))]
     )
-    there = one.edge_between(node(1).id, node(2).id)
+    there = hybrid_map.edge_between(node(1).id, node(2).id)
     assert there is not None
     expected = edge(9, 2, 1, 0.1).a_from_b.inverse()
     assert np.allclose(there.mean.vector, expected.mean.vector)
-    assert one.edge_between(node(1).id, NodeId("r0", 1, 5)) is None
+    assert hybrid_map.edge_between(node(1).id, NodeId("r0", 1, 5)) is None
 
 
 def test_components_are_largest_first() -> None:
-    one = HybridMap([*(NodePut(node(k)) for k in range(4)), EdgePut(edge(9, 2, 3))])
-    assert [len(part) for part in one.components()] == [2, 1, 1]
+    hybrid_map = HybridMap([*(NodePut(node(k)) for k in range(4)), EdgePut(edge(9, 2, 3))])
+    assert [len(part) for part in hybrid_map.components()] == [2, 1, 1]

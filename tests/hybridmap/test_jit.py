@@ -66,10 +66,10 @@ def run(folder: Path, how: str, cache: Path) -> dict[str, object]:
         [sys.executable, "-c", PROGRAM, how], capture_output=True, text=True, check=False, env=environment
     )
     assert done.returncode == 0, done.stderr
-    told: dict[str, object] = json.loads(done.stdout)
-    assert told["lengths"] == [12.0, 5.0]
-    assert np.array(told["table"]).tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
-    return told
+    collected: dict[str, object] = json.loads(done.stdout)
+    assert collected["lengths"] == [12.0, 5.0]
+    assert np.array(collected["table"]).tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
+    return collected
 
 
 @pytest.mark.parametrize("how", ["without", "disabled"])

@@ -113,9 +113,9 @@ def test_the_covariance_check_agrees_with_eigenvalues(seed: int) -> None:
         least = -1e-6 * beyond * max(values.max(), 1e-12)
         one = turned @ np.diag([least, *values[1:]]) @ turned.T
         one = 0.5 * (one + one.T)
-        told = np.linalg.eigvalsh(one)[0] / max(np.abs(one).max(), 1e-12)
-        if abs(told + 1e-6) > 1e-8:
-            assert accepted(one) == (told > -1e-6)
+        result = np.linalg.eigvalsh(one)[0] / max(np.abs(one).max(), 1e-12)
+        if abs(result + 1e-6) > 1e-8:
+            assert accepted(one) == (result > -1e-6)
 
 
 def accepted(covariance: np.ndarray) -> bool:
@@ -128,26 +128,26 @@ def accepted(covariance: np.ndarray) -> bool:
 
 def test_arrays_agree_with_single_poses() -> None:
     rng = np.random.default_rng(7)
-    one = [
+    first = [
         PoseGaussian(Pose2.from_vector(rng.normal(0, 2, 3)), random_covariance(rng, 0.1)) for _ in range(20)
     ]
-    two = [
+    second = [
         PoseGaussian(Pose2.from_vector(rng.normal(0, 2, 3)), random_covariance(rng, 0.1)) for _ in range(20)
     ]
     stacked = [
         PoseGaussians(np.stack([g.mean.vector for g in many]), np.stack([g.covariance for g in many]))
-        for many in (one, two)
+        for many in (first, second)
     ]
     product, inverse = stacked[0] @ stacked[1], stacked[0].inverse()
     for k in range(20):
-        expected = one[k] @ two[k]
+        expected = first[k] @ second[k]
         assert close(Pose2.from_vector(product.means[k]), expected.mean)
         assert np.allclose(product.covariances[k], expected.covariance)
-        assert close(Pose2.from_vector(inverse.means[k]), one[k].inverse().mean)
-        assert np.allclose(inverse.covariances[k], one[k].inverse().covariance)
-        assert np.allclose(adjoints(stacked[0].means)[k], one[k].mean.adjoint)
+        assert close(Pose2.from_vector(inverse.means[k]), first[k].inverse().mean)
+        assert np.allclose(inverse.covariances[k], first[k].inverse().covariance)
+        assert np.allclose(adjoints(stacked[0].means)[k], first[k].mean.adjoint)
         assert stacked[0].distances2()[k] == pytest.approx(
-            one[k].inverse().inverse().mahalanobis2(Pose2()), abs=1e9
+            first[k].inverse().inverse().mahalanobis2(Pose2()), abs=1e9
         )
 
 
@@ -158,6 +158,12 @@ def test_any_decoded_pose_can_be_inverted_and_composed(seed: int, size: float, l
     root = rng.normal(size=(3, rng.integers(1, 4))) * 10.0**size
     rounded = (root @ root.T).astype(np.float32).astype(np.float64)
     pose = PoseGaussian(Pose2(*rng.normal(size=2) * 10.0**lever, rng.uniform(-3, 3)), rounded)
-    for one in (pose, pose.inverse(), pose.inverse().inverse(), pose @ pose.inverse(), pose.inverse() @ pose):
-        values = np.linalg.eigvalsh(one.covariance)
+    for item in (
+        pose,
+        pose.inverse(),
+        pose.inverse().inverse(),
+        pose @ pose.inverse(),
+        pose.inverse() @ pose,
+    ):
+        values = np.linalg.eigvalsh(item.covariance)
         assert values[0] >= -3e-6 * values[-1]

@@ -114,11 +114,11 @@ def test_landmarks_without_depth_count_by_being_at_both_ends() -> None:
 def test_closed_edges_of_a_map() -> None:
     rng = np.random.default_rng(4)
     edge, a, b = pair(Pose2(0.4), wall(60, rng), rng)
-    other, c, d = pair(Pose2(2.8), wall(60, rng, x=6.0), rng)
+    second, c, d = pair(Pose2(2.8), wall(60, rng, x=6.0), rng)
     c, d = (Node(NodeId("q", k, 1), 0, n.map_from_robot, CAMERA, n.landmarks) for k, n in ((1, c), (2, d)))
-    closed = Edge(NodeId("merge", 0, 2), c.id, d.id, other.a_from_b, EdgeKind.LOOP, other.shared)
-    one = HybridMap([NodePut(a), NodePut(b), NodePut(c), NodePut(d), EdgePut(edge), EdgePut(closed)])
-    assert closed_edges(one) == {closed.id}
+    closed = Edge(NodeId("merge", 0, 2), c.id, d.id, second.a_from_b, EdgeKind.LOOP, second.shared)
+    first = HybridMap([NodePut(a), NodePut(b), NodePut(c), NodePut(d), EdgePut(edge), EdgePut(closed)])
+    assert closed_edges(first) == {closed.id}
 
 
 def test_landmarks_missing_in_a_rewritten_node_are_not_in_view() -> None:

@@ -37,26 +37,26 @@ def random_map(seed: int, n: int = 14, m: int = 22) -> HybridMap:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.booleans())
 def test_costs_no_more_than_dijkstra(seed: int, optimised: bool) -> None:
-    one = random_map(seed)
+    hybrid_map = random_map(seed)
     rng = np.random.default_rng(seed)
-    poses = {i: n.map_from_robot.mean for i, n in one.nodes.items()}
+    poses = {i: n.map_from_robot.mean for i, n in hybrid_map.nodes.items()}
     if optimised:
         poses = {i: p @ Pose2(*rng.normal(0, 1.0, 3)) for i, p in poses.items()}
-    penalties = {edge_id: float(rng.uniform(0, 3)) for edge_id in one.edges}
+    penalties = {edge_id: float(rng.uniform(0, 3)) for edge_id in hybrid_map.edges}
     graph: nx.MultiGraph = nx.MultiGraph()
-    for e in one.edges.values():
+    for e in hybrid_map.edges.values():
         cost = edge_cost(e, poses, True, RouteSettings()) + penalties[e.id]
         assert cost >= poses[e.a].distance(poses[e.b])
         graph.add_edge(e.a, e.b, weight=cost)
     start, goal = NodeId("r0", 1, 0), NodeId("r0", 1, 13)
-    found = find_route(one, start, goal, poses=poses if optimised else None, penalties=penalties)
+    result = find_route(hybrid_map, start, goal, poses=poses if optimised else None, penalties=penalties)
     if start in graph and goal in graph and nx.has_path(graph, start, goal):
-        assert found.cost == pytest.approx(nx.dijkstra_path_length(graph, start, goal))
-        assert found.nodes[0] == start and found.nodes[-1] == goal
-        for a, edge_id, b in zip(found.nodes[:-1], found.edges, found.nodes[1:], strict=True):
-            assert {one.edges[edge_id].a, one.edges[edge_id].b} == {a, b}
+        assert result.cost == pytest.approx(nx.dijkstra_path_length(graph, start, goal))
+        assert result.nodes[0] == start and result.nodes[-1] == goal
+        for a, edge_id, b in zip(result.nodes[:-1], result.edges, result.nodes[1:], strict=True):
+            assert {hybrid_map.edges[edge_id].a, hybrid_map.edges[edge_id].b} == {a, b}
     else:
-        assert found.nodes == () and found.reason
+        assert result.nodes == () and result.reason
 
 
 def chain(*poses: Pose2) -> tuple[list[Node], HybridMap]:
@@ -99,11 +99,11 @@ def test_a_driven_link_costs_its_length() -> None:
         edge(2, nodes[0], nodes[2]),
         edge(3, nodes[2], nodes[1]),
     ]
-    one = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
-    around = find_route(one, nodes[0].id, nodes[1].id)
+    hybrid_map = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    around = find_route(hybrid_map, nodes[0].id, nodes[1].id)
     assert around.edges == (edges[1].id, edges[2].id)
-    one.apply(EdgePut(edge(4, nodes[0], nodes[1], EdgeKind.DRIVEN)))
-    straight = find_route(one, nodes[0].id, nodes[1].id)
+    hybrid_map.apply(EdgePut(edge(4, nodes[0], nodes[1], EdgeKind.DRIVEN)))
+    straight = find_route(hybrid_map, nodes[0].id, nodes[1].id)
     assert straight.edges == (NodeId("e", 1, 4),) and straight.cost == pytest.approx(2.02)
 
 
@@ -112,9 +112,9 @@ def test_links_between_maps_without_common_frame_are_driven() -> None:
     a, b = node(1, Pose2(0, 0)), node(1, Pose2(100, 100), "r1")
     relative = PoseGaussian.from_sigmas(Pose2(1, 0, 0), 0.1, 0.1)
     link = Edge(NodeId("e", 1, 1), a.id, b.id, relative, EdgeKind.MERGED)
-    one = HybridMap([NodePut(a), NodePut(b), EdgePut(link)])
+    hybrid_map = HybridMap([NodePut(a), NodePut(b), EdgePut(link)])
     s = RouteSettings(per_edge=0.1, per_turn=0.0, per_undriven=0.5)
-    assert find_route(one, a.id, b.id, settings=s).cost == pytest.approx(1.5 + 0.1)
+    assert find_route(hybrid_map, a.id, b.id, settings=s).cost == pytest.approx(1.5 + 0.1)
 
 
 def test_reasons() -> None:
@@ -130,14 +130,16 @@ def test_reasons() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6))
 def test_closed_edges_are_as_if_they_were_not_there(seed: int) -> None:
-    one, rng = random_map(seed), np.random.default_rng(seed)
-    closed = {edge_id for edge_id in one.edges if rng.random() < 0.3}
+    hybrid_map, rng = random_map(seed), np.random.default_rng(seed)
+    closed = {edge_id for edge_id in hybrid_map.edges if rng.random() < 0.3}
     left = HybridMap(
-        body for body in one.contents() if not (isinstance(body, EdgePut) and body.edge.id in closed)
+        change
+        for change in hybrid_map.contents()
+        if not (isinstance(change, EdgePut) and change.edge.id in closed)
     )
     start, goal = NodeId("r0", 1, 0), NodeId("r0", 1, 13)
-    found, expected = find_route(one, start, goal, closed=closed), find_route(left, start, goal)
-    assert (found.nodes, found.edges) == (expected.nodes, expected.edges)
-    assert found.cost == pytest.approx(expected.cost)
-    if not found.nodes and find_route(one, start, goal).nodes:
-        assert "only ties poses" in found.reason
+    result, expected = find_route(hybrid_map, start, goal, closed=closed), find_route(left, start, goal)
+    assert (result.nodes, result.edges) == (expected.nodes, expected.edges)
+    assert result.cost == pytest.approx(expected.cost)
+    if not result.nodes and find_route(hybrid_map, start, goal).nodes:
+        assert "only ties poses" in result.reason

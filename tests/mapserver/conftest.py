@@ -51,10 +51,10 @@ def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Mapped
     stops = [Pose2(2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for k in range(7)]
     nodes, edges = take_map(world, ROBOT, stops, rng)
     truth = {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
-    bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+    changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
     entries = [
         Entry.read(ROBOT, k + 1, encode_change(Change(ROBOT, k + 1, 0, body)))
-        for k, body in enumerate(bodies)
+        for k, body in enumerate(changes)
     ]
 
     def make() -> MappedRoom:

@@ -37,8 +37,8 @@ def covariance(rng: np.random.Generator) -> Array:
     scale = 10.0 ** rng.uniform(-6, most, 3) if rng.random() < 0.5 else 10.0 ** rng.uniform(-6, most)
     root = rng.normal(size=(3, rng.integers(0, 4)))
     root = scale * root.T if root.size else root.T
-    found: Array = root.T @ root
-    return found
+    result: Array = root.T @ root
+    return result
 
 
 def camera(rng: np.random.Generator) -> Camera:
@@ -65,7 +65,7 @@ def landmarks(rng: np.random.Generator, of: Camera, most: int = 100) -> Landmark
         pixels[:] = 0.5
     pixels = pixels * [of.width, of.height]
     sigmas = depths * (0.05 if rng.random() < 0.7 else 10.0 ** rng.uniform(-2.5, 0.6, n))
-    single = (np.asarray(one, np.float32) for one in (depths, sigmas))
+    single = (np.asarray(item, np.float32) for item in (depths, sigmas))
     return Landmarks(pixels.astype(np.float32), quantise(vectors), *single)
 
 
@@ -115,31 +115,31 @@ def content(rng: np.random.Generator, map_id: MapId, others: list[NodeId]) -> li
         others: nodes of other robots: edges may lead to them, or from one of them to another.
     """
     own = [NodeId(*map_id, 2 * k) for k in range(int(rng.integers(1, 7)))]
-    bodies: list[ChangeBody] = [NodePut(node(rng, one)) for one in own]
-    counts = {body.node.id: len(body.node.landmarks) for body in bodies if isinstance(body, NodePut)}
+    changes: list[ChangeBody] = [NodePut(node(rng, item)) for item in own]
+    counts = {change.node.id: len(change.node.landmarks) for change in changes if isinstance(change, NodePut)}
     ends = [*own, NodeId(*map_id, 1000)]
     if rng.random() < 0.4:
         ends += [*others, NodeId("nobody", 0, 1)]
     if len(own) > 1 and rng.random() < 0.7:
         # Most robots' nodes hang together.
         pairs = pairwise(own)
-        bodies += [
+        changes += [
             EdgePut(edge(rng, NodeId(*map_id, 2 * k + 1), list(pair), counts)) for k, pair in enumerate(pairs)
         ]
     for k in range(int(rng.integers(0, 8))):
-        bodies.append(EdgePut(edge(rng, NodeId(*map_id, 101 + 2 * k), ends, counts)))
+        changes.append(EdgePut(edge(rng, NodeId(*map_id, 101 + 2 * k), ends, counts)))
     for _ in range(int(rng.integers(0, 3))):
-        bodies.append(NodePut(node(rng, own[rng.integers(len(own))])))
+        changes.append(NodePut(node(rng, own[rng.integers(len(own))])))
     if rng.random() < 0.2:
-        bodies.append(NodeRetired(own[rng.integers(len(own))]))
+        changes.append(NodeRetired(own[rng.integers(len(own))]))
     if rng.random() < 0.2:
-        bodies.append(EdgeRetired(NodeId(*map_id, 1)))
+        changes.append(EdgeRetired(NodeId(*map_id, 1)))
     if rng.random() < 0.2:
-        bodies = [bodies[k] for k in rng.permutation(len(bodies))]
+        changes = [changes[k] for k in rng.permutation(len(changes))]
     out = []
-    for body in bodies:
+    for change in changes:
         try:
-            out.append(decode_body(encode_body(body)))
+            out.append(decode_body(encode_body(change)))
         except InvalidValue:
             continue
     return out

@@ -100,8 +100,8 @@ def two_maps() -> MergedMap:
     for map_id in (MapId("r0", 1), MapId("r1", 1)):
         stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
         nodes, edges = take_map(world, map_id, stops, rng)
-        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, body)
+        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, change)
     return merger.merged()
 
 

@@ -33,8 +33,8 @@ class Two:
             tour = [Pose2(1.5 + 0.7 * k, 2.0, 0.2 * k) for k in range(3)]
             nodes, edges = take_map(self.worlds[map_id], map_id, tour, rng)
             self.truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
-            bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-            for number, body in enumerate(bodies, start=1):
+            changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+            for number, body in enumerate(changes, start=1):
                 self.merger.on_change(Change(map_id, number, 0, body))
 
     def answers(self) -> Answers:
@@ -50,8 +50,12 @@ def two() -> Two:
 
 
 def test_nothing_is_answered_from_a_retired_map_until_it_is_taken_back(two: Two) -> None:
-    for rulings, known in (([], True), ([RETIRED], False), ([RETIRED, replace(RETIRED, apart=False)], True)):
-        two.merger.rule(ManualConstraints(rulings))
+    for constraints, known in (
+        ([], True),
+        ([RETIRED], False),
+        ([RETIRED, replace(RETIRED, apart=False)], True),
+    ):
+        two.merger.rule(ManualConstraints(constraints))
         answers = two.answers()
         assert answers.relocalizer.answer(two.view(HERE)).certainty is Certainty.FOUND
         there = answers.relocalizer.answer(two.view(THERE))
@@ -79,8 +83,8 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     for map_id in maps:
         tour = [Pose2(*rng.uniform([1.2, 1.0], [3.8, 3.0]), 1.26 * k) for k in range(10)]
         nodes, edges = take_map(world, map_id, tour, rng)
-        bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-        logs[map_id] = [Change(map_id, number, 0, body) for number, body in enumerate(bodies, start=1)]
+        changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+        logs[map_id] = [Change(map_id, number, 0, body) for number, body in enumerate(changes, start=1)]
     views = [take_view(world, Pose2(2.5, 2.0, 0.5 * k), rng)[0] for k in range(12)]
     merger, retired = Merger(), ManualConstraint((maps[2], maps[2]), True, "anna", 1, "moved")
     for map_id in maps[:2]:
@@ -101,7 +105,7 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     merger.rule(ManualConstraints([retired, replace(retired, apart=False)]))
     assert told(merger, views) == with_it
     alike = merger.alike.of(late[0], merger.places, merger.node, lambda a, b: None)
-    assert any(one.other.id.map == maps[2] for one in alike)
+    assert any(item.other.id.map == maps[2] for item in alike)
 
 
 def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
@@ -120,16 +124,16 @@ def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
 def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
     two.merger.rule(ManualConstraints())
     merged = two.merger.merged()
-    one = NodeId("a", 1, 3)
-    node = merged.maps[HERE].nodes[one]
+    node_id = NodeId("a", 1, 3)
+    node = merged.maps[HERE].nodes[node_id]
     gone = np.zeros(len(node.landmarks), np.bool_)
     gone[::3] = True
-    faded = replace(merged, faded={one: gone})
+    faded = replace(merged, faded={node_id: gone})
     shown = without_faded(node, faded)
     assert np.array_equal(shown.landmarks.pixels, node.landmarks.pixels[~gone])
     answers = Answers.of(two.merger, faded, two.merger.node)
     legs = answers.router.route(NodeId("a", 1, 1), NodeId("a", 1, 5)).legs
-    assert [len(leg.node.landmarks) for leg in legs if leg.node.id == one] == [len(shown.landmarks)]
-    assert ActiveNodes(two.merger.places, two.merger.node, merged).node(one) is node
-    anew = replace(node, landmarks=node.landmarks.take(np.arange(len(gone) - 1)))
-    assert without_faded(anew, faded) is anew, "it is known better than what was found out"
+    assert [len(leg.node.landmarks) for leg in legs if leg.node.id == node_id] == [len(shown.landmarks)]
+    assert ActiveNodes(two.merger.places, two.merger.node, merged).node(node_id) is node
+    fresh = replace(node, landmarks=node.landmarks.take(np.arange(len(gone) - 1)))
+    assert without_faded(fresh, faded) is fresh, "it is known better than what was found out"

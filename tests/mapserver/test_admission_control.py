@@ -52,16 +52,16 @@ class Counter:
 def test_unusual_jobs_do_not_change_the_estimated_duration(workers: int) -> None:
     """A person's question takes seconds; no robot is turned away for it afterwards."""
     clock = Clock()
-    desk = AdmissionControl(AdmissionSettings(workers, first_guess=0.1), clock)
+    admission = AdmissionControl(AdmissionSettings(workers, first_guess=0.1), clock)
 
     def work() -> None:
         clock.now += 8.0
 
-    desk.submit(work, usual=False).result(20.0)
-    assert desk.counters()["answer_ms"] == 100.0 and desk.counters()["answered"] == 1
-    desk.submit(work).result(20.0)
-    assert float(desk.counters()["answer_ms"]) > 800.0
-    desk.close()
+    admission.submit(work, usual=False).result(20.0)
+    assert admission.counters()["answer_ms"] == 100.0 and admission.counters()["answered"] == 1
+    admission.submit(work).result(20.0)
+    assert float(admission.counters()["answer_ms"]) > 800.0
+    admission.close()
 
 
 @pytest.mark.parametrize(("workers", "seconds", "in_time"), [(1, 0.1, 0.65), (2, 0.05, 0.51), (4, 0.2, 0.23)])
@@ -184,42 +184,47 @@ def test_an_appointment_has_precedence_and_expires() -> None:
 
 def test_the_time_that_a_question_takes_is_learned() -> None:
     clock = Clock()
-    desk = AdmissionControl(AdmissionSettings(1, first_guess=0.01, smoothing=0.5), clock)
+    admission = AdmissionControl(AdmissionSettings(1, first_guess=0.01, smoothing=0.5), clock)
 
     def work() -> None:
         clock.now += 0.4
 
     for _ in range(12):
-        desk.submit(work, 1).result(5)
-    assert desk.counters() == {"answered": 12, "busy": 0, "open": 0, "answer_ms": pytest.approx(400, abs=1)}
-    desk.close()
+        admission.submit(work, 1).result(5)
+    assert admission.counters() == {
+        "answered": 12,
+        "busy": 0,
+        "open": 0,
+        "answer_ms": pytest.approx(400, abs=1),
+    }
+    admission.close()
 
 
 def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
     for executor in (None, LockstepSchedule().executor(1)):
-        desk = AdmissionControl(AdmissionSettings(1), executor=executor)
-        assert desk.submit(lambda: 3 + 4, 1).result(5) == 7
+        admission = AdmissionControl(AdmissionSettings(1), executor=executor)
+        assert admission.submit(lambda: 3 + 4, 1).result(5) == 7
         for _ in range(3):
             with pytest.raises(ZeroDivisionError):
-                desk.submit(lambda: 1 / 0, 1).result(5)
-        assert desk.submit(lambda: "still here", 1).result(5) == "still here"
-        assert desk.counters()["open"] == 0
-        desk.close()
-        desk.close()
+                admission.submit(lambda: 1 / 0, 1).result(5)
+        assert admission.submit(lambda: "still here", 1).result(5) == "still here"
+        assert admission.counters()["open"] == 0
+        admission.close()
+        admission.close()
 
 
 def test_questions_that_waited_too_long_are_refused() -> None:
     """Each question takes four times as long as was thought."""
     clock = Clock()
     settings = AdmissionSettings(1, in_time=0.6, too_late=1.5, first_guess=0.1)
-    desk, go, waited = AdmissionControl(settings, clock), threading.Event(), []
+    admission, go, waited = AdmissionControl(settings, clock), threading.Event(), []
 
     def work(came: float) -> None:
         assert go.wait(60)
         waited.append(clock.now - came)
         clock.now += 0.4
 
-    futures = [desk.submit(lambda: work(100.0), k) for k in range(5)]
+    futures = [admission.submit(lambda: work(100.0), k) for k in range(5)]
     go.set()
     refusals = [future.exception(10) for future in futures]
     assert waited == pytest.approx([0.0, 0.4])
@@ -227,9 +232,9 @@ def test_questions_that_waited_too_long_are_refused() -> None:
         assert isinstance(refusal, Busy)
         assert 0.0 < refusal.retry_after <= LONGEST_PAUSE
     assert refusals[:2] == [None, None]
-    assert desk.counters()["busy"] == 3
-    assert desk.counters()["open"] == 0
-    desk.close()
+    assert admission.counters()["busy"] == 3
+    assert admission.counters()["open"] == 0
+    admission.close()
 
 
 @pytest.mark.parametrize(
@@ -243,18 +248,18 @@ def test_settings_that_cannot_work(name: str, value: float) -> None:
 
 
 def test_closing_finishes_accepted_jobs() -> None:
-    desk = AdmissionControl(AdmissionSettings(1, in_time=60.0))
+    admission = AdmissionControl(AdmissionSettings(1, in_time=60.0))
     done: list[int] = []
     for k in range(20):
-        desk.submit(lambda k=k: done.append(k), k)
-    desk.close()
+        admission.submit(lambda k=k: done.append(k), k)
+    admission.close()
     assert done == list(range(20))
 
 
 def test_in_lockstep_the_asking_thread_works_and_no_question_is_refused() -> None:
     schedule = LockstepSchedule()
-    desk = AdmissionControl(
+    admission = AdmissionControl(
         AdmissionSettings(1, in_time=0.1, first_guess=100.0), schedule.monotonic, schedule.executor(1)
     )
-    threads = [desk.submit(threading.current_thread, k).result() for k in range(50)]
+    threads = [admission.submit(threading.current_thread, k).result() for k in range(50)]
     assert set(threads) == {threading.current_thread()}

@@ -41,8 +41,8 @@ class Scene:
             nodes, edges = take_map(where, map_id, stops, rng)
             self.truth |= {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
             self.begin[map_id] = stops[0]
-            bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-            for k, body in enumerate(bodies):
+            changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+            for k, body in enumerate(changes):
                 self.merger.on_change(Change(map_id, k + 1, 0, body))
         self.merged = self.merger.merged()
 
@@ -61,8 +61,8 @@ def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
         # The own map drifts: answers are right near the nearest own node.
         beside = min(own.values(), key=lambda node: scene.truth[node.id].distance(pose))
         world_from_map = scene.truth[beside.id] @ beside.map_from_robot.mean.inverse()
-        told = [world_from_map @ Pose2(*view[:3]) for view in answer.views]
-        nearest = min(told, key=pose.distance)
+        collected = [world_from_map @ Pose2(*view[:3]) for view in answer.views]
+        nearest = min(collected, key=pose.distance)
         assert pose.distance(nearest) < 0.3
         assert abs(wrap_angle(nearest.heading - pose.heading)) < 0.2
     assert set(answer.views[:, 3]) == {np.float32(beside.camera.semi_aperture)}
@@ -115,8 +115,8 @@ def test_answers_fit_into_a_message(scene: Scene) -> None:
             return [(float(x), 0.0, 0.0, 0.5) for x, *_ in views]
 
     one = MergedMap(scene.merged.maps, (), (), scene.merged.components[:1], scene.merged.poses)
-    told: KnownAnswer = Many(one).answer(A, (0.0, 0.0), math.inf)
-    assert told.views[:, 0].tolist() == list(range(MAX_KNOWN))
+    result: KnownAnswer = Many(one).answer(A, (0.0, 0.0), math.inf)
+    assert result.views[:, 0].tolist() == list(range(MAX_KNOWN))
 
 
 def test_the_server_answers_over_the_bus(scene: Scene, tmp_path) -> None:

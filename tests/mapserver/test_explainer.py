@@ -66,10 +66,10 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The bytes of a server's store."""
     path = tmp_path_factory.mktemp("store") / "s0.sqlite"
     store = Store(path)
-    for map_id, bodies in logs().items():
+    for map_id, changes in logs().items():
         entries = [
             Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
-            for k, body in enumerate(bodies)
+            for k, body in enumerate(changes)
         ]
         store.apply(map_id, 7, entries, len(entries))
     store.close()
@@ -95,8 +95,8 @@ class Asker:
 
     def maps(self) -> MapsExplanation:
         request = encode(ExplainRequest((A, B)))
-        (told,) = decode(self.ask(KEYS.explain("s0"), request).payload, FleetExplanation).maps
-        return told
+        (explanation,) = decode(self.ask(KEYS.explain("s0"), request).payload, FleetExplanation).maps
+        return explanation
 
     def rule(self, ends: Ends, apart: bool = True) -> Reply:
         return self.ask(
@@ -126,14 +126,14 @@ def links(content: MapFile) -> set[tuple[NodeId, NodeId]]:
     return {link.pair for link in merged_of(content).links}
 
 
-def same(one: MergedMap, two: MergedMap) -> None:
-    assert [link.pair for link in one.links] == [link.pair for link in two.links]
-    assert [(r.pair, r.reason, r.edge) for r in one.refused] == [
-        (r.pair, r.reason, r.edge) for r in two.refused
+def same(first: MergedMap, second: MergedMap) -> None:
+    assert [link.pair for link in first.links] == [link.pair for link in second.links]
+    assert [(r.pair, r.reason, r.edge) for r in first.refused] == [
+        (r.pair, r.reason, r.edge) for r in second.refused
     ]
-    assert one.components == two.components and one.rulings.made == two.rulings.made
-    for node, place in one.poses.items():
-        other = two.poses[node]
+    assert first.components == second.components and first.rulings.made == second.rulings.made
+    for node, place in first.poses.items():
+        other = second.poses[node]
         assert place.component == other.component
         assert np.allclose(
             place.merged_from_robot.mean.vector, other.merged_from_robot.mean.vector, atol=1e-5
@@ -148,9 +148,9 @@ def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
         content = asker.merged()
         pair = min(pair for pair in links(content) if pair[0].map != pair[1].map)
         reply = asker.ask(KEYS.explain("s0"), encode(ExplainRequest(pair)))
-        told = decode(reply.payload, PairExplanation)
-        assert told.standing is Standing.LINKED and (told.a.id, told.b.id) == pair
-        assert len(told.shared) == told.evidence["inliers"] and told.witnesses
+        result = decode(reply.payload, PairExplanation)
+        assert result.standing is Standing.LINKED and (result.a.id, result.b.id) == pair
+        assert len(result.shared) == result.evidence["inliers"] and result.witnesses
         assert asker.maps().joined
         everything = decode(
             asker.ask(KEYS.explain("s0"), encode(ExplainRequest())).payload, FleetExplanation
@@ -162,22 +162,24 @@ def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
 
 
 def test_blocked_edges_are_used_in_route_explanations(path: Path) -> None:
-    one, two = NodeId("a", 1, 1), NodeId("a", 1, 3)
+    node_id, two = NodeId("a", 1, 1), NodeId("a", 1, 3)
     with serving(path) as asker:
 
         def way() -> RouteExplanation:
-            request = encode(ExplainRequest((one, two), route=True))
+            request = encode(ExplainRequest((node_id, two), route=True))
             return decode(asker.ask(KEYS.explain("s0"), request).payload, RouteExplanation)
 
         free = way()
         assert free.found and not free.gaps and [hop.b for hop in free.hops] == [two]
-        blocked = encode(RouteRequest(one, two, ((one, two),)))
+        blocked = encode(RouteRequest(node_id, two, ((node_id, two),)))
         assert not asker.ask(KEYS.route("s0"), blocked).error
-        told = way()
-        assert told.found and any(
-            "recently could not get through" in hop.words for hop in (*told.hops, *told.gaps)
+        result = way()
+        assert result.found and any(
+            "recently could not get through" in hop.words for hop in (*result.hops, *result.gaps)
         )
-        assert [hop.b for hop in told.gaps] == [two] and sum(h.cost for h in told.hops) > free.hops[0].cost
+        assert [hop.b for hop in result.gaps] == [two] and sum(h.cost for h in result.hops) > free.hops[
+            0
+        ].cost
 
 
 def test_undone_links_stay_undone_after_a_restart(path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -193,8 +195,8 @@ def test_undone_links_stay_undone_after_a_restart(path: Path, caplog: pytest.Log
         assert event in caplog.messages
         assert asker.status()["rulings"] == 1
     with serving(path) as asker:
-        told = asker.maps()
-        assert not told.joined and [r.because for r in told.rulings] == ["two kitchens"]
+        result = asker.maps()
+        assert not result.joined and [r.because for r in result.rulings] == ["two kitchens"]
         assert "apart already" in asker.rule((A, B)).error
         assert not asker.rule((A, B), apart=False).error
         assert asker.maps().joined and len(asker.maps().rulings) == 2
@@ -219,11 +221,11 @@ def test_merged_without_a_server_is_the_same(path: Path) -> None:
         asker.rule(min(links(asker.merged())))
         served = asker.merged()
     offline = Merger()
-    for map_id, bodies in logs().items():
+    for map_id, changes in logs().items():
         # As robots' files hold them.
-        content = unpack_map_file(pack_map_file(MapFile("agent", str(map_id), tuple(bodies))))
-        for body in content.changes:
-            offline.apply(map_id, body)
+        content = unpack_map_file(pack_map_file(MapFile("agent", str(map_id), tuple(changes))))
+        for change in content.changes:
+            offline.apply(map_id, change)
     offline.rule(merged_of(served).rulings)
     same(offline.merged(), merged_of(served))
 
@@ -239,10 +241,10 @@ def test_a_file_holds_the_whole_merged_map(path: Path) -> None:
         r.pair: r.link is None for r in merged_of(again).refused
     }
     whole = {map_id: (set(one.nodes), set(one.edges)) for map_id, one in maps_of(content).items()}
-    for map_id, bodies in logs().items():
+    for map_id, changes in logs().items():
         assert whole[map_id] == (
-            {body.node.id for body in bodies if isinstance(body, NodePut)},
-            {body.edge.id for body in bodies if isinstance(body, EdgePut)},
+            {change.node.id for change in changes if isinstance(change, NodePut)},
+            {change.edge.id for change in changes if isinstance(change, EdgePut)},
         )
     for link in merged.links:
         (edge,) = [b.edge for b in content.changes if isinstance(b, EdgePut) and b.edge.id == link.edge().id]
@@ -269,23 +271,24 @@ def test_an_incomplete_merge_is_reported(stored: bytes, path: Path) -> None:
     bus, merged = MemoryBus(MemoryHub()), MergedMap.empty()
     with serving(path) as asker:
         merged = merged_of(asker.merged())
-    store, desk, settled = Store(path), AdmissionControl(AdmissionSettings(workers=1)), False
+    store, admission, settled = Store(path), AdmissionControl(AdmissionSettings(workers=1)), False
     answers = SimpleNamespace(merged=merged, router=Router(merged))
     explainer = Explainer(
-        bus, KEYS, "s0", lambda: answers, desk, RulingBook(store), lambda rulings: None, lambda: settled,
+        bus, KEYS, "s0", lambda: answers, admission, RulingBook(store),
+            lambda constraints: None, lambda: settled,
         ConsistencySettings(), tuple, tuple,
     )  # fmt: skip
     pair = merged.links[0].pair
     for request in (*map(ExplainRequest, ((A, B), pair, None)), ExplainRequest(pair, route=True)):
         settled = False
-        told = explainer.explain(request)
-        early = told.maps[0] if isinstance(told, FleetExplanation) else told
+        explanation = explainer.explain(request)
+        early = explanation.maps[0] if isinstance(explanation, FleetExplanation) else explanation
         settled = True
-        told = explainer.explain(request)
-        late = told.maps[0] if isinstance(told, FleetExplanation) else told
+        explanation = explainer.explain(request)
+        late = explanation.maps[0] if isinstance(explanation, FleetExplanation) else explanation
         assert early.reason == f"{late.reason} (still merging: ask again)"
     explainer.close()
-    desk.close()
+    admission.close()
     store.close()
     bus.close()
 
@@ -307,6 +310,6 @@ def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.L
     store = Store(path)
     store.add_ruling(b"rubbish")
     RulingBook(store).add(ManualConstraint((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
-    assert [ruling.who for ruling in RulingBook(store).rulings.made] == ["anna"]
+    assert [constraint.who for constraint in RulingBook(store).rulings.made] == ["anna"]
     assert "a manual constraint cannot be read" in caplog.text
     store.close()

@@ -16,7 +16,7 @@ from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.map_history import BODIES, MOST_AT_ONCE, MapHistory
+from mapweave.mapserver.map_history import EXCLUSION_WORDS, MOST_AT_ONCE, MapHistory
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.ruling_history import with_rulings
 from mapweave.merge.mutual_exclusion.collision import Collision
@@ -39,8 +39,8 @@ def merger() -> Merger:
     for map_id in (A, B):
         stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
         nodes, edges = take_map(world, map_id, stops, rng)
-        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, body)
+        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, change)
     return merger
 
 
@@ -63,8 +63,8 @@ def store(tmp_path: Path) -> Iterator[Store]:
     store.close()
 
 
-def told(chronicle: MapHistory) -> list[tuple[MapEventKind, str]]:
-    return [(one.kind, one.words.split(":")[0].split(", by")[0]) for one in chronicle.happenings]
+def told(history: MapHistory) -> list[tuple[MapEventKind, str]]:
+    return [(event.kind, event.words.split(":")[0].split(", by")[0]) for event in history.happenings]
 
 
 JOINED = (MapEventKind.JOINED, "a.1 and b.1 are one map now")
@@ -73,12 +73,12 @@ PARTED = (MapEventKind.PARTED, "a.1 and b.1 are no longer one map")
 
 def test_each_event_is_listed_once_with_its_time(one: MergedMap, two: MergedMap) -> None:
     times = iter(range(10**18, 10**19, 10**9))
-    chronicle = MapHistory(clock=lambda: next(times))
+    history = MapHistory(clock=lambda: next(times))
     for merged in (MergedMap.empty(), one, one, two, two, one):
-        chronicle.follow(merged)
-    assert told(chronicle) == [JOINED, PARTED, JOINED]
-    assert "two kitchens" in chronicle.happenings[1].words and chronicle.newest.startswith("a.1 and b.1")
-    stamps = [happening.stamp_ns for happening in chronicle.happenings]
+        history.follow(merged)
+    assert told(history) == [JOINED, PARTED, JOINED]
+    assert "two kitchens" in history.happenings[1].words and history.newest.startswith("a.1 and b.1")
+    stamps = [happening.stamp_ns for happening in history.happenings]
     assert stamps == sorted(stamps) and stamps[0] >= 10**18
 
 
@@ -97,19 +97,19 @@ def test_a_restarted_server_publishes_only_news(store: Store, one: MergedMap, tw
 
 
 def test_it_is_bounded(store: Store, one: MergedMap, two: MergedMap) -> None:
-    chronicle = MapHistory(store, most=5)
+    history = MapHistory(store, most=5)
     for k in range(12):
-        chronicle.follow(two if k % 2 else one)
-    assert told(chronicle) == [PARTED, JOINED, PARTED, JOINED, PARTED] == told(MapHistory(store))
+        history.follow(two if k % 2 else one)
+    assert told(history) == [PARTED, JOINED, PARTED, JOINED, PARTED] == told(MapHistory(store))
 
 
 def test_many_events_at_once_are_summarised(one: MergedMap) -> None:
     many = {MapId(f"r{k}", 1): one.maps[A] for k in range(200)}
     nodes = frozenset(next(iter(one.maps[A].nodes))._replace(agent=name.agent) for name in many)
-    chronicle = MapHistory()
-    chronicle.follow(replace(one, maps=many, links=(), components=(nodes,)))
-    assert len(chronicle.happenings) == MOST_AT_ONCE + 1
-    assert chronicle.newest == f"and {199 - MOST_AT_ONCE} more at once"
+    history = MapHistory()
+    history.follow(replace(one, maps=many, links=(), components=(nodes,)))
+    assert len(history.happenings) == MOST_AT_ONCE + 1
+    assert history.newest == f"and {199 - MOST_AT_ONCE} more at once"
 
 
 def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
@@ -117,18 +117,18 @@ def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
 ) -> None:
     clash = Collision("a", "b", "hall", 40, 0.1, 12.0, 99.0)
     seen = replace(clash, where="ahead")
-    assert all(any(words in one.reason for words in BODIES) for one in (clash, seen))
+    assert all(any(words in one.reason for words in EXCLUSION_WORDS) for one in (clash, seen))
     links = [link for link in one.links if {link.a.map, link.b.map} == {A, B}]
     held = replace(two, refused=tuple(refuse(link, clash.reason) for link in links))
-    chronicle = MapHistory(store)
-    chronicle.follow(held)
-    chronicle.follow(replace(two, refused=tuple(refuse(link, seen.reason) for link in links)))
-    ((kind, _),) = told(chronicle)
+    history = MapHistory(store)
+    history.follow(held)
+    history.follow(replace(two, refused=tuple(refuse(link, seen.reason) for link in links)))
+    ((kind, _),) = told(history)
     assert kind is MapEventKind.KEPT_APART
-    assert chronicle.newest == (f"a.1 and b.1 are kept apart: {len(links)} links refused ({clash.reason})")
+    assert history.newest == (f"a.1 and b.1 are kept apart: {len(links)} links refused ({clash.reason})")
     again = MapHistory(store)
     again.follow(held)
-    assert again.happenings == chronicle.happenings, "told already"
+    assert again.happenings == history.happenings, "told already"
     again.follow(one)
     again.follow(held)
     # The split by it has the reason itself.
@@ -151,49 +151,49 @@ def test_each_refused_pair_is_listed_once(one: MergedMap, monkeypatch: pytest.Mo
     )
     parts = tuple(frozenset([link.a._replace(agent=name.agent)]) for name in names)
     merged = MergedMap(dict.fromkeys(names, one.maps[A]), (), refused, parts, {})
-    chronicle = MapHistory()
+    history = MapHistory()
     for _ in range(3):
-        chronicle.follow(merged)
-    assert [kind for kind, _ in told(chronicle)] == [MapEventKind.KEPT_APART] * 3
+        history.follow(merged)
+    assert [kind for kind, _ in told(history)] == [MapEventKind.KEPT_APART] * 3
 
 
 def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> None:
     other = Merger()
     for map_id in (A, B):
-        for body in one.maps[map_id].contents():
-            other.apply(map_id, body)
-    chronicle = MapHistory()
-    chronicle.follow(other.merged())
+        for change in one.maps[map_id].contents():
+            other.apply(map_id, change)
+    history = MapHistory()
+    history.follow(other.merged())
     for node in list(one.maps[B].nodes):
         other.apply(B, NodeRetired(node))
-    chronicle.follow(other.merged())
-    assert told(chronicle) == [JOINED]
+    history.follow(other.merged())
+    assert told(history) == [JOINED]
 
 
 def test_a_damaged_record_is_replaced_and_reported(store: Store, one: MergedMap) -> None:
     store.put_result("history", b"rubbish")
-    chronicle = MapHistory(store)
-    (failed,) = chronicle.happenings
-    assert failed.kind is MapEventKind.FAILED and "damaged" in failed.words and chronicle.newest == ""
-    chronicle.failed(failed.words)
-    assert chronicle.happenings == (failed,), "told once"
-    chronicle.follow(one)
-    assert MapHistory(store).happenings == chronicle.happenings
+    history = MapHistory(store)
+    (failed,) = history.happenings
+    assert failed.kind is MapEventKind.FAILED and "damaged" in failed.words and history.newest == ""
+    history.failed(failed.words)
+    assert history.happenings == (failed,), "told once"
+    history.follow(one)
+    assert MapHistory(store).happenings == history.happenings
 
 
 def test_a_disk_that_does_not_take_it_ends_nothing(
     tmp_path: Path, one: MergedMap, two: MergedMap, caplog: pytest.LogCaptureFixture
 ) -> None:
     store = Store(tmp_path / "s0.sqlite")
-    chronicle = MapHistory(store)
-    chronicle.follow(one)
+    history = MapHistory(store)
+    history.follow(one)
 
     def full(name: str, value: bytes) -> None:
         raise InvalidFile("the disk is full")
 
     store.put_result = full  # type: ignore[method-assign]
-    chronicle.follow(two)
-    assert told(chronicle) == [JOINED, PARTED] and "is not kept: the disk is full" in caplog.text
+    history.follow(two)
+    assert told(history) == [JOINED, PARTED] and "is not kept: the disk is full" in caplog.text
     store.close()
     store = Store(tmp_path / "s0.sqlite")
     assert told(MapHistory(store)) == [JOINED], "the record of before is whole"
@@ -202,7 +202,7 @@ def test_a_disk_that_does_not_take_it_ends_nothing(
 
 def test_constraints_are_listed_in_the_history() -> None:
     happenings = [MapEvent(10**18 + k, MapEventKind.JOINED, "x") for k in (-1, 1)]
-    kinds = [one.kind for one in with_rulings(happenings, APART)]
+    kinds = [event.kind for event in with_rulings(happenings, APART)]
     assert kinds == [MapEventKind.JOINED, MapEventKind.RULED, MapEventKind.JOINED]
     assert "two kitchens" in with_rulings((), APART)[0].words
 
@@ -225,6 +225,6 @@ def test_it_comes_through_bytes() -> None:
         5,
         [[1, "joined", "x"]],
     ]
-    for fields in ({}, *({"history": one} for one in wrong)):
+    for fields in ({}, *({"history": item} for item in wrong)):
         with pytest.raises(InvalidMessage):
             decode(pack(fields), History)

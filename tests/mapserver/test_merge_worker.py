@@ -33,20 +33,20 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
         return real(merger, use)
 
     monkeypatch.setattr(Merger, "merged", held)
-    upkeep = MergeWorker(LiveSchedule(), 1.0)
-    assert upkeep.settled
-    upkeep.start()
-    rulings = ManualConstraints([ManualConstraint((MapId("a", 1), MapId("b", 1)), True, "anna", 0)])
-    upkeep.rule(rulings)
+    worker = MergeWorker(LiveSchedule(), 1.0)
+    assert worker.settled
+    worker.start()
+    constraints = ManualConstraints([ManualConstraint((MapId("a", 1), MapId("b", 1)), True, "anna", 0)])
+    worker.rule(constraints)
     assert entered.wait(20)
-    assert not upkeep.settled
+    assert not worker.settled
     go.set()
     end = time.monotonic() + 20
-    while not upkeep.settled:
+    while not worker.settled:
         assert time.monotonic() < end
         time.sleep(0.001)
-    assert upkeep.answers.merged.rulings is rulings
-    upkeep.close()
+    assert worker.answers.merged.rulings is constraints
+    worker.close()
 
 
 @pytest.mark.parametrize("broken", [False, True])
@@ -58,8 +58,8 @@ def test_a_store_read_at_once_merges_as_change_by_change(
     for agent in ("a", "b"):
         tour = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
         nodes, edges = take_map(world, MapId(agent, 1), tour, rng)
-        bodies = [*map(NodePut, nodes), *map(EdgePut, edges), NodePut(nodes[1]), NodeRetired(nodes[3].id)]
-        changes += [Change(MapId(agent, 1), k + 1, 0, body) for k, body in enumerate(bodies)]
+        contents = [*map(NodePut, nodes), *map(EdgePut, edges), NodePut(nodes[1]), NodeRetired(nodes[3].id)]
+        changes += [Change(MapId(agent, 1), k + 1, 0, body) for k, body in enumerate(contents)]
     if broken:
 
         def fails(*_: object) -> None:
@@ -68,22 +68,22 @@ def test_a_store_read_at_once_merges_as_change_by_change(
         monkeypatch.setattr(Merger, "read", fails)
     merged = []
     for at_once in (True, False):
-        upkeep = MergeWorker(LiveSchedule(), 1.0)
-        upkeep.start()
+        worker = MergeWorker(LiveSchedule(), 1.0)
+        worker.start()
         if at_once:
-            upkeep.read(iter(changes))
+            worker.read(iter(changes))
         else:
             for change in changes:
-                upkeep.take(change)
-        assert upkeep.settle(30)
-        merged.append(upkeep.answers.merged)
-        upkeep.close()
+                worker.take(change)
+        assert worker.settle(30)
+        merged.append(worker.answers.merged)
+        worker.close()
     assert ("one by one" in caplog.text) is broken
-    one, two = merged
-    assert len(one.links) > 0 and one.summary() == two.summary() and "6 nodes" in one.summary()
-    assert [(link.a, link.b) for link in one.links] == [(link.a, link.b) for link in two.links]
-    for node, placement in one.poses.items():
-        there = two.poses[node].merged_from_robot.mean
+    first, second = merged
+    assert len(first.links) > 0 and first.summary() == second.summary() and "6 nodes" in first.summary()
+    assert [(link.a, link.b) for link in first.links] == [(link.a, link.b) for link in second.links]
+    for node, placement in first.poses.items():
+        there = second.poses[node].merged_from_robot.mean
         assert placement.merged_from_robot.mean.distance(there) < 1e-9
 
 
@@ -93,9 +93,9 @@ def mapped_room(agents: tuple[str, ...]) -> tuple[World, list[Pose2], list[Chang
     world = room(0, 0, 5, 4, 600, rng)
     tour, changes = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)], []
     for agent in agents:
-        bodies = [body for made in take_map(world, MapId(agent, 1), tour, rng) for body in made]
-        bodies = [NodePut(one) if isinstance(one, Node) else EdgePut(one) for one in bodies]
-        changes += [Change(MapId(agent, 1), k + 1, 0, body) for k, body in enumerate(bodies)]
+        contents = [body for made in take_map(world, MapId(agent, 1), tour, rng) for body in made]
+        contents = [NodePut(entry) if isinstance(entry, Node) else EdgePut(entry) for entry in contents]
+        changes += [Change(MapId(agent, 1), k + 1, 0, body) for k, body in enumerate(contents)]
     return world, tour, changes
 
 
@@ -110,23 +110,23 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
         return real(merger, use)
 
     monkeypatch.setattr(Merger, "merged", held)
-    upkeep = MergeWorker(LiveSchedule(), 1.0)
-    upkeep.start()
-    upkeep.rule(ManualConstraints())
+    worker = MergeWorker(LiveSchedule(), 1.0)
+    worker.start()
+    worker.rule(ManualConstraints())
     assert entered.wait(20)
-    assert upkeep.answers.relocalizer.answer(view).certainty is Certainty.UNKNOWN
+    assert worker.answers.relocalizer.answer(view).certainty is Certainty.UNKNOWN
     for change in changes:
-        upkeep.take(change)
+        worker.take(change)
     began = time.monotonic()
-    answer = upkeep.answers.relocalizer.answer(view)
+    answer = worker.answers.relocalizer.answer(view)
     assert time.monotonic() - began < 1.0 and answer.certainty is Certainty.FOUND
     best = answer.candidates[0]
     assert best.component == NO_COMPONENT and best.merged_from_robot is None
     go.set()
-    assert upkeep.settle(20)
-    merged = upkeep.answers.relocalizer.answer(view).candidates[0]
+    assert worker.settle(20)
+    merged = worker.answers.relocalizer.answer(view).candidates[0]
     assert merged.node == best.node and merged.component == 0 and merged.merged_from_robot is not None
-    upkeep.close()
+    worker.close()
 
 
 def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,41 +139,41 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
         real(merger, most)
 
     monkeypatch.setattr(Merger, "search_pairs", held)
-    upkeep = MergeWorker(LiveSchedule(), 1.0)
-    upkeep.start()
-    upkeep.read(iter(changes))
-    assert len(upkeep.answers.merged.components) == 2
-    assert not upkeep.settled and not upkeep.answers.merged.links
-    answer = upkeep.answers.relocalizer.answer(view)
-    assert {one.node.agent for one in answer.candidates} == {"a", "b"}
-    assert len({one.component for one in answer.candidates}) == 2
+    worker = MergeWorker(LiveSchedule(), 1.0)
+    worker.start()
+    worker.read(iter(changes))
+    assert len(worker.answers.merged.components) == 2
+    assert not worker.settled and not worker.answers.merged.links
+    answer = worker.answers.relocalizer.answer(view)
+    assert {candidate.node.agent for candidate in answer.candidates} == {"a", "b"}
+    assert len({candidate.component for candidate in answer.candidates}) == 2
     assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason
     go.set()
-    assert upkeep.settle(30)
-    answer = upkeep.answers.relocalizer.answer(view)
-    assert answer.certainty is Certainty.FOUND and len(upkeep.answers.merged.components) == 1
-    upkeep.close()
+    assert worker.settle(30)
+    answer = worker.answers.relocalizer.answer(view)
+    assert answer.certainty is Certainty.FOUND and len(worker.answers.merged.components) == 1
+    worker.close()
 
 
 def test_in_lockstep_all_changes_are_merged_before_an_answer() -> None:
     _, _, changes = mapped_room(("a",))
     places, schedule = PlaceDatabase(), LockstepSchedule()
-    upkeep = MergeWorker(schedule, 1.0, places=places)
-    upkeep.start()
+    worker = MergeWorker(schedule, 1.0, places=places)
+    worker.start()
     for change in changes:
-        upkeep.take(replace(change, stamp_ns=change.sequence))
-    assert len(upkeep.answers.merged.poses) == 0
-    assert len(upkeep.current().merged.poses) == len(places) == 4 and upkeep.settled
+        worker.take(replace(change, stamp_ns=change.sequence))
+    assert len(worker.answers.merged.poses) == 0
+    assert len(worker.current().merged.poses) == len(places) == 4 and worker.settled
     assert schedule.time_ns() == len(changes)
-    upkeep.close()
+    worker.close()
 
 
 def test_a_database_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
     """The owner of the database saves it: a server's first start must leave a saved index, too."""
     _, _, changes = mapped_room(("a",))
     places = PlaceDatabase()
-    upkeep = MergeWorker(LiveSchedule(), 1.0, places=places)
-    upkeep.start()
-    upkeep.read(iter(changes))
+    worker = MergeWorker(LiveSchedule(), 1.0, places=places)
+    worker.start()
+    worker.read(iter(changes))
     assert len(places) == 4
-    upkeep.close()
+    worker.close()

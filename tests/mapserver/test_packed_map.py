@@ -80,9 +80,9 @@ def test_everything_else_is_answered_while_the_map_is_packed(served: Served) -> 
 def test_the_same_map_is_packed_once(served: Served) -> None:
     first = served.ask(MAP).payload
     assert served.ask(MAP).payload == first and served.packs == 1
-    served.server._chronicle.failed("something")
-    told = unpack_map_file(served.ask(MAP).payload).history
-    assert served.packs == 2 and "something" in told[-1].words
+    served.server._history.failed("something")
+    answer = unpack_map_file(served.ask(MAP).payload).history
+    assert served.packs == 2 and "something" in answer[-1].words
 
 
 def test_a_crowd_costs_two_packs_at_most(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +96,7 @@ def test_a_crowd_costs_two_packs_at_most(served: Served, monkeypatch: pytest.Mon
         refused = served.ask(MAP)
         assert refused.retry_after == pytest.approx(packed_map.PAUSE) and "busy" in refused.error
         served.go_on.set()
-        assert len({one.result(30).payload for one in asked}) == 1
+        assert len({item.result(30).payload for item in asked}) == 1
     assert served.packs <= 2
 
 

@@ -48,7 +48,7 @@ def no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Told:
-    """A herald, and what it publishes."""
+    """A pose broadcast, and what it publishes."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.heard: list[PoseNews] = []
@@ -90,53 +90,53 @@ def zenoh() -> Iterator[ZenohFleet]:
 
 
 def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) -> None:
-    told = Told(memory)
-    (first,) = told.tell(graph(A))
+    result = Told(memory)
+    (first,) = result.tell(graph(A))
     assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
-    assert told.tell(graph(A, 0.049)) == []
-    assert told.tell(graph(A, 0.0, math.radians(0.9))) == []
+    assert result.tell(graph(A, 0.049)) == []
+    assert result.tell(graph(A, 0.0, math.radians(0.9))) == []
     # Each step is small; the distance from the published pose counts.
-    steps = [told.tell(graph(A, 0.03 * k)) for k in range(1, 5)]
+    steps = [result.tell(graph(A, 0.03 * k)) for k in range(1, 5)]
     assert [len(news) for news in steps] == [0, 1, 0, 1]
-    (turned,) = told.tell(graph(A, 0.12, math.radians(1.1)))
+    (turned,) = result.tell(graph(A, 0.12, math.radians(1.1)))
     assert turned.placed[A[2]].merged_from_node.vector == pytest.approx([2.12, 0, math.radians(1.1)])
 
 
 def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> None:
-    told = Told(memory)
-    told.tell(graph(A), graph(B))
+    result = Told(memory)
+    result.tell(graph(A), graph(B))
     one = graph(A)
     one.means[3, 1] = 0.2
-    (news,) = told.tell(one, graph(B, 5.0))
+    (news,) = result.tell(one, graph(B, 5.0))
     assert set(news.placed) == {A[3]}
     # One component now, in the frame of the smallest node of all: same numbers, other frame.
-    (news,) = told.tell(graph([*A, *B]))
+    (news,) = result.tell(graph([*A, *B]))
     assert set(news.placed) == {A[3]}, "the frame of the first is that of both"
-    (reply,) = told.agent.ask(KEYS.poses("s0", "r1"), b"", 5.0)
+    (reply,) = result.agent.ask(KEYS.poses("s0", "r1"), b"", 5.0)
     assert {place.frame for place in PoseNews.decode(reply.payload, "r1").placed.values()} == {A[0]}
 
 
 def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
-    told = Told(memory)
-    told.tell(graph(A))
-    (news,) = told.tell(graph(A[:-1]))
+    result = Told(memory)
+    result.tell(graph(A))
+    (news,) = result.tell(graph(A[:-1]))
     assert news.gone == (A[-1],) and not news.placed
-    (reply,) = told.agent.ask(KEYS.poses("s0", "r0"), b"", 5.0)
+    (reply,) = result.agent.ask(KEYS.poses("s0", "r0"), b"", 5.0)
     whole = PoseNews.decode(reply.payload, "r0")
     assert set(whole.placed) == set(A[:-1]) and whole.after == 0 and whole.sequence == 2
 
 
 def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose_broadcast, "MOST", 2)
-    told = Told(memory)
-    pieces = told.tell(graph(A))
+    result = Told(memory)
+    pieces = result.tell(graph(A))
     assert [len(news.placed) for news in pieces] == [2, 2, 1]
     assert [(news.after, news.sequence) for news in pieces] == [(0, 1), (1, 2), (2, 3)]
-    herald, heard = told.herald, told.heard
-    herald.tell(merged(graph(A, 1.0)), 100.0)
-    herald.tell(merged(graph(A, 2.0)), 101.9)
-    told.wait()
-    assert len(heard) == 6, "two seconds lie between"
+    broadcast, received = result.herald, result.heard
+    broadcast.tell(merged(graph(A, 1.0)), 100.0)
+    broadcast.tell(merged(graph(A, 2.0)), 101.9)
+    result.wait()
+    assert len(received) == 6, "two seconds lie between"
 
 
 def kept(bus: Bus) -> MergedPoses:
@@ -156,38 +156,38 @@ def test_lost_changes_are_pulled_over_zenoh(zenoh: ZenohFleet, monkeypatch: pyte
     monkeypatch.setattr(pose_broadcast, "EVERY", 0.0)
     monkeypatch.setattr(pose_broadcast, "BEAT", 0.0)
     server = zenoh.join()
-    herald = PoseBroadcast(server, KEYS, "s0")
-    herald.tell(merged(graph(A)))
+    broadcast = PoseBroadcast(server, KEYS, "s0")
+    broadcast.tell(merged(graph(A)))
     alive = server.announce(KEYS.server_alive("s0"))
     poses = kept(zenoh.join())
     eventually(at(poses, A[2], 2.0))
     assert poses.count(A[0].map) == len(A) and poses.of(B[0]) is None
-    herald.tell(merged(graph(A, 1.0)))
+    broadcast.tell(merged(graph(A, 1.0)))
     eventually(at(poses, A[2], 3.0))
     zenoh.cut()
-    herald.tell(merged(graph(A, 2.0)))
+    broadcast.tell(merged(graph(A, 2.0)))
     assert at(poses, A[2], 3.0)()
     zenoh.mend()
     assert server.wait_connected(30)
 
     def beaten() -> bool:
-        herald.tell(merged(graph(A, 2.0)))
+        broadcast.tell(merged(graph(A, 2.0)))
         return at(poses, A[2], 4.0)()
 
     eventually(beaten)
     alive.close()
-    herald.close()
+    broadcast.close()
     again = zenoh.join()
-    herald = PoseBroadcast(again, KEYS, "s0")
-    herald.tell(merged(graph(A[:3], 7.0)))
+    broadcast = PoseBroadcast(again, KEYS, "s0")
+    broadcast.tell(merged(graph(A[:3], 7.0)))
     alive = again.announce(KEYS.server_alive("s0"))
     eventually(at(poses, A[2], 9.0))
     assert poses.of(A[4]) is None and poses.count(A[0].map) == 3
-    herald.tell(merged(graph(A[:2], 7.0)))
+    broadcast.tell(merged(graph(A[:2], 7.0)))
     eventually(lambda: poses.of(A[2]) is None)
     poses.close()
     alive.close()
-    herald.close()
+    broadcast.close()
 
 
 def test_a_map_server_reports_its_merged_map(

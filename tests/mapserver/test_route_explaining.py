@@ -79,40 +79,42 @@ def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
 
 def test_edges_that_only_constrain_poses_are_named_with_what_they_lack(router: Router) -> None:
     start, goal = nodes_of(ME)[0], nodes_of(OTHER)[2]
-    told = explain_route(router, start, goal)
-    assert not told.found and not told.hops and told.apart is None
-    assert told.reason.startswith(router.route(start, goal).reason) and "ties poses" in told.reason
-    assert len(told.gaps) == least_gaps(router, start, goal) == 1
-    (gap,) = told.gaps
+    explanation = explain_route(router, start, goal)
+    assert not explanation.found and not explanation.hops and explanation.apart is None
+    assert (
+        explanation.reason.startswith(router.route(start, goal).reason) and "ties poses" in explanation.reason
+    )
+    assert len(explanation.gaps) == least_gaps(router, start, goal) == 1
+    (gap,) = explanation.gaps
     assert (gap.a.map, gap.b.map) == (ME, OTHER) and gap.kind == "merged"
     assert gap.words.startswith("ties poses, not driven: ")
     assert gap.distance == pytest.approx(router.merged.pose(gap.a).distance(router.merged.pose(gap.b)))
-    words = route_words(told)
+    words = route_words(explanation)
     assert "there is no way" in words[0] and "what is missing" in words[1] and gap.words in words[2]
 
 
 def test_the_explained_route_is_the_one_that_robots_get(router: Router) -> None:
     start, goal = nodes_of(ME)[0], nodes_of(ME)[2]
-    told = explain_route(router, start, goal)
+    explanation = explain_route(router, start, goal)
     legs = router.route(start, goal).legs
-    assert told.found and [hop.b for hop in told.hops] == [leg.node.id for leg in legs[1:]]
-    for hop, leg in zip(told.hops, legs[1:], strict=True):
+    assert explanation.found and [hop.b for hop in explanation.hops] == [leg.node.id for leg in legs[1:]]
+    for hop, leg in zip(explanation.hops, legs[1:], strict=True):
         assert hop.distance == pytest.approx(leg.previous_from_node.mean.distance(Pose2()))
         assert hop.turn == pytest.approx(leg.previous_from_node.mean.heading, abs=1e-9)
-    assert not told.gaps and "no cheaper one is known" in told.reason
-    assert f"cost {sum(hop.cost for hop in told.hops):.2f} m" in told.reason
+    assert not explanation.gaps and "no cheaper one is known" in explanation.reason
+    assert f"cost {sum(hop.cost for hop in explanation.hops):.2f} m" in explanation.reason
 
 
 def test_blocked_edges_are_explained_with_and_without_another_way(router: Router) -> None:
     one, two, three = nodes_of(ME)
-    told = explain_route(router, one, three, blocked=[(two, one)])
+    explanation = explain_route(router, one, three, blocked=[(two, one)])
     legs = router.route(one, three, blocked=[(two, one)]).legs
-    assert told.found is bool(legs)
-    assert all("reported as blocked" in gap.words for gap in told.gaps)
+    assert explanation.found is bool(legs)
+    assert all("reported as blocked" in gap.words for gap in explanation.gaps)
     whole = [(one, other) for other in router.merged.poses if other != one]
-    told = explain_route(router, one, three, blocked=whole)
-    assert not told.found and not router.route(one, three, blocked=whole).legs
-    assert "is blocked" in told.reason and "reported as blocked" in told.gaps[0].words
+    explanation = explain_route(router, one, three, blocked=whole)
+    assert not explanation.found and not router.route(one, three, blocked=whole).legs
+    assert "is blocked" in explanation.reason and "reported as blocked" in explanation.gaps[0].words
 
 
 def test_recently_blocked_edges_are_reported(router: Router) -> None:
@@ -127,14 +129,14 @@ def test_recently_blocked_edges_are_reported(router: Router) -> None:
 
 
 def test_unconnected_maps_are_explained_instead_of_a_route(router: Router, sent: bool) -> None:
-    told = explain_route(router, nodes_of(ME)[0], nodes_of(FAR)[0])
+    explanation = explain_route(router, nodes_of(ME)[0], nodes_of(FAR)[0])
     if sent:
-        told = decode(encode(told), RouteExplanation)
-    assert not told.found and "in parts of the map that nothing joins yet" in told.reason
-    assert told.apart is not None and not told.apart.joined
-    assert told.apart.second == FAR and "are not one map" in told.apart.reason
-    assert any("are not one map" in line for line in route_words(told))
-    assert json_values(told)["apart"]["second"] == "c.1"
+        explanation = decode(encode(explanation), RouteExplanation)
+    assert not explanation.found and "in parts of the map that nothing joins yet" in explanation.reason
+    assert explanation.apart is not None and not explanation.apart.joined
+    assert explanation.apart.second == FAR and "are not one map" in explanation.apart.reason
+    assert any("are not one map" in line for line in route_words(explanation))
+    assert json_values(explanation)["apart"]["second"] == "c.1"
 
 
 def test_pieces_of_one_map_are_not_joined_as_maps() -> None:
@@ -143,33 +145,33 @@ def test_pieces_of_one_map_are_not_joined_as_maps() -> None:
     for number, first in ((0, 1), (1, 101)):
         world = room(0, 0, 5, 4, 700, rng)
         nodes, edges = take_map(world, ME, [Pose2(2.0 + 0.3 * k, 2.0) for k in range(3)], rng, SHARP)
-        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(ME, renumbered(body, 100 * number))
+        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(ME, renumbered(change, 100 * number))
         assert merger.maps[ME].nodes[NodeId(*ME, first)]
     router = Router(merger.merged())
     assert len(router.merged.components) == 2
-    told = explain_route(router, NodeId(*ME, 1), NodeId(*ME, 101))
-    assert not told.found and told.apart is None
-    assert told.reason.endswith("in parts of the map that nothing joins yet; a.1 is in pieces")
+    explanation = explain_route(router, NodeId(*ME, 1), NodeId(*ME, 101))
+    assert not explanation.found and explanation.apart is None
+    assert explanation.reason.endswith("in parts of the map that nothing joins yet; a.1 is in pieces")
 
 
-def renumbered(body: NodePut | EdgePut, more: int) -> NodePut | EdgePut:
+def renumbered(change: NodePut | EdgePut, more: int) -> NodePut | EdgePut:
     """The same with other numbers."""
 
-    def later(one: NodeId) -> NodeId:
-        return one._replace(number=one.number + more)
+    def later(node_id: NodeId) -> NodeId:
+        return node_id._replace(number=node_id.number + more)
 
-    if isinstance(body, NodePut):
-        return NodePut(replace(body.node, id=later(body.node.id)))
-    edge = body.edge
+    if isinstance(change, NodePut):
+        return NodePut(replace(change.node, id=later(change.node.id)))
+    edge = change.edge
     return EdgePut(replace(edge, id=later(edge.id), a=later(edge.a), b=later(edge.b)))
 
 
 def test_a_retired_map_is_explained_with_the_persons_name() -> None:
     merger = fleet()
     merger.rule(ManualConstraints([ManualConstraint((OTHER, OTHER), True, "anna", 10**18, "burnt down")]))
-    told = explain_route(Router(merger.merged()), nodes_of(ME)[0], nodes_of(OTHER)[0])
-    assert not told.found and "anna" in told.reason and "burnt down" in told.reason
+    explanation = explain_route(Router(merger.merged()), nodes_of(ME)[0], nodes_of(OTHER)[0])
+    assert not explanation.found and "anna" in explanation.reason and "burnt down" in explanation.reason
 
 
 def test_unknown_ids_are_refused_with_the_known_range(router: Router) -> None:
@@ -186,9 +188,9 @@ def test_questions_and_answers_come_through_the_wire(router: Router) -> None:
     one, two, three = nodes_of(ME)
     request = ExplainRequest((one, three), True, ((one, two), (two, three)))
     assert decode(encode(request), ExplainRequest) == request
-    told = explain_route(router, one, three, blocked=[(one, two)])
-    again = decode(encode(told), RouteExplanation)
-    assert isinstance(again, RouteExplanation) and again == told
+    explanation = explain_route(router, one, three, blocked=[(one, two)])
+    again = decode(encode(explanation), RouteExplanation)
+    assert isinstance(again, RouteExplanation) and again == explanation
     with pytest.raises(InvalidValue, match="from node to node"):
         ExplainRequest((ME, OTHER), True)
     with pytest.raises(InvalidMessage, match="from node to node"):

@@ -77,8 +77,8 @@ def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> 
     assert len(merged.components) == 1 and merged.links, "the poses are tied"
     answer = Router(merged).route(ends[0][0], ends[1][1])
     assert not answer.legs and "only ties poses" in answer.reason
-    told = explain_nodes(merged, *merged.links[0].pair)
-    assert any("ties poses, not driven" in claim and "2.5 m" in claim for claim in told.claims)
+    explanation = explain_nodes(merged, *merged.links[0].pair)
+    assert any("ties poses, not driven" in claim and "2.5 m" in claim for claim in explanation.claims)
     joined = explain_maps(merged, ME, other)
     assert joined.joined and "none can be driven" in joined.reason
     between = merged.relative(ends[0][1], ends[1][0])

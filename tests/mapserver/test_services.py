@@ -126,7 +126,7 @@ def test_slow_questions_block_no_other_and_excess_is_refused(
 
 def test_a_long_merge_holds_up_no_question(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     gate = Gate(monkeypatch, Merger, "merged")
-    served.server._upkeep._dirty = True
+    served.server._worker._dirty = True
     settling = threading.Thread(target=served.server.settle, args=(20.0,))
     settling.start()
     assert gate.entered.acquire(timeout=30)
@@ -186,12 +186,12 @@ def test_a_merge_that_fails_is_logged_and_the_next_one_succeeds(
 
     with monkeypatch.context() as patch:
         patch.setattr(Merger, "merged", broken)
-        served.server._upkeep._dirty = True
+        served.server._worker._dirty = True
         assert served.server.settle(20)
     assert "merging failed" in caplog.text
     assert "merging failed" in str(served.server.status()["event"])
     served.quick_ones()
-    served.server._upkeep._dirty = True
+    served.server._worker._dirty = True
     assert served.server.settle(20)
     assert "merging failed" not in str(served.server.status()["event"])
     assert not served.where().error
@@ -218,8 +218,8 @@ def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
             if number % 3 == 2:
                 index.remove(NodeId("x", 1, number - 1))
         stop.set()
-        for one in searches:
-            one.result(20)
+        for searche in searches:
+            searche.result(20)
     alone = PlaceIndex()
     for number in range(120):
         if number % 3 != 1:

@@ -65,8 +65,8 @@ def sound_logs() -> dict[MapId, list[bytes]]:
     return out
 
 
-def messages(map_id: MapId, bodies: list[ChangeBody]) -> list[bytes]:
-    return [encode_change(Change(map_id, k + 1, 0, body)) for k, body in enumerate(bodies)]
+def messages(map_id: MapId, changes: list[ChangeBody]) -> list[bytes]:
+    return [encode_change(Change(map_id, k + 1, 0, body)) for k, body in enumerate(changes)]
 
 
 def stored(path: Path, logs: dict[MapId, list[bytes]]) -> Store:
@@ -224,14 +224,14 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
         status = fleet.status()
         assert (status["set_apart"], status["links"], status["event"]) == (1, links, words)
         assert told(fleet.where()) == places
-        assert [one.words for one in fleet.server.history()].count(words) == 1
+        assert [event.words for event in fleet.server.history()].count(words) == 1
     caplog.clear()
     with serving(path) as fleet:
         status = fleet.status()
         assert (status["set_apart"], status["links"], status["event"]) == (1, links, words)
         assert told(fleet.where()) == places
         # It was said before.
-        assert [one.words for one in fleet.server.history()].count(words) == 1
+        assert [event.words for event in fleet.server.history()].count(words) == 1
         retire = ManualConstraint((BAD, BAD), True, "anna", 10**18, "it is mad")
         reply = fleet.ask(KEYS.rule("s0"), encode(retire))
         assert not reply.error
@@ -362,39 +362,39 @@ def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Besi
 
 def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
     """It puts one of its nodes 200 times a second."""
-    upkeep = MergeWorker(LiveSchedule(), 1.0)
-    upkeep.start()
+    worker = MergeWorker(LiveSchedule(), 1.0)
+    worker.start()
     stop = threading.Event()
     logs = {one: [decode_change(message) for message in log] for one, log in sound_logs().items()}
 
     def hurry() -> None:
         puts = [change for change in logs[SOUND[0]] if isinstance(change.body, NodePut)]
         while not stop.wait(0.005):
-            upkeep.take(puts[0])
+            worker.take(puts[0])
 
     for change in logs[SOUND[0]]:
-        upkeep.take(change)
+        worker.take(change)
     hurrying = threading.Thread(target=hurry)
     hurrying.start()
     try:
         time.sleep(0.5)
         for change in logs[SOUND[1]]:
-            upkeep.take(change)
-        eventually(lambda: len(upkeep.answers.merged.links) > 1, 20.0)
-        assert len(upkeep.answers.merged.maps) == 2
+            worker.take(change)
+        eventually(lambda: len(worker.answers.merged.links) > 1, 20.0)
+        assert len(worker.answers.merged.maps) == 2
     finally:
         stop.set()
         hurrying.join()
-        upkeep.close()
+        worker.close()
 
 
 def test_the_last_waiting_write_of_a_node_counts() -> None:
-    upkeep = MergeWorker(LiveSchedule(), 1.0)
+    worker = MergeWorker(LiveSchedule(), 1.0)
     nodes = [replace(node(1), stamp_ns=k) for k in range(50)]
     for k, one in enumerate(nodes):
-        upkeep.take(Change(BAD, k + 1, 0, NodePut(one)))
-    upkeep.start()
-    assert upkeep.settle(30) and upkeep.settled
-    assert upkeep.answers.merged.maps[BAD].nodes[NodeId(*BAD, 1)] is nodes[-1]
-    assert upkeep._merger.counters.changes == 1
-    upkeep.close()
+        worker.take(Change(BAD, k + 1, 0, NodePut(one)))
+    worker.start()
+    assert worker.settle(30) and worker.settled
+    assert worker.answers.merged.maps[BAD].nodes[NodeId(*BAD, 1)] is nodes[-1]
+    assert worker._merger.counters.changes == 1
+    worker.close()

@@ -13,7 +13,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, Whereabouts
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.wire_limits import Pairs, drivable, said
+from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.messages import decode, encode
 from synthetic.world import take_map
 from tests.mapserver.test_active_nodes import HERE, Two
@@ -44,10 +44,12 @@ def test_values_out_of_range_are_left_out(
     left: tuple[Certainty, list[int]],
 ) -> None:
     candidates = tuple(place(k, *poses) for k, poses in enumerate(places, start=1))
-    answer = said(RelocalizeAnswer(certainty, candidates, "words"))
+    answer = within_range(RelocalizeAnswer(certainty, candidates, "words"))
     back = decode(encode(answer), RelocalizeAnswer)
-    assert (back.certainty, [one.node.number for one in back.candidates]) == left
-    assert all((one.merged_from_robot is None) == (one.component < 0) for one in back.candidates)
+    assert (back.certainty, [candidate.node.number for candidate in back.candidates]) == left
+    assert all(
+        (candidate.merged_from_robot is None) == (candidate.component < 0) for candidate in back.candidates
+    )
 
 
 def test_a_node_where_no_robot_can_be_is_no_second_place() -> None:
@@ -63,7 +65,7 @@ def test_a_node_where_no_robot_can_be_is_no_second_place() -> None:
         two.merger.on_change(Change(C, number, 0, body))
     answer = two.answers().relocalizer.answer(two.view(HERE))
     assert answer.certainty is Certainty.FOUND and answer.candidates[0].node.map == HERE
-    encode(said(answer))
+    encode(within_range(answer))
 
 
 def test_a_view_without_a_heading_is_not_published() -> None:
@@ -71,20 +73,20 @@ def test_a_view_without_a_heading_is_not_published() -> None:
     tour = [Pose2(1.5 + 0.7 * k, 2.0, 0.2 * k) for k in range(4)]
     nodes, edges = take_map(two.worlds[HERE], C, tour, rng)
     merger, own = Merger(), two.merger.maps[HERE].contents()
-    changes = [(HERE, body) for body in own] + [
-        (C, body) for body in (*map(NodePut, nodes), *map(EdgePut, edges))
+    changes = [(HERE, change) for change in own] + [
+        (C, change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))
     ]
-    for number, (map_id, body) in enumerate(changes, start=1):
-        merger.on_change(Change(map_id, number, 0, body))
-    told = Answers.of(merger, merger.merged(), merger.node).known.answer(HERE, (0.0, 0.0), 50.0)
-    assert len(told.views) == 4
+    for number, (map_id, change) in enumerate(changes, start=1):
+        merger.on_change(Change(map_id, number, 0, change))
+    result = Answers.of(merger, merger.merged(), merger.node).known.answer(HERE, (0.0, 0.0), 50.0)
+    assert len(result.views) == 4
     outside = replace(nodes[3], camera=replace(nodes[3].camera, cx=-40.0))
     merger.on_change(Change(C, 90, 0, NodePut(outside)))
     merged = merger.merged()
     assert merged.joined(HERE, C)
-    told = Answers.of(merger, merged, merger.node).known.answer(HERE, (0.0, 0.0), 50.0)
-    encode(told)
-    assert len(told.views) == 3
+    result = Answers.of(merger, merged, merger.node).known.answer(HERE, (0.0, 0.0), 50.0)
+    encode(result)
+    assert len(result.views) == 3
 
 
 def test_a_route_goes_around_legs_that_no_robot_drives() -> None:

@@ -15,11 +15,11 @@ CAMERA = "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m 
 def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     """The message of a failing command: exactly one line."""
     assert main([str(a) for a in arguments]) == 1
-    said = capfd.readouterr().err.splitlines()
-    assert len(said) == 1, said
-    assert said[0].startswith("mapweave: ")
-    assert len(said[0]) < 400
-    return said[0]
+    output = capfd.readouterr().err.splitlines()
+    assert len(output) == 1, output
+    assert output[0].startswith("mapweave: ")
+    assert len(output[0]) < 400
+    return output[0]
 
 
 def commands(runnable: bool = False) -> list[str]:

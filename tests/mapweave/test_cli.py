@@ -43,14 +43,14 @@ def test_a_wrong_use_shows_how_to_use_it(arguments, capfd):
 
 @pytest.mark.parametrize("name", ["R0", "a b", "", "r0/1", "*", "ä", "x" * 33, "-x"])
 def test_names_that_cannot_be_in_a_key(name, capfd, recording, nobody, tmp_path):
-    said = complaint(capfd, "agent", "--", name)
-    assert "use 1 to 32 of a-z" in said
+    output = complaint(capfd, "agent", "--", name)
+    assert "use 1 to 32 of a-z" in output
     if name:
         assert "use 1 to 32 of a-z" in complaint(capfd, "agent", "r0", "--connect", nobody, f"--fleet={name}")
         assert "use 1 to 32 of a-z" in complaint(capfd, "replay", recording, "--offline", f"--name={name}")
         data = tmp_path / "data"
-        said = complaint(capfd, "server", "--listen", nobody, f"--name={name}", "--data", data)
-        assert "use 1 to 32 of a-z" in said
+        output = complaint(capfd, "server", "--listen", nobody, f"--name={name}", "--data", data)
+        assert "use 1 to 32 of a-z" in output
         assert not data.exists(), "nothing is left behind"
 
 
@@ -59,8 +59,8 @@ def test_names_that_cannot_be_in_a_key(name, capfd, recording, nobody, tmp_path)
     ["--robots=1", "--rooms=99", "--seed=-1"],
 )
 def test_demos_out_of_range(arguments, capfd, tmp_path):
-    said = complaint(capfd, "demo", arguments, "--out", tmp_path)
-    assert arguments.replace("=", " ") in said
+    output = complaint(capfd, "demo", arguments, "--out", tmp_path)
+    assert arguments.replace("=", " ") in output
 
 
 @pytest.mark.parametrize(
@@ -89,12 +89,12 @@ def test_a_batch_names_its_failures(capfd, tmp_path):
     )
     arguments = ["sim", "batch", path, "--seeds", 2, "--first", 4, "--one-process", "--out", tmp_path / "out"]
     assert main([str(a) for a in arguments]) == 2
-    said = capfd.readouterr()
-    assert "seed 4: nodes is" in said.err
-    assert "seed 5: nodes is" in said.err
+    output = capfd.readouterr()
+    assert "seed 4: nodes is" in output.err
+    assert "seed 5: nodes is" in output.err
     assert main([str(a) for a in [*arguments, "--json"]]) == 2
-    found = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
-    assert found == json.loads((tmp_path / "out" / "batch.json").read_text())
+    values = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
+    assert values == json.loads((tmp_path / "out" / "batch.json").read_text())
     assert "seeds" in complaint(capfd, "sim", "batch", path, "--seeds", 0)
     assert "--first -1: use 0 or more" in complaint(capfd, "sim", "batch", path, "--first", -1)
 
@@ -124,19 +124,19 @@ def test_a_trial_prints_one_json_object(capfd, tmp_path):
 
 def test_a_live_view_at_no_port_starts_no_fleet(capfd, tmp_path):
     for port in (-1, 65536):
-        said = complaint(capfd, "sim", "run", "office", f"--view={port}", "--out", tmp_path / "out")
-        assert f"--view {port}: a port is 0 to 65535" in said
+        output = complaint(capfd, "sim", "run", "office", f"--view={port}", "--out", tmp_path / "out")
+        assert f"--view {port}: a port is 0 to 65535" in output
     assert not (tmp_path / "out").exists()
 
 
 def test_an_epoch_out_of_range(capfd, recording, tmp_path, nobody):
     for epoch in (-1, 2**60):
         data = tmp_path / f"agent{epoch}"
-        said = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", data, f"--epoch={epoch}")
-        assert "epoch" in said and not data.exists(), "before any body is waited for"
+        output = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", data, f"--epoch={epoch}")
+        assert "epoch" in output and not data.exists(), "before any body is waited for"
         data = tmp_path / str(epoch)
-        said = complaint(capfd, "replay", recording, "--offline", "--data", data, f"--epoch={epoch}")
-        assert "epoch" in said
+        output = complaint(capfd, "replay", recording, "--offline", "--data", data, f"--epoch={epoch}")
+        assert "epoch" in output
 
 
 # As processes

@@ -51,19 +51,19 @@ def test_endless_input_is_not_read(tmp_path, capfd, pipe):
 
 def test_a_map_with_singular_and_huge_covariances_is_solved(tmp_path):
     """Covariances are bounded when they are written, so no pose is left without one."""
-    bodies = []
+    changes = []
     for number in (1, 3, 5):
         here = PoseGaussian(Pose2(number, 0, 0), np.eye(3) * 1e-4)
         camera = Camera(160, 120, 150, 150, 80, 60, 0.3)
         nothing = Landmarks.empty()
-        bodies.append(NodePut(Node(NodeId("r0", 1, number), 0, here, camera, nothing)))
+        changes.append(NodePut(Node(NodeId("r0", 1, number), 0, here, camera, nothing)))
     v = np.array([1.0, -2.0, 0.5])
     for a, b in ((1, 3), (3, 5)):
         moved = PoseGaussian(Pose2(2, 0, 0), np.outer(v, v) * 1e11)
         ends = NodeId("r0", 1, a), NodeId("r0", 1, b)
-        bodies.append(EdgePut(Edge(NodeId("r0", 1, a + 1), *ends, moved, EdgeKind.MAPPED)))
+        changes.append(EdgePut(Edge(NodeId("r0", 1, a + 1), *ends, moved, EdgeKind.MAPPED)))
     path = tmp_path / "odd.mapweave"
-    write_map_file(path, MapFile("agent", "r0.1", tuple(bodies)))
+    write_map_file(path, MapFile("agent", "r0.1", tuple(changes)))
     out = tmp_path / "map.g2o"
     assert main(["map", "export", str(path), "--to", "g2o", "-o", str(out)]) == 0
     assert out.read_text().count("VERTEX_SE2") == 3
@@ -83,8 +83,8 @@ def test_settings(tmp_path, capfd, recording):
         assert "did you mean 'network'?" in complaint(capfd, *command, "--settings", path)
         path.write_text("[network")
         assert "robot.toml" in complaint(capfd, *command, "--settings", path)
-        said = complaint(capfd, *command, "--settings", tmp_path)
-        assert said.count(str(tmp_path)) == 1 and "Errno" not in said
+        output = complaint(capfd, *command, "--settings", tmp_path)
+        assert output.count(str(tmp_path)) == 1 and "Errno" not in output
 
 
 def test_recordings(tmp_path, capfd, recording):
@@ -98,11 +98,11 @@ def test_an_image_of_a_recording_that_is_broken(tmp_path, capfd, recording):
     (recording / "images" / "1.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 50)
     arguments = ["replay", recording, "--offline", "--data", tmp_path / "data", "--epoch", 1]
     assert main([str(a) for a in arguments]) == 1
-    said = capfd.readouterr().err.splitlines()
-    (line,) = [line for line in said if line.startswith("mapweave: ")]
+    output = capfd.readouterr().err.splitlines()
+    (line,) = [line for line in output if line.startswith("mapweave: ")]
     assert "1.png: not an image that can be read" in line
-    assert said[-1] == line
-    assert not any("Traceback" in line for line in said)
+    assert output[-1] == line
+    assert not any("Traceback" in line for line in output)
     assert (tmp_path / "data" / "walk.1.mapweave").exists(), "what was mapped before is kept"
 
 
@@ -118,8 +118,8 @@ def test_places_that_cannot_be_written(tmp_path, capfd, recording, nobody):
             ["eval", "relocalize", recording],
             ["eval", "merge", recording],
         ):
-            said = complaint(capfd, *command, "--out", folder)
-            assert f"{taken}: is a file; give a folder" in said, "before anything is measured"
+            output = complaint(capfd, *command, "--out", folder)
+            assert f"{taken}: is a file; give a folder" in output, "before anything is measured"
     path = tmp_path / "a.mapweave"
     write_map_file(path, MapFile("agent", "r0.1", one_node()))
     assert str(taken) in complaint(capfd, "map", "show", path, "--out", taken / "a.png")

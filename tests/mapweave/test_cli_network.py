@@ -32,27 +32,27 @@ def test_endpoints(endpoint, capfd, recording, tmp_path):
 
 
 def test_a_port_that_is_taken(capfd, port, tmp_path):
-    said = complaint(capfd, "server", "--listen", f"tcp/127.0.0.1:{port}", "--data", tmp_path)
-    assert f"cannot listen at tcp/127.0.0.1:{port}: the port is taken" in said
+    output = complaint(capfd, "server", "--listen", f"tcp/127.0.0.1:{port}", "--data", tmp_path)
+    assert f"cannot listen at tcp/127.0.0.1:{port}: the port is taken" in output
 
 
 def test_a_port_for_people_that_is_taken(capfd, port, nobody, tmp_path):
-    said = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "a", "--http", port)
-    assert f"cannot listen at http 127.0.0.1:{port}: the port is taken" in said
-    said = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "b", "--http", "here")
-    assert "write a port, or HOST:PORT" in said
+    output = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "a", "--http", port)
+    assert f"cannot listen at http 127.0.0.1:{port}: the port is taken" in output
+    output = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "b", "--http", "here")
+    assert "write a port, or HOST:PORT" in output
     assert not (tmp_path / "b").exists()
 
 
 def test_an_address_of_another_machine(capfd, tmp_path):
-    said = complaint(capfd, "server", "--listen", "tcp/192.0.2.1:7447", "--data", tmp_path)
-    assert "cannot listen at tcp/192.0.2.1:7447" in said
+    output = complaint(capfd, "server", "--listen", "tcp/192.0.2.1:7447", "--data", tmp_path)
+    assert "cannot listen at tcp/192.0.2.1:7447" in output
 
 
 def test_asking_without_a_server(capfd, recording, nobody):
     picture = recording / "images" / "0.png"
-    said = complaint(capfd, "relocalize", picture, "--connect", nobody, "--timeout", "0.3")
-    assert f"no router at {nobody}: start `mapweave server`" in said
+    output = complaint(capfd, "relocalize", picture, "--connect", nobody, "--timeout", "0.3")
+    assert f"no router at {nobody}: start `mapweave server`" in output
 
 
 def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
@@ -66,8 +66,8 @@ def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
     for known in (camera, []):
         assert "b.png: no such file" in complaint(capfd, "relocalize", tmp_path / "b.png", *known)
     for seconds in ("0", "-1", "nan", "inf"):
-        said = complaint(capfd, "relocalize", lonely, *camera, f"--timeout={seconds}")
-        assert f"--timeout {seconds}: give seconds" in said
+        output = complaint(capfd, "relocalize", lonely, *camera, f"--timeout={seconds}")
+        assert f"--timeout {seconds}: give seconds" in output
     lonely.write_text("no image")
     assert "not an image" in complaint(capfd, "relocalize", lonely, *camera, *rest)
     assert "not an image" in complaint(capfd, "relocalize", tmp_path, *camera, *rest)
@@ -84,9 +84,9 @@ def test_an_agent_interrupted_before_its_base_answers_reports_it(nobody, tmp_pat
         watchdog.start()
         eventually(lambda: (tmp_path / "r0.sqlite").exists())
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate()
+        _, output = process.communicate()
         watchdog.cancel()
-    *before, last = said.splitlines()
+    *before, last = output.splitlines()
     assert last.endswith("robot/r0/describe: stopped before its base has answered")
     assert all("waits for its robot" in line or "finds no router" in line for line in before)
     assert process.returncode == 1

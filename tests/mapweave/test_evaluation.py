@@ -94,13 +94,13 @@ def report(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict:
 
 
 def test_a_drive(drive: Path, capfd, tmp_path: Path) -> None:
-    found = report(capfd, drive, "--out", tmp_path / "out")
-    assert (found["queries"], found["expected"]) == (12, 9)
-    assert found["nodes"] >= 1
-    assert found["recall_at_1"] >= 0.8
-    assert (found["precision"], found["false_accept"]) == (1.0, 0.0)
-    assert found["error_m_median"] < 0.1
-    assert found["error_deg_median"] < 1.0
+    values = report(capfd, drive, "--out", tmp_path / "out")
+    assert (values["queries"], values["expected"]) == (12, 9)
+    assert values["nodes"] >= 1
+    assert values["recall_at_1"] >= 0.8
+    assert (values["precision"], values["false_accept"]) == (1.0, 0.0)
+    assert values["error_m_median"] < 0.1
+    assert values["error_deg_median"] < 1.0
     with (tmp_path / "out" / "answers-depths.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 12
@@ -116,50 +116,58 @@ def test_a_drives_error_is_measured_against_its_truth(drive: Path, capfd, tmp_pa
         stamp, x, y, heading = row.split(",")
         moved.append(f"{stamp},{x},{float(y) + 7.0},{heading}")
     (folder / "truth.csv").write_text("\n".join(moved) + "\n")
-    found = report(capfd, folder)
-    assert found["error_m_median"] == pytest.approx(7.0, abs=0.2)
-    assert (found["expected"], found["recall_at_1"], found["precision"]) == (0, None, 0.0)
-    assert found["false_accept"] > 0.5
+    values = report(capfd, folder)
+    assert values["error_m_median"] == pytest.approx(7.0, abs=0.2)
+    assert (values["expected"], values["recall_at_1"], values["precision"]) == (0, None, 0.0)
+    assert values["false_accept"] > 0.5
     (folder / "truth.csv").unlink()
-    found = report(capfd, folder)
-    assert (found["truth"], found["precision"], found["false_accept"]) == (False, None, None)
-    assert found["found"] >= 7
+    values = report(capfd, folder)
+    assert (values["truth"], values["precision"], values["false_accept"]) == (False, None, None)
+    assert values["found"] >= 7
 
 
 def test_photographs(walk: Path, capfd, tmp_path: Path) -> None:
-    found = report(capfd, walk, "--focal", 300, "--out", tmp_path / "out")
-    assert (found["queries"], found["expected"], found["nodes"]) == (4, 3, 3)
-    assert (found["recall_at_1"], found["precision"], found["unknown_share"]) == (1.0, 1.0, 0.25)
-    assert (found["error_frames_median"], found["false_accept"]) == (0.0, 0.0)
+    values = report(capfd, walk, "--focal", 300, "--out", tmp_path / "out")
+    assert (values["queries"], values["expected"], values["nodes"]) == (4, 3, 3)
+    assert (values["recall_at_1"], values["precision"], values["unknown_share"]) == (1.0, 1.0, 0.25)
+    assert (values["error_frames_median"], values["false_accept"]) == (0.0, 0.0)
     assert (tmp_path / "out" / "answers-looks.csv").exists()
     # Two references changed over: what was right is wrong.
     table = (walk / "lap_truth.csv").read_text()
     (walk / "lap_truth.csv").write_text(table.replace("11,1,1,1", "11,2,2,2").replace("12,2,2,2", "12,1,1,1"))
     (walk / "camera.toml").write_text(CAMERA_TOML)
-    found = report(capfd, walk)
-    assert (found["recall_at_1"], found["precision"]) == (pytest.approx(1 / 3, abs=1e-4),) * 2
+    values = report(capfd, walk)
+    assert (values["recall_at_1"], values["precision"]) == (pytest.approx(1 / 3, abs=1e-4),) * 2
 
 
 def test_figures_by_hand() -> None:
-    found, unknown, ambiguous = Certainty.FOUND, Certainty.UNKNOWN, Certainty.AMBIGUOUS
+    result, unknown, ambiguous = Certainty.FOUND, Certainty.UNKNOWN, Certainty.AMBIGUOUS
     verdicts = [
-        Verdict("1", True, found, "a", True, True, error_m=0.2, error_deg=1.0, answer_ms=10.0),
-        Verdict("2", True, found, "a", True, True, error_m=0.4, error_deg=3.0, answer_ms=20.0),
-        Verdict("3", True, found, "b", False, False, error_m=9.0, error_deg=3.0, answer_ms=30.0),
+        Verdict("1", True, result, "a", True, True, error_m=0.2, error_deg=1.0, answer_ms=10.0),
+        Verdict("2", True, result, "a", True, True, error_m=0.4, error_deg=3.0, answer_ms=20.0),
+        Verdict("3", True, result, "b", False, False, error_m=9.0, error_deg=3.0, answer_ms=30.0),
         Verdict("4", True, unknown, first=True),
         Verdict("5", True, ambiguous, "a", True, True),
-        Verdict("6", False, found, "a", False, False, error_m=30.0, error_deg=90.0),
+        Verdict("6", False, result, "a", False, False, error_m=30.0, error_deg=90.0),
         Verdict("7", False, unknown, first=False),
-        Verdict("8", None, found, "a"),
+        Verdict("8", None, result, "a"),
     ]
-    told = figures(verdicts)
-    assert (told["queries"], told["expected"], told["found"]) == (8, 5, 5)
-    assert (told["recall_at_1"], told["retrieved_at_1"], told["precision"]) == (0.4, 0.8, 0.5)
-    assert (told["unknown_share"], told["ambiguous_share"], told["false_accept"]) == (0.25, 0.125, 0.5)
-    assert (told["recall_0.25m_2deg"], told["recall_0.5m_5deg"], told["recall_5m_10deg"]) == (0.2, 0.4, 0.4)
-    assert told["error_m_median"] == 4.7
-    assert told["answer_ms_p50"] == 20.0
-    assert "error_frames_median" not in told
+    outcome = figures(verdicts)
+    assert (outcome["queries"], outcome["expected"], outcome["found"]) == (8, 5, 5)
+    assert (outcome["recall_at_1"], outcome["retrieved_at_1"], outcome["precision"]) == (0.4, 0.8, 0.5)
+    assert (outcome["unknown_share"], outcome["ambiguous_share"], outcome["false_accept"]) == (
+        0.25,
+        0.125,
+        0.5,
+    )
+    assert (outcome["recall_0.25m_2deg"], outcome["recall_0.5m_5deg"], outcome["recall_5m_10deg"]) == (
+        0.2,
+        0.4,
+        0.4,
+    )
+    assert outcome["error_m_median"] == 4.7
+    assert outcome["answer_ms_p50"] == 20.0
+    assert "error_frames_median" not in outcome
 
 
 def test_evidence_bounds_chance() -> None:
@@ -176,9 +184,9 @@ def test_evidence_bounds_chance() -> None:
 
 def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     assert main(["eval", "relocalize", *map(str, arguments)]) == 1
-    said = [line for line in capfd.readouterr().err.splitlines() if line.startswith("mapweave: ")]
-    assert len(said) == 1
-    return said[0]
+    output = [line for line in capfd.readouterr().err.splitlines() if line.startswith("mapweave: ")]
+    assert len(output) == 1
+    return output[0]
 
 
 def test_folders_that_are_none(walk: Path, capfd, tmp_path: Path) -> None:

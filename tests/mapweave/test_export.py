@@ -42,8 +42,8 @@ def merged() -> MergedMap:
     for agent, x in (("r0", 0), ("r1", 0), ("r2", 20)):
         stops = [Pose2(x + 2.4 + 0.1 * k, 2.0, 0.7 * k) for k in range(6)]
         nodes, edges = take_map(world, MapId(agent, 1), stops, rng)
-        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(MapId(agent, 1), body)
+        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(MapId(agent, 1), change)
     return merger.merged()
 
 
@@ -59,9 +59,9 @@ def test_gtsam_reads_the_pose_graph_and_is_at_its_optimum(part: MapPart, tmp_pat
     assert values.size() == len(part.nodes)
     measurements = part.measurements
     for node, number in part.numbers.items():
-        pose, ours = values.atPose2(number), part.pose(node)
-        assert np.allclose([pose.x(), pose.y()], [ours.x, ours.y], atol=1e-9)
-        assert abs(math.remainder(pose.theta() - ours.heading, math.tau)) < 1e-9
+        pose, own = values.atPose2(number), part.pose(node)
+        assert np.allclose([pose.x(), pose.y()], [own.x, own.y], atol=1e-9)
+        assert abs(math.remainder(pose.theta() - own.heading, math.tau)) < 1e-9
     expected = 0.0
     for m in measurements:
         off = (m.a_from_b.mean.inverse() @ part.pose(m.a).inverse() @ part.pose(m.b)).vector
@@ -150,11 +150,11 @@ def test_nav2_is_led_as_robots_are(merged: MergedMap, tmp_path: Path) -> None:
     part = MapPart(replace(merged, faded={blind: np.ones(count, np.bool_)}))
     (path,) = FORMATS["geojson"](part, tmp_path / "map.geojson")
     features = json.loads(path.read_text())["features"]
-    told = [f["properties"]["metadata"] for f in features if f["geometry"]["type"] != "Point"]
+    collected = [f["properties"]["metadata"] for f in features if f["geometry"]["type"] != "Point"]
     closed = {link.edge().id for link in merged.links if blind in link.pair}
-    kinds = Counter(one["kind"] for one in told)
-    assert closed and {one["edge"] for one in told}.isdisjoint(map(str, closed))
-    assert len(told) - kinds["near"] - kinds["superseded"] == 2 * (len(part.graph.edges) - len(closed))
+    kinds = Counter(item["kind"] for item in collected)
+    assert closed and {item["edge"] for item in collected}.isdisjoint(map(str, closed))
+    assert len(collected) - kinds["near"] - kinds["superseded"] == 2 * (len(part.graph.edges) - len(closed))
     drivable = {frozenset((e.a, e.b)) for e in part.graph.edges.values() if e.id not in closed}
     near = [
         pair for pair in combinations(part.nodes, 2)
@@ -197,9 +197,9 @@ def test_g2o_comes_back_to_the_last_bit(
     write_g2o(tmp_path / "x.g2o", graph, {0: "r0.1.1"})
     back = read_g2o(tmp_path / "x.g2o")
     assert back.poses == graph.poses and back.fixed == (1,) and len(back.edges) == len(drawn)
-    for one, two in zip(back.edges, drawn, strict=True):
-        assert (one.i, one.j, one.i_from_j) == (two.i, two.j, two.i_from_j)
-        assert np.array_equal(one.information, two.information)
+    for first, second in zip(back.edges, drawn, strict=True):
+        assert (first.i, first.j, first.i_from_j) == (second.i, second.j, second.i_from_j)
+        assert np.array_equal(first.information, second.information)
 
 
 def square(noise: float, seed: int) -> G2oGraph:
@@ -230,9 +230,9 @@ def test_the_back_end_finds_gtsam_s_optimum_of_others_graphs(
     assert "what is written is a pose graph, no map" in capfd.readouterr().err and not wrong.exists()
     arguments = ["map", "import", str(tmp_path / "in.g2o"), "-o", str(tmp_path / "out.g2o"), "--json"]
     assert main(arguments) == 0
-    told = json.loads(capfd.readouterr().out)
-    assert told["chi2"] == pytest.approx(best, rel=1e-5) and told["chi2_before"] > 2 * told["chi2"]
-    assert read_g2o(tmp_path / "out.g2o").chi2() == pytest.approx(told["chi2"])
+    result = json.loads(capfd.readouterr().out)
+    assert result["chi2"] == pytest.approx(best, rel=1e-5) and result["chi2_before"] > 2 * result["chi2"]
+    assert read_g2o(tmp_path / "out.g2o").chi2() == pytest.approx(result["chi2"])
 
 
 def test_vertices_without_a_line_are_placed_along_edges(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ CASES: list[tuple[str, str, str]] = [
     ("map route", "r0.1.1 r0.1.3 --map {merged}", SERVER),
     ("map route", "r0.1.1 r0.1.3 --map {merged} --draw {tmp}/way.png", VIZ),
     ("map history", "--connect {nobody} --timeout 0.1", WITHOUT_SERVER),
-    ("map history", "--map {merged}", "nothing has joined"),
+    ("map history", "--map {merged}", "no joins"),
     ("map unmerge", "r0.1 r1.1 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
     ("map unmerge", "r0.1 r1.1 --map {merged} --out {tmp}/apart.mapweave", SERVER),
     ("map retire", "r0.1 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),

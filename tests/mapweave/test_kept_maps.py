@@ -96,16 +96,16 @@ def test_agents_that_are_killed_begun_afresh_and_robbed_of_their_disk_lose_no_ma
 
     def mapped(nodes: int) -> AgentStatus:
         """Wait until a map has so many nodes, all of them on the server's disk."""
-        found: list[AgentStatus] = []
+        collected: list[AgentStatus] = []
 
         def done() -> bool:
             now = report()
             if now is not None and now.status.nodes >= nodes and now.unsent == 0:
-                found.append(now)
-            return bool(found)
+                collected.append(now)
+            return bool(collected)
 
         eventually(done, PATIENCE)
-        return found[0]
+        return collected[0]
 
     start()
     first = mapped(2)
@@ -166,15 +166,15 @@ def renumbered(epoch: int):
 def test_maps_of_a_journal_are_extracted_and_no_file_is_written_over(tmp_path, capfd):
     source = journal_with(tmp_path / "r0.sqlite", 1, 4, 9)
     assert main(["map", "extract", str(source), "-o", str(tmp_path / "out")]) == 0
-    said = capfd.readouterr().out
-    assert f"{tmp_path / 'out' / 'r0.4.mapweave'}: 1 nodes, 0 edges" in said
-    assert "r0.9: empty, not written" in said
+    output = capfd.readouterr().out
+    assert f"{tmp_path / 'out' / 'r0.4.mapweave'}: 1 nodes, 0 edges" in output
+    assert "r0.9: empty, not written" in output
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["r0.1.mapweave", "r0.4.mapweave"]
     (tmp_path / "out" / "r0.1.mapweave").unlink()
     kept = tmp_path / "out" / "r0.4.mapweave"
     kept.write_bytes(b"mine")
-    said = complaint(capfd, "map", "extract", source, "-o", tmp_path / "out")
-    assert "r0.4.mapweave: is there already; choose another folder with -o" in said
+    output = complaint(capfd, "map", "extract", source, "-o", tmp_path / "out")
+    assert "r0.4.mapweave: is there already; choose another folder with -o" in output
     assert kept.read_bytes() == b"mine"
     assert not (tmp_path / "out" / "r0.1.mapweave").exists(), "all or nothing"
 
@@ -216,8 +216,8 @@ def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, 
 
 
 def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, nobody, simulator):
-    said = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", tmp_path, "--resume", "r0.3")
-    assert "there is no journal of r0" in said
+    output = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", tmp_path, "--resume", "r0.3")
+    assert "there is no journal of r0" in output
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 
 

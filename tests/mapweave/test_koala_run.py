@@ -104,8 +104,8 @@ def test_a_koala_maps_is_carried_off_and_parks(
 
                 def agent(condition):
                     """Whether its status says so; one that does not answer in time is asked again."""
-                    told = reports.agents(["r0"])
-                    return "r0" in told and condition(told["r0"].status)
+                    result = reports.agents(["r0"])
+                    return "r0" in result and condition(result["r0"].status)
 
                 wait_for(lambda: agent(lambda status: True), 40, "no agent")
                 time.sleep(EXPLORE)

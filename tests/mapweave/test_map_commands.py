@@ -49,9 +49,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Each robot's own map, and the merged one last."""
     folder = tmp_path_factory.mktemp("maps")
     paths = []
-    for map_id, bodies in logs().items():
+    for map_id, changes in logs().items():
         paths.append(folder / f"{map_id.agent}.mapweave")
-        write_map_file(paths[-1], MapFile("agent", str(map_id), tuple(bodies)))
+        write_map_file(paths[-1], MapFile("agent", str(map_id), tuple(changes)))
     merged = folder / "merged.mapweave"
     assert main(["map", "merge", *map(str, paths), "-o", str(merged)]) == 0
     return [*paths, merged]
@@ -80,9 +80,11 @@ def test_merging_prints_joined_and_separate_maps(files: list[Path], said: Said, 
     out = said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave")
     assert "12 nodes, 3 maps, 2 components" in out and "r0.1 and r1.1 are one map now, by " in out
     assert "r0.1 and r2.1 are not one map: " in out
-    told = json.loads(said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave", "--json"))
-    assert told["maps"] == ["r0.1", "r1.1", "r2.1"] and told["components"] == 2 and len(told["apart"]) == 2
-    assert told["links"] == len(links(files[3]))
+    values = json.loads(said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave", "--json"))
+    assert (
+        values["maps"] == ["r0.1", "r1.1", "r2.1"] and values["components"] == 2 and len(values["apart"]) == 2
+    )
+    assert values["links"] == len(links(files[3]))
 
 
 def test_merging_in_steps_is_merging_at_once(files: list[Path], said: Said, tmp_path: Path) -> None:
@@ -94,8 +96,8 @@ def test_merging_in_steps_is_merging_at_once(files: list[Path], said: Said, tmp_
 def test_how_maps_are_merged_can_be_chosen(files: list[Path], said: Said, tmp_path: Path) -> None:
     path, out = tmp_path / "strict.toml", tmp_path / "m.mapweave"
     path.write_text("[merge.consistency]\nleast_links = 1000\noverwhelming_inliers = 1000\n")
-    told = said("map", "merge", *files[:3], "-o", out, "--json", "--settings", path)
-    assert json.loads(told)["links"] == 0
+    result = said("map", "merge", *files[:3], "-o", out, "--json", "--settings", path)
+    assert json.loads(result)["links"] == 0
     path.write_text("[merge.consistency]\ngate = 'much'\n")
     assert main(["map", "merge", *map(str, files[:3]), "-o", str(out), "--settings", str(path)]) == 1
 
@@ -119,20 +121,20 @@ def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path: 
     # The first colours of the scale, that of lines with small residuals, are really there.
     blue, green, red = (image[..., k].astype(int) for k in range(3))
     assert ((blue - green > 40) & (red - green > 20)).sum() > 500
-    told = json.loads(said("map", "explain", *pair[::-1], "--map", files[3], "--json"))
-    assert told["standing"] == "linked" and len(told["shared"]) == len(told["residuals_px"])
-    assert np.shape(told["a_from_b"]["covariance"]) == (3, 3)
+    values = json.loads(said("map", "explain", *pair[::-1], "--map", files[3], "--json"))
+    assert values["standing"] == "linked" and len(values["shared"]) == len(values["residuals_px"])
+    assert np.shape(values["a_from_b"]["covariance"]) == (3, 3)
 
 
 def test_a_route_is_explained(
     files: list[Path], said: Said, capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     start, goal = links(files[3])[0]
-    told = json.loads(said("map", "route", start, goal, "--json", "--map", files[3]))
-    assert told["found"] and told["hops"][0]["a"] == str(start) and told["hops"][-1]["b"] == str(goal)
+    values = json.loads(said("map", "route", start, goal, "--json", "--map", files[3]))
+    assert values["found"] and values["hops"][0]["a"] == str(start) and values["hops"][-1]["b"] == str(goal)
     out = said("map", "route", start, goal, "--map", files[3])
-    assert out.startswith(f"{start} to {goal}: the route is: {told['reason']}")
-    assert len(out.splitlines()) == 1 + len(told["hops"])
+    assert out.startswith(f"{start} to {goal}: the route is: {values['reason']}")
+    assert len(out.splitlines()) == 1 + len(values["hops"])
     drawn = tmp_path / "pictures" / "way.png"
     out = said("map", "route", start, goal, "--map", files[3], "--draw", drawn)
     assert out.endswith(f"picture   {drawn}\n")
@@ -152,8 +154,8 @@ def test_a_route_is_explained(
 
 
 def test_maps_are_explained(files: list[Path], said: Said) -> None:
-    told = json.loads(said("map", "explain", "--map", files[3], "--json"))["maps"]
-    assert [(one["first"], one["second"], one["joined"]) for one in told] == [
+    values = json.loads(said("map", "explain", "--map", files[3], "--json"))["maps"]
+    assert [(item["first"], item["second"], item["joined"]) for item in values] == [
         ("r0.1", "r2.1", False), ("r1.1", "r2.1", False), ("r0.1", "r1.1", True),
     ]  # fmt: skip
     assert "are one map: " in said("map", "explain", "r1.1", "r0.1", "--map", files[3])
@@ -181,7 +183,7 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     # The history of a file is kept in files made of it, once.
     said("map", "merge", path, files[3], "-o", tmp_path / "again.mapweave")
     assert said("map", "history", "--map", tmp_path / "again.mapweave").splitlines() == lines
-    assert said("map", "history", "--map", files[3]).startswith("nothing has joined")
+    assert said("map", "history", "--map", files[3]).startswith("no joins")
     pair = links(path)[0]
     said("map", "unmerge", *pair, "--map", path, "-o", tmp_path / "one.mapweave")
     assert links(tmp_path / "one.mapweave") == [other for other in links(path) if other != pair]
@@ -254,7 +256,7 @@ def test_of_an_older_and_a_newer_file_the_newer_counts(
 ) -> None:
     out, older, other = (tmp_path / name for name in ("m.mapweave", "older.mapweave", "other.mapweave"))
     content = read_map_file(files[0])
-    nodes = [body for body in content.changes if isinstance(body, NodePut)]
+    nodes = [change for change in content.changes if isinstance(change, NodePut)]
     write_map_file(older, replace(content, changes=tuple(nodes[:3])))
     for order in ([files[0], older, files[1], files[2]], [files[2], older, files[1], files[0]]):
         words = said("map", "merge", *order, "-o", out)
@@ -266,12 +268,12 @@ def test_of_an_older_and_a_newer_file_the_newer_counts(
     assert out.read_bytes() == files[3].read_bytes()
     assert "taken from" not in said("map", "merge", out, *files[:3], "-o", out)
     assert out.read_bytes() == files[3].read_bytes()
-    moved = [NodePut(replace(body.node, stamp_ns=body.node.stamp_ns + 1)) for body in nodes]
+    moved = [NodePut(replace(change.node, stamp_ns=change.node.stamp_ns + 1)) for change in nodes]
     write_map_file(other, replace(content, changes=tuple(moved[:3])))
     for rival, words in ((other, "two maps of one name"), (older, "")):
         assert main(["map", "merge", str(files[0]), str(rival), "-o", str(tmp_path / "no")]) == bool(words)
         assert words in capfd.readouterr().err
-    less = replace(content, changes=tuple(body for body in content.changes if body is not nodes[0]))
+    less = replace(content, changes=tuple(change for change in content.changes if change is not nodes[0]))
     write_map_file(other, less)
     assert main(["map", "merge", str(files[0]), str(other), "-o", str(tmp_path / "none")]) == 1
     assert "it cannot be decided which is newer" in capfd.readouterr().err
@@ -310,10 +312,10 @@ def serving(folder: Path, port: int) -> Iterator[None]:
 
 def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path: Path) -> None:
     store = Store(tmp_path / "s0.sqlite")
-    for map_id, bodies in logs().items():
+    for map_id, changes in logs().items():
         entries = [
             Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
-            for k, body in enumerate(bodies)
+            for k, body in enumerate(changes)
         ]
         store.apply(map_id, 7, entries, len(entries))
     store.close()
@@ -354,18 +356,18 @@ def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Sa
         assert "r0.1 and r1.1 are one map: " in out
         history = json.loads(said("map", "history", "--json", *at))["history"]
         # What the first server saw, too; a restarted server does not report joined maps again.
-        assert [one["kind"] for one in history] == ["joined", "ruled", "parted", "ruled", "joined"]
+        assert [event["kind"] for event in history] == ["joined", "ruled", "parted", "ruled", "joined"]
         assert "two kitchens" in history[1]["words"] and "two kitchens" in history[2]["words"]
-        assert [one["stamp_ns"] for one in history] == sorted(one["stamp_ns"] for one in history)
+        assert [event["stamp_ns"] for event in history] == sorted(event["stamp_ns"] for event in history)
         lines = said("map", "history", "--most", "2", *at).splitlines()
         assert len(lines) == 3 and lines[0] == "(3 older ones: --most)" and history[-1]["words"] in lines[2]
     log = "".join(path.read_text() for path in (tmp_path / "logs").iterdir())
     assert "r0.1 and r1.1 are no longer one map: " in log
 
 
-def said_or_refused(said: Said, *arguments: object) -> str:
+def said_or_refused(text: Said, *arguments: object) -> str:
     """A server that has only just started knows no maps yet."""
     try:
-        return said(*arguments)
+        return text(*arguments)
     except AssertionError:
         return "known are: none"

@@ -38,13 +38,13 @@ def agent_file(tmp_path: Path) -> Path:
 @pytest.fixture
 def merged_file(tmp_path: Path) -> Path:
     """Two robots' maps that are joined, and a node without a component."""
-    bodies = [*changes("r0"), *changes("r1")]
-    nodes = [body.node for body in bodies if isinstance(body, NodePut)]
+    contents = [*changes("r0"), *changes("r1")]
+    nodes = [change.node for change in contents if isinstance(change, NodePut)]
     near = PoseGaussian.from_sigmas(Pose2(), 0.02, 0.02)
     link = Edge(NodeId("s0", 1, 1), nodes[0].id, NodeId("r1", 1, 1), near, EdgeKind.MERGED)
     poses = {n.id: (1 if n.id == NodeId("r1", 1, 11) else 0, n.map_from_robot) for n in nodes}
     path = tmp_path / "merged.mapweave"
-    write_map_file(path, MapFile("merged", "two robots", (*bodies, EdgePut(link)), poses))
+    write_map_file(path, MapFile("merged", "two robots", (*contents, EdgePut(link)), poses))
     return path
 
 
@@ -53,13 +53,13 @@ def summary(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[str, 
     out, err = capfd.readouterr()
     assert err == ""
     assert len(out.splitlines()) == 1
-    found: dict[str, object] = json.loads(out)
-    return found
+    collected: dict[str, object] = json.loads(out)
+    return collected
 
 
 def test_the_summary_of_an_agents_map(agent_file, capfd):
-    bodies = changes("r0")
-    counts = [len(body.node.landmarks) for body in bodies if isinstance(body, NodePut)]
+    contents = changes("r0")
+    counts = [len(change.node.landmarks) for change in contents if isinstance(change, NodePut)]
     assert summary(capfd, agent_file) == {
         "file": str(agent_file),
         "kind": "agent",
@@ -82,16 +82,16 @@ def test_the_summary_of_an_agents_map(agent_file, capfd):
 
 
 def test_the_summary_of_a_merged_map(merged_file, capfd, tmp_path):
-    found = summary(capfd, merged_file, "--out", tmp_path / "pictures" / "m.png")
-    assert found["kind"] == "merged"
-    assert found["maps"] == ["r0.1", "r1.1"]
-    assert found["nodes"] == 2 * len(TOUR)
-    assert found["edges"] == {"turned": 2 * (len(TOUR) - 1), "merged": 1}
-    assert (found["links"], found["components"]) == (1, 2)
+    values = summary(capfd, merged_file, "--out", tmp_path / "pictures" / "m.png")
+    assert values["kind"] == "merged"
+    assert values["maps"] == ["r0.1", "r1.1"]
+    assert values["nodes"] == 2 * len(TOUR)
+    assert values["edges"] == {"turned": 2 * (len(TOUR) - 1), "merged": 1}
+    assert (values["links"], values["components"]) == (1, 2)
     assert (tmp_path / "pictures" / "m.png").stat().st_size > 5000
-    assert found["drawn"] == f"component 0, {2 * len(TOUR) - 1} nodes"
-    found = summary(capfd, merged_file, "--out", tmp_path / "other.png", "--component", 1)
-    assert found["drawn"] == "component 1, 1 nodes"
+    assert values["drawn"] == f"component 0, {2 * len(TOUR) - 1} nodes"
+    values = summary(capfd, merged_file, "--out", tmp_path / "other.png", "--component", 1)
+    assert values["drawn"] == "component 1, 1 nodes"
     assert (tmp_path / "other.png").read_bytes() != (tmp_path / "pictures" / "m.png").read_bytes()
     assert main(["map", "show", str(merged_file), "--component", "2"]) == 1
     assert "has no component 2; it has 0 to 1" in capfd.readouterr().err
@@ -113,9 +113,9 @@ def test_people_read_lines(agent_file, capfd):
 def test_a_map_of_nothing(tmp_path, capfd):
     path = tmp_path / "empty.mapweave"
     write_map_file(path, MapFile("agent", "nothing", ()))
-    found = summary(capfd, path)
-    assert (found["nodes"], found["edges"], found["components"]) == (0, {}, 0)
-    assert "picture" not in found
+    values = summary(capfd, path)
+    assert (values["nodes"], values["edges"], values["components"]) == (0, {}, 0)
+    assert "picture" not in values
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])

@@ -54,10 +54,10 @@ def test_nodes_edges_and_links_are_in_the_picture(tmp_path):
 
 
 def test_the_title_is_written(tmp_path):
-    one, two = (
+    first, second = (
         drawn(tmp_path, MapPicture(title, NODES, [])) for title in ("", "seed 3: 12 nodes, ATE 0.1 m")
     )
-    dark = [int((image < 100).all(axis=2).sum()) for image in (one, two)]
+    dark = [int((image < 100).all(axis=2).sum()) for image in (first, second)]
     assert dark[1] > dark[0] + 500
 
 

@@ -47,24 +47,24 @@ def test_no_optimiser_aligns_better(seed):
     estimated = rng.normal(0, 3, (int(rng.integers(2, 20)), 2))
     moved = Pose2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3))
     true = moved.apply(estimated) + rng.normal(0, 0.5, estimated.shape)
-    found = align(estimated, true)
+    alignment = align(estimated, true)
     best = min(
         minimize(lambda v: left(Pose2(*v), estimated, true), [*true.mean(axis=0), heading], tol=1e-10).fun
         for heading in (-2.0, 0.0, 2.0)
     )
-    assert left(found, estimated, true) <= best + 1e-6
+    assert left(alignment, estimated, true) <= best + 1e-6
 
 
 @given(poses, st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=2, max_size=9))
 def test_a_motion_is_found_again(motion, points):
     estimated = np.array(points)
-    found = align(estimated, motion.apply(estimated))
-    assert np.allclose(found.apply(estimated), motion.apply(estimated), atol=1e-6)
+    alignment = align(estimated, motion.apply(estimated))
+    assert np.allclose(alignment.apply(estimated), motion.apply(estimated), atol=1e-6)
 
 
 def test_one_point_is_shifted_and_none_is_unchanged():
-    found = align(np.array([[1.0, 2.0]]), np.array([[4.0, 6.0]]))
-    assert (found.x, found.y, found.heading) == (3.0, 4.0, 0.0)
+    alignment = align(np.array([[1.0, 2.0]]), np.array([[4.0, 6.0]]))
+    assert (alignment.x, alignment.y, alignment.heading) == (3.0, 4.0, 0.0)
     assert align(np.zeros((0, 2)), np.zeros((0, 2))) == Pose2()
 
 
@@ -135,12 +135,12 @@ def test_only_links_between_maps_are_counted():
 def test_a_link_is_false_beyond_half_a_metre_or_fifteen_degrees(a, b, distance, direction, turn):
     truth = {node(1): a, node(2, "b"): b}
     true = a.inverse() @ b
-    told = Pose2(
+    result = Pose2(
         true.x + distance * math.cos(direction), true.y + distance * math.sin(direction), true.heading + turn
     )
     if abs(distance - 0.5) < 1e-6 or abs(abs(turn) - math.radians(15)) < 1e-6:
         return
-    assert is_false(link(node(1), node(2, "b"), told), truth) == (
+    assert is_false(link(node(1), node(2, "b"), result), truth) == (
         distance > 0.5 or abs(turn) > math.radians(15)
     )
 

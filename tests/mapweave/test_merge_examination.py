@@ -111,9 +111,9 @@ def test_a_robot_that_cannot_localize_begins_another_map(
     made = [change for some in changes("one", Replay(folder), AgentSettings()) for change in some]
     maps = {epoch: [c for c in made if c.map == MapId("one", epoch)] for epoch in (1, 2)}
     assert len(maps[1]) + len(maps[2]) == len(made)
-    for one in maps.values():
-        assert [change.sequence for change in one] == list(range(1, len(one) + 1))
-        assert len(HybridMap([change.body for change in one]).nodes) >= 1
+    for hybrid_map in maps.values():
+        assert [change.sequence for change in hybrid_map] == list(range(1, len(hybrid_map) + 1))
+        assert len(HybridMap([change.body for change in hybrid_map]).nodes) >= 1
 
 
 def test_without_truth_nothing_is_scored_and_pieces_can_be_chosen(
@@ -133,10 +133,10 @@ def test_without_truth_nothing_is_scored_and_pieces_can_be_chosen(
 def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
     cuts = cut(1000, robots)
     assert cuts[0].start == 0 and cuts[-1][-1] >= 998
-    for one, other in pairwise(cuts):
-        assert not set(one) & set(other)
-        shared = one[-1] - other[0]
-        assert shared == pytest.approx(OVERLAP * (one[-1] - one[0]), abs=4)
+    for first, second in pairwise(cuts):
+        assert not set(first) & set(second)
+        shared = first[-1] - second[0]
+        assert shared == pytest.approx(OVERLAP * (first[-1] - first[0]), abs=4)
 
 
 @pytest.mark.parametrize(
@@ -175,6 +175,6 @@ def test_an_unusable_recording_is_reported_in_one_line(
     shutil.copytree(recording, folder)
     break_it(folder)
     assert main(["eval", "merge", str(folder), "--out", str(tmp_path / "out"), *more]) == 1
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mapweave: ")]
-    assert len(said) == 1 and words in said[0]
+    output = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mapweave: ")]
+    assert len(output) == 1 and words in output[0]
     assert not (tmp_path / "out").exists()

@@ -97,9 +97,9 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path:
         assert (tmp_path / "third.log").read_text().endswith("closed\n")
         assert router.end() == 0
     finally:
-        for one in started:
-            one.process.kill()
-            one.process.wait()
+        for item in started:
+            item.process.kill()
+            item.process.wait()
 
 
 @pytest.mark.parametrize(

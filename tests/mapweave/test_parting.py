@@ -84,13 +84,13 @@ class Robot:
 
     def maps(self, nodes: slice) -> None:
         """Send some nodes."""
-        for k, bodies in enumerate(self.life[nodes]):
-            self.sender.submit(bodies, k)
+        for k, changes in enumerate(self.life[nodes]):
+            self.sender.submit(changes, k)
 
     def frames(self) -> set[NodeId]:
         """The components of its first nodes, as published."""
-        found = [self.poses.of(NodeId(*self.map, 2 * k + 1)) for k in range(FIRST)]
-        return {NodeId("?", 0, 0) if one is None else one.frame for one in found}
+        result = [self.poses.of(NodeId(*self.map, 2 * k + 1)) for k in range(FIRST)]
+        return {NodeId("?", 0, 0) if item is None else item.frame for item in result}
 
 
 @pytest.fixture
@@ -101,10 +101,10 @@ def fleet(tmp_path: Path) -> Iterator[tuple[Children, list[str], list[Robot], in
     serve = ["server", "--fleet", "twins", "--listen", endpoint, "--data", str(tmp_path), "--http", str(http)]
     with Children(tmp_path / "logs") as children, ExitStack() as robots:
         children.start("server", serve)
-        told = [Robot(one, tmp_path, endpoint, life) for one, life in lives(1).items()]
-        for robot in told:
+        collected = [Robot(one, tmp_path, endpoint, life) for one, life in lives(1).items()]
+        for robot in collected:
             robots.callback(robot.close)
-        yield children, serve, told, http
+        yield children, serve, collected, http
 
 
 def test_a_merge_that_loses_its_support_is_undone_and_reported(
@@ -156,7 +156,7 @@ def test_a_merge_that_loses_its_support_is_undone_and_reported(
         return list(json.loads(said("history", "--json"))["history"])
 
     before = history()
-    assert [one["kind"] for one in before] == ["joined", "parted"] and before[1]["words"] == event
+    assert [item["kind"] for item in before] == ["joined", "parted"] and before[1]["words"] == event
     logged = (tmp_path / "logs" / "server.log").read_text()
     stamped = r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d "
     assert re.search(stamped + re.escape(event), logged, re.M)

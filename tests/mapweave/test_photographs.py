@@ -37,14 +37,14 @@ def stretch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Pose2]
     folder = tmp_path_factory.mktemp("stretch")
     world = world_from_table({"kind": "office", "rooms": 2}, 4, Path())
     taken = walk(world, PHONE, COUNT, SPACING, 4)
-    for number, one in enumerate(taken):
-        assert cv2.imwrite(str(folder / f"{number}.png"), one.image)
+    for number, place in enumerate(taken):
+        assert cv2.imwrite(str(folder / f"{number}.png"), place.image)
     c = PHONE.intrinsics
     (folder / "camera.toml").write_text(
         f"width = {c.width}\nheight = {c.height}\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
         f"height_m = {c.mount_height}\ndistortion = {list(PHONE.distortion)}\n"
     )
-    return folder, [one.world_from_camera for one in taken]
+    return folder, [place.world_from_camera for place in taken]
 
 
 def test_nodes_are_where_the_photographs_were_taken_up_to_scale(stretch) -> None:
@@ -92,11 +92,11 @@ def test_the_command_writes_a_map_file(stretch, tmp_path: Path, capfd) -> None:
     folder, _ = stretch
     out = tmp_path / "hall.mapweave"
     assert main(["map", "from-photos", str(folder), "--spacing", "0.5", "-o", str(out), "--json"]) == 0
-    told = json.loads(capfd.readouterr().out)
+    values = json.loads(capfd.readouterr().out)
     read = HybridMap(read_map_file(out, "agent").changes)
     assert len(read.nodes) == COUNT
-    assert told["landmarks"] == [len(node.landmarks) for node in read.nodes.values()]
-    assert {str(node.map) for node in read.nodes} == {told["map"]}
+    assert values["landmarks"] == [len(node.landmarks) for node in read.nodes.values()]
+    assert {str(node.map) for node in read.nodes} == {values["map"]}
     assert not list(tmp_path.glob("*.sqlite"))
 
 

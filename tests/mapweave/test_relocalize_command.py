@@ -113,17 +113,17 @@ def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Pat
     assert (np.abs(image.astype(int) - GREEN) < 40).all(axis=2).sum() > 1000
     # As people read it.
     assert main(["relocalize", str(photo), "--connect", served]) == 0
-    told = re.search(r"node r0\.1\.1: (\S+) m ahead", capfd.readouterr().out)
-    assert told is not None and float(told[1]) == pytest.approx(MOVED.x, abs=0.03)
+    result = re.search(r"node r0\.1\.1: (\S+) m ahead", capfd.readouterr().out)
+    assert result is not None and float(result[1]) == pytest.approx(MOVED.x, abs=0.03)
 
 
 def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
     cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
     drawn = tmp_path / "matches.png"
     assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == 2
-    said = capfd.readouterr()
-    assert said.out.startswith("unknown: ")
-    assert said.err == f"{drawn} is not drawn: no place was recognised\n"
+    output = capfd.readouterr()
+    assert output.out.startswith("unknown: ")
+    assert output.err == f"{drawn} is not drawn: no place was recognised\n"
     assert not drawn.exists()
     assert main(["relocalize", str(photo), "--connect", served, "--draw", str(tmp_path / "a.jpg")]) == 1
     assert "end its name with .png" in capfd.readouterr().err

@@ -27,10 +27,10 @@ def refused(tmp_path: Path, text: str | bytes) -> str:
     """The single line."""
     with pytest.raises(SettingsError) as error:
         load(tmp_path, text)
-    said = str(error.value)
-    assert "\n" not in said
-    assert said.startswith(str(tmp_path / "robot.toml"))
-    return said
+    output = str(error.value)
+    assert "\n" not in output
+    assert output.startswith(str(tmp_path / "robot.toml"))
+    return output
 
 
 def test_without_a_file_all_is_default(tmp_path):

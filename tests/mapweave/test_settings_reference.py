@@ -48,7 +48,7 @@ def test_the_printed_file_holds_every_setting_with_its_default(capsys: pytest.Ca
 def test_what_has_no_default_is_printed_as_a_comment() -> None:
     """Filled in, the comments are a file."""
     off = re.findall(r"^#(\w+) =", as_toml(), re.MULTILINE)
-    assert sorted(off) == sorted(one.name for one in OPTIONAL)
+    assert sorted(off) == sorted(item.name for item in OPTIONAL)
     text = re.sub(r"^#(\[|\w+ =)", r"\1", as_toml(), flags=re.MULTILINE)
     text = re.sub(
         r"= *$", "= 1", text.replace("ranger_bearings_deg =", "ranger_bearings_deg = [1]"), flags=re.MULTILINE
@@ -58,9 +58,9 @@ def test_what_has_no_default_is_printed_as_a_comment() -> None:
 
 
 def test_each_has_a_text_and_the_page_counts_them() -> None:
-    every = [one for section in sections() for one in section.settings]
+    every = [setting for section in sections() for setting in section.settings]
     assert len(every) == len(EVERY) + len(OPTIONAL) <= 150
-    assert all(len(one.text) > 3 and one.text.endswith(".") for one in every)
+    assert all(len(setting.text) > 3 and setting.text.endswith(".") for setting in every)
     assert f"There are {len(every)} settings." in as_markdown()
 
 

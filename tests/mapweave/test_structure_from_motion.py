@@ -39,25 +39,27 @@ class Walk:
             pixels = pixels + rng.normal(0.0, 0.4, pixels.shape)
             seen = np.flatnonzero((local[:, 2] > 0.5) & CAMERA.contains(pixels))
             seen = rng.permutation(seen)[:150]
-            looks = vectors[seen] + rng.normal(0.0, 0.03, (len(seen), vectors.shape[1]))
+            views = vectors[seen] + rng.normal(0.0, 0.03, (len(seen), vectors.shape[1]))
             # Some look like what is elsewhere.
             swapped = rng.permutation(len(seen))[: int(wrong * len(seen))]
-            looks[swapped] = looks[rng.permutation(swapped)]
-            self.views.append(View(pixels[seen].astype(np.float32), quantise(looks), CAMERA))
+            views[swapped] = views[rng.permutation(swapped)]
+            self.views.append(View(pixels[seen].astype(np.float32), quantise(views), CAMERA))
             self.rotations.append(turn)
             self.centres.append(centre)
 
-    def off(self, found: Structure) -> tuple[np.ndarray, np.ndarray, float]:
+    def off(self, structure: Structure) -> tuple[np.ndarray, np.ndarray, float]:
         """Position errors (K,) m and orientation errors (K,) rad after the best similarity; the scale."""
-        true, got = np.array(self.centres), found.centres
+        true, got = np.array(self.centres), structure.centres
         a, b = true - true.mean(axis=0), got - got.mean(axis=0)
         turn, _ = Rotation.align_vectors(a, b)
         scale = float((a * turn.apply(b)).sum() / (b**2).sum())
         errors = np.linalg.norm(a - scale * turn.apply(b), axis=1)
         relative = [
-            (Rotation.from_matrix(found.rotations[0].T @ one) * Rotation.from_matrix(known).inv()).magnitude()
+            (
+                Rotation.from_matrix(structure.rotations[0].T @ one) * Rotation.from_matrix(known).inv()
+            ).magnitude()
             for one, known in zip(
-                found.rotations, [self.rotations[0].T @ r for r in self.rotations], strict=True
+                structure.rotations, [self.rotations[0].T @ r for r in self.rotations], strict=True
             )
         ]
         return errors, np.array(relative), scale
@@ -78,16 +80,16 @@ def test_a_walk_is_found_again_up_to_its_scale(seed: int) -> None:
 
 def test_points_lie_where_their_features_are_seen() -> None:
     walk = Walk(3)
-    found = reconstruct(walk.views, 0.6)
-    assert len(found.points) > 150
+    structure = reconstruct(walk.views, 0.6)
+    assert len(structure.points) > 150
     for k, view in enumerate(walk.views):
-        seen = np.flatnonzero(found.features[k] >= 0)
-        local = (found.points[seen] - found.centres[k]) @ found.rotations[k]
+        seen = np.flatnonzero(structure.features[k] >= 0)
+        local = (structure.points[seen] - structure.centres[k]) @ structure.rotations[k]
         pixels = local[:, :2] / local[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
-        misses = np.linalg.norm(pixels - view.pixels[found.features[k, seen]], axis=1)
+        misses = np.linalg.norm(pixels - view.pixels[structure.features[k, seen]], axis=1)
         assert np.median(misses) < 1.0
-        assert (found.features[k, seen] < len(view)).all()
-    assert ((found.features >= 0).sum(axis=0) >= 1).all()
+        assert (structure.features[k, seen] < len(view)).all()
+    assert ((structure.features >= 0).sum(axis=0) >= 1).all()
 
 
 def test_invalid_walks_are_refused() -> None:

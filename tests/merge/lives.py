@@ -28,11 +28,13 @@ class Life:
     def __init__(self, seed: int, false_share: float, settings: FleetSettings = SMALL) -> None:
         self.rng = np.random.default_rng(seed)
         fleet = draw_fleet(false_share, self.rng, settings)
-        self.bodies = {map_id: list(one.contents()) for map_id, one in fleet.maps.items()}
+        self.bodies = {map_id: list(first.contents()) for map_id, first in fleet.maps.items()}
         for map_id in self.bodies:  # each node, then the edge that leads to it
             nodes = [b for b in self.bodies[map_id] if isinstance(b, NodePut)]
             edges = [b for b in self.bodies[map_id] if isinstance(b, EdgePut)]
-            self.bodies[map_id] = [b for two in zip(nodes, [None, *edges], strict=True) for b in two if b]
+            self.bodies[map_id] = [
+                b for second in zip(nodes, [None, *edges], strict=True) for b in second if b
+            ]
         self.coming = {link.pair: link for link in fleet.links}
         self.truth = fleet.truth
         self.maps: dict[MapId, HybridMap] = {}
@@ -65,7 +67,7 @@ class Life:
     def step(self, quiet: bool = False) -> None:
         """Something happens; most often the maps grow, always if it is quiet."""
         rng, what = self.rng, 0.0 if quiet else self.rng.random()
-        open_ = [map_id for map_id, bodies in self.bodies.items() if bodies]
+        open_ = [map_id for map_id, changes in self.bodies.items() if changes]
         known = list(self.known)
         if what < 0.7 and open_:
             map_id = open_[int(rng.integers(len(open_)))]
@@ -87,8 +89,8 @@ class Life:
             pair = known[int(rng.integers(len(known)))]
             ends = pair if rng.random() < 0.7 or pair[0].map == pair[1].map else (pair[0].map, pair[1].map)
             self.number += 1
-            ruling = ManualConstraint(ends, bool(rng.random() < 0.6), "anna", self.number)
-            self.rulings = self.rulings + ManualConstraints([ruling])
+            constraint = ManualConstraint(ends, bool(rng.random() < 0.6), "anna", self.number)
+            self.rulings = self.rulings + ManualConstraints([constraint])
 
     def _loop(self) -> None:
         """A robot recognises a place of its own, or drives there, and may be mistaken."""
@@ -102,7 +104,7 @@ class Life:
         a_from_b = PoseGaussian.from_sigmas(self.truth[a].inverse() @ self.truth[b] @ off, 0.03, 0.02)
         self.number += 1
         kind = EdgeKind.LOOP if rng.random() < 0.6 else EdgeKind.DRIVEN
-        others = sorted(n for one in self.maps.values() for n in one.nodes if n.map != map_id)
+        others = sorted(n for hybrid_map in self.maps.values() for n in hybrid_map.nodes if n.map != map_id)
         if kind is EdgeKind.DRIVEN and others and rng.random() < 0.5:
             b = others[int(rng.integers(len(others)))]
         edge = Edge(EdgeId(map_id.agent, 1, 1000 + self.number), a, b, a_from_b, kind)

@@ -31,8 +31,8 @@ def pair(request: pytest.FixtureRequest) -> tuple[Node, Node, Pose2]:
 
 def test_depths_of_one_side_are_enough(pair):
     a, b, a_from_b = pair
-    for one, other in ((a, bare(b)), (bare(a), b)):
-        link = verify(one, other)
+    for first, second in ((a, bare(b)), (bare(a), b)):
+        link = verify(first, second)
         assert isinstance(link, Link)
         assert link.a_from_b.mahalanobis2(a_from_b) < 25.0
         assert link.a_from_b.mean.distance(a_from_b) < 0.15

@@ -67,11 +67,11 @@ class Daily:
         return undone.completed(merge_maps(undone.maps, undone.links, undone.refused))
 
 
-def check(merged: MergedMap, anew: MergedMap) -> None:
-    assert set(merged.components) == set(anew.components)
-    assert {link.pair for link in merged.links} == {link.pair for link in anew.links}
-    for node in anew.poses:
-        assert merged.pose(node).distance(anew.pose(node)) < 1e-3
+def check(merged: MergedMap, fresh: MergedMap) -> None:
+    assert set(merged.components) == set(fresh.components)
+    assert {link.pair for link in merged.links} == {link.pair for link in fresh.links}
+    for node in fresh.poses:
+        assert merged.pose(node).distance(fresh.pose(node)) < 1e-3
 
 
 @pytest.mark.parametrize(("seed", "false_share"), [(60, 0.0), (61, 0.3), (62, 0.5)])
@@ -111,10 +111,10 @@ def test_maps_and_nodes_of_earlier_days_are_retired() -> None:
     daily.rulings = ManualConstraints([ManualConstraint((MapId("r0", 2), MapId("r0", 2)), True, "anna", 1)])
     daily.touched.add(MapId("r0", 2))
     check(daily.merged(), daily.anew())
-    one = HybridMap(daily.maps[MapId("r0", 3)].contents())
-    gone = sorted(one.nodes)[1]
-    one.apply(NodeRetired(gone))
-    daily.maps[MapId("r0", 3)] = one
+    hybrid_map = HybridMap(daily.maps[MapId("r0", 3)].contents())
+    gone = sorted(hybrid_map.nodes)[1]
+    hybrid_map.apply(NodeRetired(gone))
+    daily.maps[MapId("r0", 3)] = hybrid_map
     for pair in [pair for pair in daily.links if gone in pair]:
         del daily.links[pair]
         daily.verdicts.drop(pair)
@@ -137,12 +137,12 @@ def test_a_false_join_is_undone_when_later_maps_contradict_it(seed: int) -> None
     pairs = zip(list(first.truth)[2:22:4], list(second.truth)[2:22:4], strict=True)
     false = [link_between(a, b, first.truth[a].inverse() @ moved @ second.truth[b], rng) for a, b in pairs]
     daily.tell(false)
-    told = {link.pair for link in false}
-    believed = []
+    result = {link.pair for link in false}
+    estimated = []
     for _ in range(3):
-        merged, anew = daily.live(1), daily.anew()
-        found = told & {link.pair for link in merged.links}
-        assert found == told & {link.pair for link in anew.links}
-        believed.append(bool(found))
-    assert believed[0] and not believed[-1]
-    assert set(merged.components) == set(anew.components)
+        merged, fresh = daily.live(1), daily.anew()
+        outcome = result & {link.pair for link in merged.links}
+        assert outcome == result & {link.pair for link in fresh.links}
+        estimated.append(bool(outcome))
+    assert estimated[0] and not estimated[-1]
+    assert set(merged.components) == set(fresh.components)

@@ -42,12 +42,12 @@ def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> Non
         if life.rng.random() < 0.4:
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
             life.touched = set()
-            anew = life.anew()
-            assert told(merged) == told(anew)
-            assert [graph.anchor for graph in merged.graphs] == [graph.anchor for graph in anew.graphs]
-            assert list(merged.poses) == list(anew.poses)
+            fresh = life.anew()
+            assert told(merged) == told(fresh)
+            assert [graph.anchor for graph in merged.graphs] == [graph.anchor for graph in fresh.graphs]
+            assert list(merged.poses) == list(fresh.poses)
             for node, place in merged.poses.items():
-                other = anew.poses[node]
+                other = fresh.poses[node]
                 assert place.component == other.component
                 assert place.merged_from_robot.mean == other.merged_from_robot.mean
                 assert np.array_equal(place.merged_from_robot.covariance, other.merged_from_robot.covariance)
@@ -80,12 +80,12 @@ def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch: pyt
         life.step(quiet=True)
         merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
         life.touched = set()
-    anew = life.anew()
-    assert set(merged.components) == set(anew.components)
-    one, two = ({link.pair for link in links} for links in (merged.links, anew.links))
+    fresh = life.anew()
+    assert set(merged.components) == set(fresh.components)
+    one, two = ({link.pair for link in links} for links in (merged.links, fresh.links))
     assert len(two) > 150 and len(one ^ two) <= 0.03 * len(two)
     if one == two:
-        assert max(merged.pose(node).distance(anew.pose(node)) for node in anew.poses) < 0.02
+        assert max(merged.pose(node).distance(fresh.pose(node)) for node in fresh.poses) < 0.02
 
 
 @pytest.mark.parametrize(("seed", "false_share"), [(46, 0.0), (47, 0.3), (48, 0.3)])
@@ -98,15 +98,15 @@ def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int
         if life.maps and life.rng.random() < 0.05:
             which = sorted(life.maps)[int(life.rng.integers(len(life.maps)))]
             life.number += 1
-            ruling = ManualConstraint((which, which), bool(life.rng.random() < 0.6), "anna", life.number)
-            life.rulings = life.rulings + ManualConstraints([ruling])
+            constraint = ManualConstraint((which, which), bool(life.rng.random() < 0.6), "anna", life.number)
+            life.rulings = life.rulings + ManualConstraints([constraint])
         if life.rng.random() < 0.4:
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
-            life.touched, anew = set(), life.anew()
-            one, two = ({link.pair for link in some.links} for some in (merged, anew))
+            life.touched, fresh = set(), life.anew()
+            one, two = ({link.pair for link in some.links} for some in (merged, fresh))
             apart, links = apart + len(one ^ two), links + len(two)
-            assert set(merged.poses) == set(anew.poses)
-            assert {r.pair for r in merged.refused} | one == {r.pair for r in anew.refused} | two
+            assert set(merged.poses) == set(fresh.poses)
+            assert {r.pair for r in merged.refused} | one == {r.pair for r in fresh.refused} | two
     assert links > 15 and apart <= 0.1 * links
 
 
@@ -130,15 +130,15 @@ def test_all_is_decided_together_now_and_then_only(monkeypatch: pytest.MonkeyPat
 def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(component_solver, "WHOLE", 0)
     monkeypatch.setattr(component_solver, "LEAST", 12)
-    found = []
+    collected = []
     for _ in range(2):
         life, islands = Life(49, 0.3, DENSE), Islands(exact=0)
         for _ in range(40):
             life.step()
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
             life.touched = set()
-        found.append((told(merged), [merged.pose(node).vector.tobytes() for node in merged.poses]))
-    assert found[0] == found[1]
+        collected.append((told(merged), [merged.pose(node).vector.tobytes() for node in merged.poses]))
+    assert collected[0] == collected[1]
 
 
 def test_untouched_components_are_kept() -> None:

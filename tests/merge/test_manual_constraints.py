@@ -28,8 +28,8 @@ def merger() -> Merger:
     merger = Merger()
     for map_id in (A, B):
         nodes, edges = take_map(world, map_id, stops, rng)
-        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, body)
+        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, change)
     return merger
 
 
@@ -74,12 +74,15 @@ def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> No
     world = room(0, 0, 5, 4, 700, rng)
     third = MapId("c", 1)
     nodes, edges = take_map(world, third, [Pose2(2.45 + 0.05 * k, 2.05, 0.7 * k) for k in range(6)], rng)
-    for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-        merger.apply(third, body)
+    for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+        merger.apply(third, change)
     assert "links join them" in explain_maps(merger.merged(), A, B).reason
     merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", NOON)]))
-    told = explain_maps(merger.merged(), A, B).reason
-    assert "by way of c.1; no link joins the two directly, as was ruled" in told and "undo the links" in told
+    explanation = explain_maps(merger.merged(), A, B).reason
+    assert (
+        "by way of c.1; no link joins the two directly, as was ruled" in explanation
+        and "undo the links" in explanation
+    )
     merger.rule(
         ManualConstraints(
             [ManualConstraint((A, B), True, "anna", NOON), ManualConstraint((A, third), True, "anna", NOON)]
@@ -89,10 +92,10 @@ def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> No
 
 
 def test_a_robot_s_own_loop_can_be_undone_and_its_way_cannot(merger: Merger) -> None:
-    one = merger.maps[A]
-    nodes = sorted(one.nodes)
-    way = next(e for e in one.edges.values() if {e.a, e.b} == set(nodes[:2]))
-    true = one.nodes[nodes[0]].map_from_robot.inverse() @ one.nodes[nodes[4]].map_from_robot
+    hybrid_map = merger.maps[A]
+    nodes = sorted(hybrid_map.nodes)
+    way = next(e for e in hybrid_map.edges.values() if {e.a, e.b} == set(nodes[:2]))
+    true = hybrid_map.nodes[nodes[0]].map_from_robot.inverse() @ hybrid_map.nodes[nodes[4]].map_from_robot
     loop = Edge(NodeId("a", 1, 50), nodes[0], nodes[4], true, EdgeKind.LOOP)
     merger.apply(A, EdgePut(loop))
     assert loop.id in merger.merged().union().edges

@@ -42,8 +42,8 @@ class Fleet:
             self.truth |= {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
 
     def merge(self, order: int = 1) -> MergedMap:
-        nodes = [node for one in self.maps.values() for node in one.nodes.values()][::order]
-        edges = [edge for one in self.maps.values() for edge in one.edges.values()][::order]
+        nodes = [node for hybrid_map in self.maps.values() for node in hybrid_map.nodes.values()][::order]
+        edges = [edge for hybrid_map in self.maps.values() for edge in hybrid_map.edges.values()][::order]
         by_id = {node.id: node for node in nodes}
         verdicts = [verify(by_id[a], by_id[b]) for a, b in choose_pairs(overlaps(nodes), edges)][::order]
         maps = dict(list(self.maps.items())[::order])
@@ -63,11 +63,11 @@ class Fleet:
         The distances are taken without alignment, from the component's anchor, whose pose is certain.
         """
         nodes = sorted(merged.components[component])
-        found = np.array([merged.poses[n].merged_from_robot.mean.vector[:2] for n in nodes])
+        result = np.array([merged.poses[n].merged_from_robot.mean.vector[:2] for n in nodes])
         true = np.array([self.truth[n].vector[:2] for n in nodes])
-        u, _, vt = np.linalg.svd((found - found.mean(0)).T @ (true - true.mean(0)))
+        u, _, vt = np.linalg.svd((result - result.mean(0)).T @ (true - true.mean(0)))
         rotation = u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt
-        off = (found - found.mean(0)) @ rotation - (true - true.mean(0))
+        off = (result - result.mean(0)) @ rotation - (true - true.mean(0))
         truth_from_merged = self.truth[nodes[0]] @ merged.poses[nodes[0]].merged_from_robot.mean.inverse()
         distances = [
             merged.poses[n].merged_from_robot.mahalanobis2(truth_from_merged.inverse() @ self.truth[n])
@@ -177,16 +177,16 @@ def test_links_that_contradict_a_better_supported_way_round_are_refused() -> Non
     """a-b and b-c are well supported, all along; a-c says something else at one place, and agrees on it."""
     maps = {MapId(agent, 1): chain(agent, 14) for agent in "abc"}
 
-    def links(one: str, two: str, shift: float, inliers: int, apart: int = 4) -> list[Link]:
-        found = []
+    def links(first: str, second: str, shift: float, inliers: int, apart: int = 4) -> list[Link]:
+        collected = []
         for k in range(0, 4 * apart, apart):
-            a, b = NodeId(one, 1, 2 * k + 1), NodeId(two, 1, 2 * k + 1)
+            a, b = NodeId(first, 1, 2 * k + 1), NodeId(second, 1, 2 * k + 1)
             true = (
                 maps[a.map].nodes[a].map_from_robot.mean.inverse() @ maps[b.map].nodes[b].map_from_robot.mean
             )
             mean = PoseGaussian.from_sigmas(true @ Pose2(shift, 0, 0), 0.05, 0.05)
-            found.append(Link(a, b, mean, evidence={"inliers": float(inliers), "share": 0.8}))
-        return found
+            collected.append(Link(a, b, mean, evidence={"inliers": float(inliers), "share": 0.8}))
+        return collected
 
     false = links("a", "c", 2.0, 15, apart=1)
     merged = merge_maps(maps, [*links("a", "b", 0, 30), *links("b", "c", 0, 30), *false])
@@ -208,7 +208,7 @@ def test_a_map_in_pieces_is_joined_piece_by_piece() -> None:
 
 
 def refused_links(merged: MergedMap) -> list[RefusedLink]:
-    return [one for one in merged.refused if one.link is not None]
+    return [refusal for refusal in merged.refused if refusal.link is not None]
 
 
 def test_explanations_and_summary(office_fleet: tuple[Fleet, MergedMap]) -> None:
@@ -221,11 +221,13 @@ def test_explanations_and_summary(office_fleet: tuple[Fleet, MergedMap]) -> None
     unknown = next((a, b) for a, b in pairwise(sorted(fleet.truth)) if (a, b) not in known)
     assert "not compared" in merged.explain(*unknown)
     loops = sum(link.a.map == link.b.map for link in merged.links)
-    told = f"{len(merged.links) - loops} links, {loops} loops, {len(refused_links(merged))} refused"
-    assert loops > 1 and merged.summary() == f"40 nodes, 3 maps, 1 component, {told}"
+    result = f"{len(merged.links) - loops} links, {loops} loops, {len(refused_links(merged))} refused"
+    assert loops > 1 and merged.summary() == f"40 nodes, 3 maps, 1 component, {result}"
     union = merged.union()
     assert set(union.nodes) == set(fleet.truth)
-    assert len(union.edges) == sum(len(one.edges) for one in fleet.maps.values()) + len(merged.links)
+    assert len(union.edges) == sum(len(hybrid_map.edges) for hybrid_map in fleet.maps.values()) + len(
+        merged.links
+    )
 
 
 def test_nothing_to_merge() -> None:

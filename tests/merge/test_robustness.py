@@ -51,8 +51,8 @@ def test_graduation_finds_the_cheapest_set_of_all(seed: int) -> None:
 
     sets = (some for size in range(7) for some in combinations(links, size))
     cheapest = min(sets, key=cost)
-    found = wrong_measurements(ids[0], true[0], [*way, *links], GATE)
-    assert {(m.a, m.b) for m in found} == {(m.a, m.b) for m in cheapest}
+    result = wrong_measurements(ids[0], true[0], [*way, *links], GATE)
+    assert {(m.a, m.b) for m in result} == {(m.a, m.b) for m in cheapest}
 
 
 def test_half_of_the_links_may_be_false() -> None:

@@ -34,9 +34,9 @@ def test_both_forms_are_the_same_to_rounding(seed: int, n: int) -> None:
     compiled = everything()
     with in_numpy():
         plain = everything()
-    for one, other in zip(compiled, plain, strict=True):
-        scale = max(1.0, float(np.abs(one).max()))
-        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7 * scale)
+    for first, second in zip(compiled, plain, strict=True):
+        scale = max(1.0, float(np.abs(first).max()))
+        np.testing.assert_allclose(first, second, rtol=1e-6, atol=1e-7 * scale)
 
 
 def test_nothing_is_compiled_while_a_robot_drives() -> None:

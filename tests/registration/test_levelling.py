@@ -34,9 +34,9 @@ def test_pitch_roll_and_rise_do_not_move_the_robot(seed: int) -> None:
     scale, rise = rng.uniform(0.8, 1.25), rng.normal(0.0, 0.02)
     node, view, _ = scene(seed, off)
     held = photograph(node, scale, pitch, roll, rise)
-    found = recognise(held, view, None, np.random.default_rng(0))
-    assert found is not None
-    levelled = level(held, view, found)
+    recognition = recognise(held, view, None, np.random.default_rng(0))
+    assert recognition is not None
+    levelled = level(held, view, recognition)
     got = levelled.node_from_robot
     # The camera's way is right in the photograph's own unit.
     mount = Pose2(node.camera.mount_forward)
@@ -59,9 +59,9 @@ def test_pitch_roll_and_rise_do_not_move_the_robot(seed: int) -> None:
 def test_a_level_photograph_stays_as_it_is() -> None:
     node, view, rng = scene(3, Pose2(-0.2, 0.05, 0.03))
     held = photograph(node)
-    found = recognise(held, view, None, rng)
-    assert found is not None
-    levelled = level(held, view, found)
+    recognition = recognise(held, view, None, rng)
+    assert recognition is not None
+    levelled = level(held, view, recognition)
     assert np.median(np.abs(levelled.node.landmarks.pixels - held.landmarks.pixels)) < 0.5
     assert np.allclose(levelled.node.landmarks.depths, held.landmarks.depths, rtol=0.02)
 
@@ -69,9 +69,9 @@ def test_a_level_photograph_stays_as_it_is() -> None:
 def test_the_scale_is_a_share_of_the_way_to_the_photograph() -> None:
     off = Pose2(-0.5, 0.1, 0.05)
     node, view, rng = scene(2, off)
-    found = recognise(photograph(node), view, None, rng)
-    assert found is not None
-    sigma = math.sqrt(float(np.linalg.eigvalsh(found.node_from_robot.covariance[:2, :2])[-1]))
+    recognition = recognise(photograph(node), view, None, rng)
+    assert recognition is not None
+    sigma = math.sqrt(float(np.linalg.eigvalsh(recognition.node_from_robot.covariance[:2, :2])[-1]))
     assert sigma == pytest.approx(SCALE_SHARE * math.hypot(off.x, off.y), rel=0.2)
     measured = recognise(node, view, None, np.random.default_rng(0))
     assert measured is not None
@@ -85,7 +85,7 @@ def test_a_measured_node_gives_a_photograph_its_scale(scale: float) -> None:
     world, at, off = room(0.0, 0.0, 6.0, 5.0, 900, rng), Pose2(2.0, 2.5, 0.1), Pose2(-0.4, 0.2, -0.1)
     node = take_node(world, NodeId("p0", 1, 1), at, HERE, rng, SHARP)
     other = take_node(world, NodeId("r0", 1, 1), at @ off, HERE, rng, SHARP)
-    found = register(photograph(node, scale), other, None, np.random.default_rng(0))
-    assert found is not None
-    assert found.node_from_robot.mean.distance(off) < 0.06
-    assert found.node_from_robot.mahalanobis2(off) < 16.3
+    recognition = register(photograph(node, scale), other, None, np.random.default_rng(0))
+    assert recognition is not None
+    assert recognition.node_from_robot.mean.distance(off) < 0.06
+    assert recognition.node_from_robot.mahalanobis2(off) < 16.3

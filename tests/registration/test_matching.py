@@ -10,15 +10,15 @@ from mapweave.registration.matching import MatchSettings, match, match_vectors, 
 
 def brute_force(a: np.ndarray, b: np.ndarray, s: MatchSettings, noise: float) -> set[tuple[int, int]]:
     distances = np.array([[np.sqrt(max(0.0, np.sum((x - y) ** 2) - noise)) for y in b] for x in a])
-    found = set()
+    collected = set()
     for i in range(len(a)):
         j = int(distances[i].argmin())
         if int(distances[:, j].argmin()) != i or distances[i, j] > s.most_distance:
             continue
         others = [*np.delete(distances[i], j), *np.delete(distances[:, j], i)]
         if all(distances[i, j] < s.ratio * other for other in others):
-            found.add((i, j))
-    return found
+            collected.add((i, j))
+    return collected
 
 
 @settings(max_examples=40, deadline=None)
@@ -62,10 +62,10 @@ def test_no_feature_is_used_twice_and_the_best_come_first() -> None:
     other = np.concatenate([one, random_codes(30, rng)])
     assert len(match(crowd, other)) <= 1
     codes = random_codes(60, rng)
-    found = match_vectors(decode(codes), decode(codes[::-1].copy()))
-    assert len(found) == 60
-    assert len(np.unique(found.pairs[:, 0])) == len(np.unique(found.pairs[:, 1])) == 60
-    assert (np.diff(found.distances) >= 0).all()
+    result = match_vectors(decode(codes), decode(codes[::-1].copy()))
+    assert len(result) == 60
+    assert len(np.unique(result.pairs[:, 0])) == len(np.unique(result.pairs[:, 1])) == 60
+    assert (np.diff(result.distances) >= 0).all()
 
 
 def test_nothing_matches_nothing() -> None:

@@ -34,8 +34,8 @@ def random_pose(rng: np.random.Generator) -> Pose2:
     return Pose2(*rng.uniform([-2, -2, -math.pi], [2, 2, math.pi]))
 
 
-def error(found: Pose2, true: Pose2) -> float:
-    return float(np.abs((true.inverse() @ found).vector).max())
+def error(result: Pose2, true: Pose2) -> float:
+    return float(np.abs((true.inverse() @ result).vector).max())
 
 
 @settings(max_examples=25, deadline=None)
@@ -199,7 +199,9 @@ def test_measured_depths_make_a_pose_more_certain() -> None:
         depths=depths,
         depth_sigmas=np.full(len(points), 0.05),
     )
-    fixes = [solve_sightings([one], rng=rng, settings=PlanarPoseSettings()) for one in (without, with_depth)]
+    fixes = [
+        solve_sightings([item], rng=rng, settings=PlanarPoseSettings()) for item in (without, with_depth)
+    ]
     assert fixes[0] is not None and fixes[1] is not None
     assert fixes[1].node_from_robot.covariance.trace() < fixes[0].node_from_robot.covariance.trace()
 

@@ -29,11 +29,11 @@ def looks(pixel_sigma: float, count: int = 60) -> tuple[np.ndarray, np.ndarray, 
         b = a @ Pose2(*rng.uniform(-0.05, 0.05, 3))
         node = take_node(WORLD, NodeId("r0", 1, number), a, HERE, rng, node_sensing)
         view, _ = take_view(WORLD, b, rng, Sensing(pixel_sigma=pixel_sigma))
-        found = recognise(node, view, None, rng)
-        if found is None:
+        recognition = recognise(node, view, None, rng)
+        if recognition is None:
             continue
-        best, true = refine_pose(node, view, found, PlanarPoseSettings()), a.inverse() @ b
-        first.append(found.node_from_robot.mean.distance(true))
+        best, true = refine_pose(node, view, recognition, PlanarPoseSettings()), a.inverse() @ b
+        first.append(recognition.node_from_robot.mean.distance(true))
         closer.append(best.mean.distance(true))
         squared.append(best.mahalanobis2(true))
     assert len(first) > 0.7 * count
@@ -61,13 +61,13 @@ def test_an_average_is_where_the_likelihood_is_highest() -> None:
         root = rng.normal(0, 0.01, (3, 3))
         poses.append(PoseGaussian(middle @ Pose2(*rng.normal(0, 0.01, 3)), root @ root.T + 1e-6 * np.eye(3)))
     whole = averaged(poses)
-    found = minimize(
+    result = minimize(
         lambda v: sum(pose.mahalanobis2(middle @ Pose2.from_vector(v)) for pose in poses),
         np.zeros(3),
         method="Nelder-Mead",
         options={"xatol": 1e-9, "fatol": 1e-12, "maxiter": 5000},
     )
-    best = middle @ Pose2.from_vector(found.x)
+    best = middle @ Pose2.from_vector(result.x)
     assert whole.mean.distance(best) < 2e-4
     assert abs(math.remainder(whole.mean.heading - best.heading, math.tau)) < 2e-4
     assert np.allclose(whole.covariance, np.mean([pose.covariance for pose in poses], axis=0))

@@ -102,9 +102,9 @@ def test_likelihoods_are_those_of_a_gaussian(seed: int, n: int) -> None:
     for inverted in (False, True):
         sightings, true = scene(n, rng, inverted)
         poses = true.vector + rng.normal(0, 0.05, (4, 3))
-        found = sightings.log_ratios(poses)
+        odds = sightings.log_ratios(poses)
         for h, pose_vector in enumerate(poses):
-            np.testing.assert_allclose(found[h], expected_ratios(sightings, pose_vector), atol=1e-3)
+            np.testing.assert_allclose(odds[h], expected_ratios(sightings, pose_vector), atol=1e-3)
 
 
 @settings(max_examples=15, deadline=None)

@@ -45,16 +45,16 @@ def somewhere(rng: np.random.Generator) -> Pose2:
 
 def test_views_nearby_are_recognised_with_an_honest_pose() -> None:
     rng = np.random.default_rng(2)
-    distances, found = [], 0
+    distances, count = [], 0
     for _ in range(60):
         a = somewhere(rng)
         b = near(a, rng)
         view, _ = take_view(world(), b, rng)
         recognition = recognise(node_at(a, rng), view, None, rng)
         if recognition is not None:
-            found += 1
+            count += 1
             distances.append(recognition.node_from_robot.mahalanobis2(a.inverse() @ b))
-    assert found >= 50
+    assert count >= 50
     assert max(distances) < 20 and np.mean(distances) < 3.5
 
 

@@ -140,12 +140,12 @@ class Drawing:
         """
         _, labels = cv2.connectedComponents((self.distances > ROBOT - SLACK).astype(np.uint8))
         labels[self.distances < ROBOT + SLACK] = 0
-        found = {}
+        collected = {}
         for room in world.plan.rooms:
             low, high = self.at(*room.corners[0]), self.at(*room.corners[2])
             inside = labels[low[0] : high[0] + 1, low[1] : high[1] + 1]
-            found[room.name] = set(np.unique(inside).tolist()) - {0}
-        return found
+            collected[room.name] = set(np.unique(inside).tolist()) - {0}
+        return collected
 
 
 def picture(world: World, pose: Pose2) -> np.ndarray:

@@ -77,12 +77,12 @@ def test_corners_agree_with_the_lens_model(name: str, stand) -> None:
     assert np.linalg.norm(expected[inside] - camera.project(corners[inside]), axis=1).max() > 1.0
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-3)
     start = expected[inside].astype(np.float32)[:, None] + np.float32(0.7)
-    found = cv2.cornerSubPix(image, start, (4, 4), (-1, -1), criteria)[:, 0]
-    off = np.linalg.norm(found - expected[inside], axis=1)
+    result = cv2.cornerSubPix(image, start, (4, 4), (-1, -1), criteria)[:, 0]
+    off = np.linalg.norm(result - expected[inside], axis=1)
     assert off.max() < 0.3
-    assert np.abs((found - expected[inside]).mean(axis=0)).max() < 0.05
-    body = RobotSetup("r0", camera=setup).describe()
-    ideal = Lens(body.camera, body.distortion).undistort(found)
+    assert np.abs((result - expected[inside]).mean(axis=0)).max() < 0.05
+    description = RobotSetup("r0", camera=setup).describe()
+    ideal = Lens(description.camera, description.distortion).undistort(result)
     assert np.linalg.norm(ideal - camera.project(corners[inside]), axis=1).max() < 0.5
 
 

@@ -174,9 +174,9 @@ def test_moved_furniture_is_felt_and_seen_where_the_plan_has_it(office: World) -
             for room in [r.name for r in world.plan.rooms if r.name.startswith("room")]:
                 pose = world.plan.random_free_pose(np.random.default_rng(3), 0.4, room)
                 seen = []
-                for one in (simulation, fresh):
-                    one.kidnap("r0", pose)
-                    seen.append(one.observe("r0"))
+                for item in (simulation, fresh):
+                    item.kidnap("r0", pose)
+                    seen.append(item.observe("r0"))
                 assert seen[0].proximity == pytest.approx(seen[1].proximity, abs=1e-6)
                 # The two have other noise by now.
                 assert np.abs(seen[0].image.astype(int) - seen[1].image).mean() < 3.0

@@ -90,9 +90,9 @@ def test_the_goal_is_given_in_the_frame_of_the_start() -> None:
     seen, info = env.reset(seed=4)
     start = Pose2.from_vector(info["world_from_robot"])
     goal = Pose2.from_vector(info["world_from_goal"])
-    told = start @ Pose2.from_vector(seen["goal"].astype(float))
-    assert told.distance(goal) < 1e-3
-    assert abs(wrap_angle(told.heading - goal.heading)) < 1e-3
+    result = start @ Pose2.from_vector(seen["goal"].astype(float))
+    assert result.distance(goal) < 1e-3
+    assert abs(wrap_angle(result.heading - goal.heading)) < 1e-3
     env.close()
     with pytest.raises(InvalidValue, match="reset"):
         env.step(np.zeros(2, np.float32))

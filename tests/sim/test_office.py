@@ -122,8 +122,8 @@ def test_there_is_enough_to_see(offices: list[World]) -> None:
     counts = []
     for world in offices[1:4]:
         with Simulation(world, ["r0"], 1) as simulation:
-            body = simulation.describe("r0")
-            sift = Sift(Lens(body.camera, body.distortion))
+            description = simulation.describe("r0")
+            sift = Sift(Lens(description.camera, description.distortion))
             for _ in range(6):
                 simulation.kidnap("r0", world.plan.random_free_pose(rng, ROBOT))
                 counts.append(len(sift.extract(simulation.observe("r0").image)))

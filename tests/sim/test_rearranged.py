@@ -59,15 +59,15 @@ def test_rearranged_worlds_can_be_driven_through(name: str, seed: int) -> None:
         after = Drawing(world).regions(world)
         assert len(set.union(*after.values())) <= len(set.union(*before.values()))
         names = list(before)
-        for k, one in enumerate(names):
-            for other in names[: k + 1]:
-                assert bool(before[one] & before[other]) == bool(after[one] & after[other])
+        for k, first in enumerate(names):
+            for second in names[: k + 1]:
+                assert bool(before[first] & before[second]) == bool(after[first] & after[second])
         solid = [*world.plan.walls, *world.plan.furniture]
         for piece in (f for f, p in zip(world.plan.furniture, world.pieces, strict=True) if p.movable):
-            for other in (s for s in solid if s is not piece):
+            for second in (s for s in solid if s is not piece):
                 boxes = [
                     ((b.x, b.y), (b.length - 0.01, b.width - 0.01), np.degrees(b.heading))
-                    for b in (piece, other)
+                    for b in (piece, second)
                 ]
                 assert cv2.rotatedRectangleIntersection(*boxes)[0] == cv2.INTERSECT_NONE
 

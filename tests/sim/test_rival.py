@@ -74,9 +74,9 @@ def test_same_picture_sooner_and_steadier(office: World, stand, tmp_path: Path) 
     near = np.argsort(np.linalg.norm(centres - [start.x, start.y], axis=1))
     upright = [k for k in near if office.panels[k].down[2] < 0][:40]
     panels = PanelSet.of([office.panels[k] for k in upright])
-    ours, theirs = Renderer(WEBCAM, 255), TinyRenderer(panels, WEBCAM, tmp_path)
+    own, theirs = Renderer(WEBCAM, 255), TinyRenderer(panels, WEBCAM, tmp_path)
     poses = [start @ Pose2(0.02 * k, 0.0, 0.01 * k + turn) for turn in (0.0, 2.0, 4.0) for k in range(4)]
-    draw = {"ours": lambda pose: ours.render(panels, *stand(pose)), "TinyRenderer": theirs.render}
+    draw = {"ours": lambda pose: own.render(panels, *stand(pose)), "TinyRenderer": theirs.render}
     pictures: dict[str, list[Array]] = {}
     seconds: dict[str, float] = {}
     for name, render in draw.items():
@@ -103,8 +103,8 @@ def flow_error(pictures: list[Array]) -> float:
     for before, after in neighbours:
         a, b = before.astype(np.uint8), after.astype(np.uint8)
         points = cv2.goodFeaturesToTrack(a, 120, 0.02, 7)
-        there, found, _ = cv2.calcOpticalFlowPyrLK(a, b, points, None, winSize=(15, 15))
+        there, result, _ = cv2.calcOpticalFlowPyrLK(a, b, points, None, winSize=(15, 15))
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=(11, 11))
-        good = (found & found_back)[:, 0] == 1
+        good = (result & found_back)[:, 0] == 1
         misses.append(np.linalg.norm((back - points)[good, 0], axis=1))
     return float(np.median(np.concatenate(misses)))

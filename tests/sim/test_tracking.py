@@ -28,8 +28,8 @@ def test_tracks_follow_points_of_walls(office: World, caster, stand) -> None:
 
         for command in (Command(0.3, 0.0), Command(0.15, 0.4), Command(0.0, -0.5), Command(-0.2, 0.2)):
             # Small windows: how a large patch grows on the way is Lucas-Kanade's trouble, not the picture's.
-            body = simulation.describe("r0")
-            tracker = Tracker(Lens(body.camera, body.distortion), TrackerSettings(window_px=9))
+            description = simulation.describe("r0")
+            tracker = Tracker(Lens(description.camera, description.distortion), TrackerSettings(window_px=9))
             image = simulation.step({"r0": command})["r0"].image
             pixels = cv2.goodFeaturesToTrack(image, 90, 0.02, 9)[:, 0].astype(float)
             pixels = pixels[camera.contains(pixels, 12.0)]

@@ -41,15 +41,15 @@ def load(folder: Path, text: str) -> World:
     return load_world(path)
 
 
-def same(one: World, other: World) -> bool:
+def same(first: World, second: World) -> bool:
     """Whether two worlds are equal in all that can be run into or seen."""
     names = ("plan", "blocks", "pieces", "name", "background", "start_rooms", "look_along")
-    if any(getattr(one, name) != getattr(other, name) for name in names):
+    if any(getattr(first, name) != getattr(second, name) for name in names):
         return False
-    return len(one.panels) == len(other.panels) and all(
+    return len(first.panels) == len(second.panels) and all(
         all((getattr(a, name) == getattr(b, name)).all() for name in ("corner", "along", "down"))
         and (a.texture.seed, a.texture.painter) == (b.texture.seed, b.texture.painter)
-        for a, b in zip(one.panels, other.panels, strict=True)
+        for a, b in zip(first.panels, second.panels, strict=True)
     )
 
 
@@ -280,7 +280,7 @@ def test_any_table_makes_a_world_or_one_line(lists: dict[str, Any], top: dict[st
         table = {**lists, **top}
         for name, cls in ITEMS.items():
             if isinstance(table.get(name), list):
-                table[name] = tuple(build(cls, one, name) for one in table[name] if isinstance(one, dict))
+                table[name] = tuple(build(cls, item, name) for item in table[name] if isinstance(item, dict))
         world = build_world(build(Design, table, "file"), "file")
         assert all(np.isfinite(p.corner).all() and np.isfinite(p.along).all() for p in world.panels)
         for panel in world.panels[-2:]:

@@ -38,9 +38,9 @@ def test_twins_look_exactly_the_same(name: str, seed: int) -> None:
         if toward_door and math.sin(pose.heading) < 0.55:
             continue
         seen += 1
-        one, other = picture(world, pose), picture(world, Pose2(pose.x + east, pose.y, pose.heading))
-        assert (one == other).all()
-        assert one.std() > 3
+        first, second = picture(world, pose), picture(world, Pose2(pose.x + east, pose.y, pose.heading))
+        assert (first == second).all()
+        assert first.std() > 3
     assert seen >= 2
 
 
@@ -67,9 +67,9 @@ def test_no_two_prints_of_the_corridor_are_the_same(seed: int) -> None:
     prints = world.panels[-floors - len(design.posters) : -floors]
     assert len(prints) >= 10
     small = [cv2.resize(p.texture.level(0, 0), (24, 32), interpolation=cv2.INTER_AREA) for p in prints]
-    for k, one in enumerate(small):
-        for other in small[:k]:
-            assert np.abs(one.astype(float) - other).mean() > 4.0
+    for k, first in enumerate(small):
+        for second in small[:k]:
+            assert np.abs(first.astype(float) - second).mean() > 4.0
 
 
 def test_racks_are_equal_but_for_some_cartons() -> None:

@@ -45,9 +45,9 @@ def test_walls_are_closed(name: str, seed: int) -> None:
             turned = angles - block.base.heading
             way = np.stack([np.cos(turned), np.sin(turned)])
             half = np.array([block.base.length, block.base.width])[:, None] / 2
-            one, other = (-half - start[:, None]) / way, (half - start[:, None]) / way
-            enter = np.minimum(one, other).max(axis=0)
-            leave = np.maximum(one, other).min(axis=0)
+            first, second = (-half - start[:, None]) / way, (half - start[:, None]) / way
+            enter = np.minimum(first, second).max(axis=0)
+            leave = np.maximum(first, second).min(axis=0)
             nearest = np.where((enter <= leave) & (enter >= 0), np.minimum(nearest, enter), nearest)
         assert np.isfinite(nearest).all(), room.name
 
@@ -104,12 +104,12 @@ def test_too_many_robots_are_refused_with_the_number_that_fits(name: str) -> Non
 def test_the_same_seed_gives_the_same_world(name: str) -> None:
     """To the last bit of its places and pictures; another seed gives another."""
     kind, parameters = CASES[name]
-    one, again, other = world_of(name, 1), make_world(kind, 1, **parameters), world_of(name, 2)
-    assert one.plan == again.plan
-    assert one.blocks == again.blocks
-    for a, b in zip(one.panels, again.panels, strict=True):
+    first, again, second = world_of(name, 1), make_world(kind, 1, **parameters), world_of(name, 2)
+    assert first.plan == again.plan
+    assert first.blocks == again.blocks
+    for a, b in zip(first.panels, again.panels, strict=True):
         assert all((getattr(a, n) == getattr(b, n)).all() for n in ("corner", "along", "down"))
         assert (a.texture.seed, a.texture.painter) == (b.texture.seed, b.texture.painter)
-    pose = one.start_poses(1, 3)[0]
-    assert (picture(one, pose) == picture(again, pose)).all()
-    assert not (picture(one, pose) == picture(other, pose)).all()
+    pose = first.start_poses(1, 3)[0]
+    assert (picture(first, pose) == picture(again, pose)).all()
+    assert not (picture(first, pose) == picture(second, pose)).all()

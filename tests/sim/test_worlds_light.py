@@ -72,10 +72,12 @@ def test_no_seam_shows_between_lengths_of_wall() -> None:
     world = make_world("corridor", 1)
     panels = [p for p in world.panels if p.down[2] < 0]
     met = 0
-    for one, other in itertools.pairwise(panels):
-        here, there = one.texture.painter, other.texture.painter
-        straight = np.linalg.norm(np.cross(one.along, other.along)) < 1e-4 and one.along @ other.along > 0
-        joined = straight and np.allclose(one.corner + one.along, other.corner, atol=1e-5)
+    for first, second in itertools.pairwise(panels):
+        here, there = first.texture.painter, second.texture.painter
+        straight = (
+            np.linalg.norm(np.cross(first.along, second.along)) < 1e-4 and first.along @ second.along > 0
+        )
+        joined = straight and np.allclose(first.corner + first.along, second.corner, atol=1e-5)
         if joined and isinstance(here, Lit) and isinstance(there, Lit) and here.lamps == there.lamps:
             met += 1
             rows = here.brightness(9, 20), there.brightness(9, 20)

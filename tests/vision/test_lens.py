@@ -38,8 +38,8 @@ def test_distortion_is_brown_and_conradys_formula(coefficients, pixels):
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     expected = np.column_stack([CAMERA.fx * xd + CAMERA.cx, CAMERA.fy * yd + CAMERA.cy])
-    found = Lens(CAMERA, coefficients).distort(pixels)
-    assert np.allclose(found, expected, atol=1e-6)
+    result = Lens(CAMERA, coefficients).distort(pixels)
+    assert np.allclose(result, expected, atol=1e-6)
 
 
 def test_an_ideal_lens_and_no_points():

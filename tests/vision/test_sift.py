@@ -33,9 +33,9 @@ def test_features_are_spread_and_each_has_a_place_of_its_own(pictures, name):
 
 
 def test_the_same_image_gives_the_same_features(pictures):
-    one, two = (Sift(IDEAL).extract(pictures.photograph("camera")) for _ in range(2))
-    assert np.array_equal(one.raw, two.raw)
-    assert np.array_equal(one.codes, two.codes)
+    first, second = (Sift(IDEAL).extract(pictures.photograph("camera")) for _ in range(2))
+    assert np.array_equal(first.raw, second.raw)
+    assert np.array_equal(first.codes, second.codes)
 
 
 def test_pixels_are_free_of_the_lens(pictures):

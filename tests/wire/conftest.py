@@ -162,14 +162,14 @@ def sample_edge(count: int = 60, map_id: MapId = MAP) -> Edge:
 
 def sample_changes() -> list[Change]:
     stamp_ns = 1_700_000_000_123_456_789
-    bodies: list[ChangeBody] = [
+    changes: list[ChangeBody] = [
         NodePut(sample_node()),
         NodePut(sample_node(0, 16)),
         EdgePut(sample_edge()),
         EdgeRetired(NodeId(*MAP, 18)),
         NodeRetired(NodeId(*MAP, 17)),
     ]
-    return [Change(MAP, 1000 + k, stamp_ns + k, body) for k, body in enumerate(bodies)]
+    return [Change(MAP, 1000 + k, stamp_ns + k, body) for k, body in enumerate(changes)]
 
 
 @pytest.fixture(scope="session")

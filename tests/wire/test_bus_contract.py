@@ -89,18 +89,18 @@ def test_one_server_answers(fleet: Fleet) -> None:
 
 
 def test_two_servers_answer_and_the_slow_one_does_not_hide_the_quick(fleet: Fleet) -> None:
-    asker, one, two = fleet.join(), fleet.join(), fleet.join()
-    one.serve("server/one/ask", lambda request: request.reply(b"one"))
-    two.serve("server/two/ask", lambda request: request.refuse("not today"))
+    asker, first, second = fleet.join(), fleet.join(), fleet.join()
+    first.serve("server/one/ask", lambda request: request.reply(b"one"))
+    second.serve("server/two/ask", lambda request: request.refuse("not today"))
     settle(asker, "server/*/ask", servers=2)
     replies = asker.ask("server/*/ask", b"", 3.0)
     assert sorted(replies, key=lambda r: r.error) == [Reply(payload=b"one"), Reply(error="not today")]
 
 
 def test_two_servers_under_the_same_key_both_answer(fleet: Fleet) -> None:
-    asker, one, two = fleet.join(), fleet.join(), fleet.join()
-    one.serve("ask", lambda request: request.reply(b"one"))
-    two.serve("ask", lambda request: request.reply(b"two"))
+    asker, first, second = fleet.join(), fleet.join(), fleet.join()
+    first.serve("ask", lambda request: request.reply(b"one"))
+    second.serve("ask", lambda request: request.reply(b"two"))
     settle(asker, "ask", servers=2)
     assert sorted(reply.payload for reply in asker.ask("ask", b"", 3.0)) == [b"one", b"two"]
 
@@ -114,11 +114,11 @@ def test_a_service_for_a_pattern_gets_the_key(fleet: Fleet) -> None:
 
 
 def test_a_server_that_never_answers_does_not_hide_the_other(fleet: Fleet) -> None:
-    asker, one, two = fleet.join(), fleet.join(), fleet.join()
+    asker, first, second = fleet.join(), fleet.join(), fleet.join()
     kept: list[Request] = []
-    one.serve("server/one/ask", lambda request: request.reply(b"one"))
+    first.serve("server/one/ask", lambda request: request.reply(b"one"))
     settle(asker, "server/one/ask")
-    two.serve("server/two/ask", kept.append)
+    second.serve("server/two/ask", kept.append)
     eventually(lambda: asker.ask("server/*/ask", b"", 0.3) == [Reply(payload=b"one")] and kept)
 
 

@@ -78,27 +78,27 @@ def test_a_question_during_closing_does_not_wait_for_the_timeout(fleet: Fleet, w
 
 
 def test_without_a_connection_nothing_blocks_and_all_comes_back(fleet: Fleet) -> None:
-    one, two = fleet.join(), fleet.join()
-    got = subscribe(two, one, "a")
-    two.serve("q", lambda request: request.reply(b"yes"))
-    settle(one, "q")
+    first, second = fleet.join(), fleet.join()
+    got = subscribe(second, first, "a")
+    second.serve("q", lambda request: request.reply(b"yes"))
+    settle(first, "q")
     news: list[bool] = []
-    two.announce("token")
-    one.watch("token", lambda _, alive: news.append(alive))
+    second.announce("token")
+    first.watch("token", lambda _, alive: news.append(alive))
     eventually(lambda: news == [True])
 
     fleet.cut()
-    eventually(lambda: not one.connected() and not two.connected())
+    eventually(lambda: not first.connected() and not second.connected())
     begin = time.monotonic()
     for _ in range(1000):
-        one.publish("a", b"into the void")
-    assert one.ask("q", b"", 60.0) == []
+        first.publish("a", b"into the void")
+    assert first.ask("q", b"", 60.0) == []
     assert time.monotonic() - begin < 20
     eventually(lambda: news == [True, False])
 
     fleet.mend()
-    eventually(lambda: one.connected() and two.connected())
-    eventually(lambda: one.ask("q", b"", 1.0) == [Reply(payload=b"yes")])
-    eventually(lambda: one.publish("a", b"back") or b"back" in [s.payload for s in got])
+    eventually(lambda: first.connected() and second.connected())
+    eventually(lambda: first.ask("q", b"", 1.0) == [Reply(payload=b"yes")])
+    eventually(lambda: first.publish("a", b"back") or b"back" in [s.payload for s in got])
     eventually(lambda: news == [True, False, True])
     assert b"into the void" not in [s.payload for s in got]

@@ -152,11 +152,11 @@ def test_sigmas_are_clipped(some: SimpleNamespace, sigma: float, share: float) -
 
 def through(some: SimpleNamespace, depth: float, sigma: float) -> Landmarks:
     """One landmark, there and back."""
-    one = Landmarks(
+    landmarks = Landmarks(
         np.full((1, 2), 100, np.float32), np.zeros((1, 32), np.uint8),
         np.array([depth], np.float32), np.array([sigma], np.float32),
     )  # fmt: skip
-    body = decode_body(encode_body(NodePut(replaced(some.node(), landmarks=one))))
+    body = decode_body(encode_body(NodePut(replaced(some.node(), landmarks=landmarks))))
     assert isinstance(body, NodePut)
     return body.node.landmarks
 

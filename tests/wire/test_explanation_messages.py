@@ -61,20 +61,20 @@ def explanation() -> PairExplanation:
 
 
 def test_two_nodes_come_back() -> None:
-    told, back = explanation(), decode(encode(explanation()), PairExplanation)
+    result, back = explanation(), decode(encode(explanation()), PairExplanation)
     assert (back.a.id, back.b.id, back.standing, back.reason) == (
-        told.a.id,
-        told.b.id,
-        told.standing,
-        told.reason,
+        result.a.id,
+        result.b.id,
+        result.standing,
+        result.reason,
     )
-    assert np.array_equal(back.matches, told.matches) and np.array_equal(back.shared, told.shared)
-    assert np.array_equal(back.residuals_px, told.residuals_px, equal_nan=True)
+    assert np.array_equal(back.matches, result.matches) and np.array_equal(back.shared, result.shared)
+    assert np.array_equal(back.residuals_px, result.residuals_px, equal_nan=True)
     assert back.a_from_b is not None and np.allclose(back.a_from_b.mean.vector, [0.25, -0.5, 0.125])
-    assert (back.evidence, back.probability, back.witnesses) == (told.evidence, 0.9, told.witnesses)
+    assert (back.evidence, back.probability, back.witnesses) == (result.evidence, 0.9, result.witnesses)
     assert back.misfit is not None and np.allclose(back.misfit.off, [0.1, 0.2, -0.3])
     assert (back.misfit.strain2, back.misfit.alone) == (4.5, False)
-    assert (back.claims, back.rulings) == (told.claims, told.rulings)
+    assert (back.claims, back.rulings) == (result.claims, result.rulings)
     assert np.array_equal(back.a.landmarks.pixels, decode(encode(back), PairExplanation).a.landmarks.pixels)
 
 

@@ -101,21 +101,21 @@ def poses(node: Node, gone: NodeId) -> PoseNews:
 def explanations(some: SimpleNamespace, a: Node, pose: PoseGaussian) -> list[tuple[Decoder, bytes]]:
     """Of two nodes and two maps, with the questions and manual constraints."""
     b, (one, two) = replace(a, id=NodeId("r1", 1, 1)), (a.id.map, MapId("r1", 1))
-    ruling = ManualConstraint((a.id, b.id), True, "anna", 5, "two kitchens")
+    constraint = ManualConstraint((a.id, b.id), True, "anna", 5, "two kitchens")
     pairs = np.array([[1, 2], [3, 4]])
     misfit = Misfit(pose, np.zeros(3), 1.5, False)
-    witness = Witness(a.id, b.id, 2.5, True, False)
+    link = Witness(a.id, b.id, 2.5, True, False)
     pair = PairExplanation(
         a, b, Standing.LINKED, "why", pairs, pairs[:1], np.array([0.5]), pose, {"inliers": 12.0}, 0.9,
-        misfit, (witness,), ("r0 says so",), (ruling,),
+        misfit, (link,), ("r0 says so",), (constraint,),
     )  # fmt: skip
     near = NearMiss(a.id, b.id, 5, 3, "too few")
-    maps = MapsExplanation(one, two, False, "why", 0, 0, 3, 4, (near,), (ruling,))
+    maps = MapsExplanation(one, two, False, "why", 0, 0, 3, 4, (near,), (constraint,))
     return [
         (partial(messages.decode, kind=PairExplanation), encode(pair)),
         (partial(messages.decode, kind=FleetExplanation), encode(FleetExplanation((maps,)))),
         (partial(messages.decode, kind=ExplainRequest), encode(ExplainRequest((one, two)))),
-        (partial(messages.decode, kind=ManualConstraint), encode(ruling)),
+        (partial(messages.decode, kind=ManualConstraint), encode(constraint)),
     ]
 
 

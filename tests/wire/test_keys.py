@@ -20,11 +20,11 @@ maps = st.builds(MapId, names, st.integers(0, 2**53))
 
 
 def test_the_key_layout_matches_the_access_rules() -> None:
-    one = MapId("r0", 3)
-    assert KEYS.change(one) == "mapweave/1/warehouse/agent/r0/change/3"
-    assert KEYS.head(one) == "mapweave/1/warehouse/agent/r0/head/3"
-    assert KEYS.log(one) == "mapweave/1/warehouse/agent/r0/log/3"
-    assert KEYS.agent_alive(one) == "mapweave/1/warehouse/agent/r0/alive/3"
+    map_id = MapId("r0", 3)
+    assert KEYS.change(map_id) == "mapweave/1/warehouse/agent/r0/change/3"
+    assert KEYS.head(map_id) == "mapweave/1/warehouse/agent/r0/head/3"
+    assert KEYS.log(map_id) == "mapweave/1/warehouse/agent/r0/log/3"
+    assert KEYS.agent_alive(map_id) == "mapweave/1/warehouse/agent/r0/alive/3"
     assert KEYS.agent_status("r0") == "mapweave/1/warehouse/agent/r0/status"
     assert KEYS.mission("r0") == "mapweave/1/warehouse/agent/r0/mission"
     assert KEYS.ack("s0", "r0") == "mapweave/1/warehouse/server/s0/ack/r0"
@@ -143,9 +143,9 @@ def test_matching_agrees_with_regular_expressions(key: list[str], pattern: list[
 @given(pattern_chunks, pattern_chunks)
 def test_two_patterns_meet_where_some_key_matches_both(one: list[str], other: list[str]) -> None:
     keys = [""]
-    found = False
+    count = False
     for _ in range(7):
         keys = [key + chunk for key in keys for chunk in ("a/", "b/")]
-        found = found or any(as_regex(one).fullmatch(k) and as_regex(other).fullmatch(k) for k in keys)
+        count = count or any(as_regex(one).fullmatch(k) and as_regex(other).fullmatch(k) for k in keys)
     # Two patterns of only `**` also meet in the empty key, which is none.
-    assert intersects("/".join(one), "/".join(other)) == found
+    assert intersects("/".join(one), "/".join(other)) == count

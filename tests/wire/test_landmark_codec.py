@@ -247,14 +247,14 @@ def test_damage_is_noticed(some: SimpleNamespace, data: st.DataObject) -> None:
 
 def both_forms(packed: bytes) -> list[Landmarks | str]:
     """What comes of the compiled decoder, and of NumPy's; a reason if it is none."""
-    found: list[Landmarks | str] = []
+    collected: list[Landmarks | str] = []
     for form in (nullcontext, in_numpy):
         with form():
             try:
-                found.append(unpack_landmarks(packed, CAMERA))
+                collected.append(unpack_landmarks(packed, CAMERA))
             except InvalidMessage as error:
-                found.append(str(error))
-    return found
+                collected.append(str(error))
+    return collected
 
 
 @settings(max_examples=300)

@@ -23,8 +23,8 @@ from mapweave.wire.codec import encode_body
 def content(some: SimpleNamespace) -> MapFile:
     node = some.node(30)
     here = PoseGaussian.from_sigmas(Pose2(1.5, -2.5, 0.25), 0.5, 0.25)
-    bodies = (NodePut(node), NodePut(some.node(2, 16)), EdgePut(some.edge(2)))
-    return MapFile("merged", "three rooms", bodies, {node.id: (4, here)})
+    changes = (NodePut(node), NodePut(some.node(2, 16)), EdgePut(some.edge(2)))
+    return MapFile("merged", "three rooms", changes, {node.id: (4, here)})
 
 
 def test_written_values_are_read(tmp_path: Path, content: MapFile) -> None:

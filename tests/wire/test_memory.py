@@ -82,21 +82,21 @@ def test_the_same_seed_makes_the_same_faults() -> None:
 
 def test_a_cut_bus_is_dead_to_the_others_and_they_to_it() -> None:
     hub = MemoryHub()
-    one, two = MemoryBus(hub), MemoryBus(hub)
+    first, second = MemoryBus(hub), MemoryBus(hub)
     news: list[tuple[str, str, bool]] = []
-    one.announce("one")
-    two.announce("two")
-    one.watch("*", lambda key, alive: news.append(("one sees", key, alive)))
-    two.watch("*", lambda key, alive: news.append(("two sees", key, alive)))
+    first.announce("one")
+    second.announce("two")
+    first.watch("*", lambda key, alive: news.append(("one sees", key, alive)))
+    second.watch("*", lambda key, alive: news.append(("two sees", key, alive)))
     eventually(lambda: len(news) == 4)
-    hub.cut(two)
+    hub.cut(second)
     eventually(lambda: len(news) == 7)
     assert ("one sees", "two", False) in news
     assert ("two sees", "one", False) in news
-    hub.restore(two)
+    hub.restore(second)
     eventually(lambda: len(news) == 10)
-    one.close()
-    two.close()
+    first.close()
+    second.close()
 
 
 def test_an_answer_from_a_bus_that_was_cut_meanwhile_is_lost() -> None:

@@ -76,9 +76,9 @@ def test_many_columns_at_once_equal_one_by_one(seed: int) -> None:
     assert pack_bits(*at_once.finish()) == data
     bits, other = BitReader(data), BitReader(data)
     reader, plain = LaneReader(bits, lanes, size), LaneReader(other, lanes, size)
-    found = reader.pop(Columns.of(columns))
-    assert np.array_equal(found, np.concatenate([plain.pop(Columns.of([column])) for column in columns]))
-    assert np.array_equal(found, np.array(symbols).reshape(9, lanes))
+    result = reader.pop(Columns.of(columns))
+    assert np.array_equal(result, np.concatenate([plain.pop(Columns.of([column])) for column in columns]))
+    assert np.array_equal(result, np.array(symbols).reshape(9, lanes))
     assert np.array_equal(reader.states, plain.states) and bits.at == other.at
     if lanes > 10:
         short = BitReader(data[: -(-lanes * size // 8) + 1])
@@ -112,12 +112,12 @@ def test_one_rans_lane_in_plain_python() -> None:
     state, text = (1 << size) + int(text[:size], 2), text[size:]
     for symbol in symbols:
         slot = state % TOTAL
-        begin, found = 0, 0
-        while begin + column.frequencies[found] <= slot:
-            begin += column.frequencies[found]
-            found += 1
-        assert found == symbol
-        state = int(column.frequencies[found]) * (state // TOTAL) + slot - int(begin)
+        begin, count = 0, 0
+        while begin + column.frequencies[count] <= slot:
+            begin += column.frequencies[count]
+            count += 1
+        assert count == symbol
+        state = int(column.frequencies[count]) * (state // TOTAL) + slot - int(begin)
         while state < 1 << size:
             state, text = 2 * state + int(text[0]), text[1:]
     assert state == (1 << size) + 77

@@ -23,15 +23,15 @@ def pair() -> Iterator[tuple[MemoryHub, TrafficMeter, MemoryBus]]:
 
 def test_published_messages_are_received(pair) -> None:
     _, metered, other = pair
-    heard, seen = [], []
-    other.subscribe("to/other", heard.append)
+    received, seen = [], []
+    other.subscribe("to/other", received.append)
     metered.subscribe("to/metered", seen.append)
     metered.publish("to/other", b"12345", b"678")
     assert metered.traffic == len("to/other") + 5 + 3
     other.publish("to/metered", b"1234", b"56")
-    eventually(lambda: seen and heard)
+    eventually(lambda: seen and received)
     assert seen[0].payload == b"1234"
-    assert heard[0].attachment == b"678"
+    assert received[0].attachment == b"678"
     assert metered.traffic == len("to/other") + 8 + len("to/metered") + 6
 
 

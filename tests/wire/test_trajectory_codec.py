@@ -22,31 +22,31 @@ TWO = Ranges(np.array([0.0, 1.0]), np.array([2.0, 0.5]), 2.0)
 @example(bytes(6) + struct.pack("<h", 31488) + bytes(2), TWO)  # a heading beyond half a turn
 def test_any_bytes_are_a_trajectory_or_refused_and_encode_to_themselves(data, ranges):
     try:
-        wake = unpack_trajectory(data, ranges)
+        segment = unpack_trajectory(data, ranges)
     except InvalidMessage:
         return
-    again = pack_trajectory(wake, ranges.reach)
+    again = pack_trajectory(segment, ranges.reach)
     back = unpack_trajectory(again, ranges)
-    assert back.node_from_robot == pytest.approx(wake.node_from_robot) and len(again) == len(data)
+    assert back.node_from_robot == pytest.approx(segment.node_from_robot) and len(again) == len(data)
     assert pack_trajectory(back, ranges.reach) == again
-    assert (wake.distances <= ranges.reach).all()
+    assert (segment.distances <= ranges.reach).all()
 
 
 def test_the_layout_matches_the_documentation():
     """Columns of little-endian numbers, read by struct."""
-    wake = TrajectorySegment(
+    segment = TrajectorySegment(
         np.array([-1.5, 2.25]),
         np.array([[-0.5, 0.25, 1.0], [1.234, -2.0, -3.0]]),
         np.array([[2.0, 1.0], [0.0, 0.5]]),
     )
-    data = pack_trajectory(wake, TWO.reach)
+    data = pack_trajectory(segment, TWO.reach)
     numbers = struct.unpack("<2h 2h 2h 2h 4B", data)
     assert numbers == (-150, 225, -500, 1234, 250, -2000, 10000, -30000, 255, 127, 0, 64)
 
 
 def test_a_moment_with_sixteen_sensors_costs_24_bytes():
-    wake = TrajectorySegment(np.arange(3.0), np.zeros((3, 3)), np.ones((3, 16)))
-    assert len(pack_trajectory(wake, 3.0)) == 3 * 24
+    segment = TrajectorySegment(np.arange(3.0), np.zeros((3, 3)), np.ones((3, 16)))
+    assert len(pack_trajectory(segment, 3.0)) == 3 * 24
 
 
 @pytest.mark.parametrize("size", [1, 7, 9, 11, 10 * MOST + 10], ids=str)

@@ -65,11 +65,11 @@ def test_idle_connections_block_no_other() -> None:
         # With Zenoh's own limits it takes 10 s.
         assert client.wait_connected(5.0)
         # Who says nothing is dropped.
-        eventually(lambda: all(_is_closed(one) for one in idle))
+        eventually(lambda: all(_is_closed(item) for item in idle))
     finally:
         client.close()
-        for one in idle:
-            one.close()
+        for item in idle:
+            item.close()
         router.close()
 
 

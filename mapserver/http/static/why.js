@@ -40,7 +40,7 @@ function picture(parent, pair) {
   const alike = pair.matches.filter(match => !agree.has(String(match))).length;
   add(parent, "small", "Dots are landmarks; images are not kept. " +
     `${pair.shared.length} agree on one pose: dark where it predicts them, yellow where it is ` +
-    `${BAD_PX} px off. ${alike} look alike and do not agree: grey.`);
+    `${BAD_PX} px off. ${alike} match and do not agree: grey.`);
 }
 const metres = ([x, y, turn]) =>
   `${x.toFixed(3)} m ahead, ${y.toFixed(3)} m left, ${(turn * 180 / Math.PI).toFixed(1)}\u00b0`;
@@ -61,7 +61,7 @@ function showPair(pair) {
   if (pair.a_from_b) add(box, "p", "Seen from the first, the second is " + pose(pair.a_from_b) + ".");
   if (pair.misfit) add(box, "p", `In the map it is ${pose(pair.misfit.merged_a_from_b)}; off by ` +
     `${metres(pair.misfit.off)}, ${Math.sqrt(pair.misfit.strain2).toFixed(1)} standard deviations` +
-    (pair.misfit.alone ? "; nothing else says how they stand." : "."));
+    (pair.misfit.alone ? "; nothing else connects them." : "."));
   if (pair.probability !== null) {
     const percent = pair.probability > 0.9999 ? "over 99.99" : (100 * pair.probability).toFixed(2);
     add(box, "p", `Right with ${percent} %, by the rest of the map.`);
@@ -88,7 +88,7 @@ function ruled(r) {
   const when = new Date(r.stamp_ns / 1e6).toISOString().slice(0, 16).replace("T", " ");
   const what = r.ends[0] === r.ends[1] ? (r.apart ? "is retired" : "is in use again")
     : r.apart ? "shall not be linked" : "may be linked again";
-  return `${when} UTC ${r.who || "somebody"} ruled: ${[...new Set(r.ends)].join(" and ")} ${what}` +
+  return `${when} UTC ${r.who || "a person"} decided: ${[...new Set(r.ends)].join(" and ")} ${what}` +
     (r.because ? `: \u201c${r.because}\u201d` : "");
 }
 function showMaps(maps) {
@@ -99,14 +99,14 @@ function showTwo(one) {
   const box = add(told, "section", "", one.joined ? "good" : "");
   add(box, "p", one.reason);
   if (!one.joined)
-    add(box, "p", `${one.refused} links refused, ${one.unverified} alike pairs without a common pose.`);
+    add(box, "p", `${one.refused} links refused, ${one.unverified} candidate pairs without a common pose.`);
   if (one.nearest.length) add(box, "p", one.joined ? "Weakest links:" : "Nearest to a link:");
   const list = add(box, "ul");
   for (const n of one.nearest) {
     const item = add(list, "li");
     to(item, n.a, n.b, `${n.a} - ${n.b}`);
     const lacks = n.lacks.split("; ").filter(words => !one.reason.includes(words));
-    item.append(": " + [`${n.matches} look alike, ${n.inliers} agree`, ...lacks].join("; "));
+    item.append(": " + [`${n.matches} match, ${n.inliers} agree`, ...lacks].join("; "));
   }
   for (const words of one.rulings.map(ruled)) add(box, "p", words);
 }
@@ -122,7 +122,7 @@ function showHops(box, hops) {
 function showRoute(route) {
   const box = add(told, "section", "", route.found ? "good" : "failed");
   add(box, "p", `${route.start} to ${route.goal}: ` +
-    `${route.found ? "the way leads so" : "there is no way"}: ${route.reason}.`);
+    `${route.found ? "the route is" : "there is no way"}: ${route.reason}.`);
   if (route.hops.length) showHops(box, route.hops);
   if (route.gaps.length) {
     add(box, "p", route.found ? "Not driven, and so not taken:" : "What is missing:");

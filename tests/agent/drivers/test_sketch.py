@@ -108,11 +108,11 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("needs g++")
-    found = re.search(r"```cpp\n(.*?)```", (ROOT / "docs" / "arduino.md").read_text(), re.DOTALL)
-    assert found is not None
+    result = re.search(r"```cpp\n(.*?)```", (ROOT / "docs" / "arduino.md").read_text(), re.DOTALL)
+    assert result is not None
     folder = tmp_path_factory.mktemp("sketch")
     source, program = folder / "sketch.cpp", folder / "sketch"
-    source.write_text(ARDUINO + found[1] + MAIN)
+    source.write_text(ARDUINO + result[1] + MAIN)
     subprocess.run([compiler, "-w", "-O1", "-o", str(program), str(source)], check=True)
     return program
 
@@ -155,7 +155,7 @@ def test_the_sketch_drives_counts_and_stops_by_itself(program: Path, video: Path
         assert np.subtract(after[2:], before[2:]) / (now - then) == pytest.approx([0.2, 0.2], abs=0.03)
         last = time.monotonic()
         time.sleep(1.0)
-        stopped = next(at for at, said in wheels if at > last and said[:2] == [0.0, 0.0])
+        stopped = next(at for at, text in wheels if at > last and text[:2] == [0.0, 0.0])
         assert stopped - last < STOPS_WITHIN + SLACK
         assert wheels[-1][1][:2] == [0.0, 0.0]
     finally:

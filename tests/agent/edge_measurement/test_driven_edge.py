@@ -147,10 +147,10 @@ def test_a_robot_that_drives_to_and_fro_measures_the_edge_both_ways(walls, two_n
     assert (edge.kind, edge.a, edge.b) == (EdgeKind.DRIVEN, a, b) and edge.id not in before
     assert edge.evidence["back"] == 1.0 and edge.evidence["inliers"] >= 4
     assert pipeline.map.edges[edge.id] is edge
-    for one in (there[0].edge, edge):
-        assert one.a_from_b.mahalanobis2(truth[b]) < CERTAIN
-        assert one.a_from_b.mean.distance(truth[b]) < 0.05
-        assert np.sqrt(one.a_from_b.covariance[0, 0]) < 0.05
+    for item in (there[0].edge, edge):
+        assert item.a_from_b.mahalanobis2(truth[b]) < CERTAIN
+        assert item.a_from_b.mean.distance(truth[b]) < 0.05
+        assert np.sqrt(item.a_from_b.covariance[0, 0]) < 0.05
     merger = Merger()
     for sequence, body in enumerate([*contents, *there, *back], start=1):
         merger.on_change(Change(MAP, sequence, 0, body))

@@ -48,19 +48,19 @@ def drive(rng: np.random.Generator, node: Landmarks, true: np.ndarray) -> Locali
     one = LocalizationFilter(CAMERA, AXLE, NOISE, prior, ids, points, covariances)
     phase = rng.uniform(0, math.tau)
     for k in range(60):
-        told = Odometry(0.03 * math.sin(0.1 * k + phase), 0.012 * math.cos(0.08 * k))
-        wheels = told.forward + 0.5 * AXLE * told.turn * np.array([1.0, -1.0])
+        result = Odometry(0.03 * math.sin(0.1 * k + phase), 0.012 * math.cos(0.08 * k))
+        wheels = result.forward + 0.5 * AXLE * result.turn * np.array([1.0, -1.0])
         right, left = wheels * (1 + NOISE * rng.normal(size=2))
         pose = pose @ Odometry((right + left) / 2, (right - left) / AXLE).motion()
         seen = CAMERA.project(pose.inverse().apply(true)) + PIXEL * rng.normal(size=(len(true), 2))
         seen[~CAMERA.contains(seen)] = np.nan
-        one.predict(told)
+        one.predict(result)
         one.update(ids, seen)
     return one
 
 
 def test_four_drives_make_depths_better_and_never_too_sure(monkeypatch):
-    """Each drive begins with what the one before has written back: one depth a landmark, as a node holds it.
+    """Each drive begins with the refined node of the drive before: one depth a landmark.
 
     With the filter's own variances the mean of the squared normalised errors is 1.5 after four drives.
     """
@@ -83,9 +83,9 @@ def test_four_drives_make_depths_better_and_never_too_sure(monkeypatch):
             learned = drive(rng, node, true) if count < 4 else None
             if learned is not None and learned.healthy:
                 node = refined(node, *learned.state.depths()) or node
-    medians = [float(np.median(one)) for one in errors]
+    medians = [float(np.median(error)) for error in errors]
     assert medians[1] < 0.7 * medians[0] and medians[4] < 0.5 * medians[0]
-    assert all(np.mean(one) < 1.0 for one in nees)
+    assert all(np.mean(error) < 1.0 for error in nees)
 
 
 def test_independent_depth_errors_are_no_smaller_than_joint_ones():
@@ -142,19 +142,19 @@ class Teacher(NodeLocalizer):
 
 
 def test_a_node_is_refined_once_a_drive_when_the_robot_leaves_it():
-    nodes = [Node(one, 7, HERE, CAMERA, landmarks(DEPTHS * 1.05, 0.1 * DEPTHS)) for one in (A, B)]
+    nodes = [Node(item, 7, HERE, CAMERA, landmarks(DEPTHS * 1.05, 0.1 * DEPTHS)) for item in (A, B)]
     foreign = replace(nodes[0], id=NodeId("r1", 1, 1))
     refinement = LandmarkRefinement(HybridMap(map(NodePut, nodes)))
     fixes = [Fix(node.id, HERE, Teacher(node)) for node in (*nodes, foreign)]
     assert refinement.see(fixes[0]) is None and refinement.see(fixes[0]) is None
-    told = refinement.see(fixes[1])
-    assert told is not None and told.id == A and told.stamp_ns == 7
+    result = refinement.see(fixes[1])
+    assert result is not None and result.id == A and result.stamp_ns == 7
     # On the grid on which it is sent: off by a sixth of their sigmas at most, and equal for all receivers.
-    assert (np.abs(told.landmarks.depths - DEPTHS) <= told.landmarks.depth_sigmas / 5.5).all()
-    sent = decode_body(encode_body(NodePut(told)))
+    assert (np.abs(result.landmarks.depths - DEPTHS) <= result.landmarks.depth_sigmas / 5.5).all()
+    sent = decode_body(encode_body(NodePut(result)))
     assert isinstance(sent, NodePut)
     for name in ("pixels", "depths", "depth_sigmas"):
-        assert np.array_equal(getattr(sent.node.landmarks, name), getattr(told.landmarks, name))
+        assert np.array_equal(getattr(sent.node.landmarks, name), getattr(result.landmarks, name))
     assert refinement.see(fixes[0]) is not None, "B is left"
     assert refinement.see(fixes[2]) is None, "A was told before"
     assert refinement.see(None) is None, "another robot's node is not its own to mend"

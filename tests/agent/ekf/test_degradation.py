@@ -68,9 +68,9 @@ def drive(run: MappingRun, fault: Fault) -> tuple[MappingFilter, list[Health], l
         if pixels is not None:
             report = filter_.update(ids, pixels)
             assert (report.reason == "") == (report.health is Health.GOOD)
-        said, why = filter_.health
-        assert (why == "") == (said is Health.GOOD)
-        health.append(said)
+        text, why = filter_.health
+        assert (why == "") == (text is Health.GOOD)
+        health.append(text)
         traces.append(float(np.trace(filter_.pose.covariance)))
         distances.append(filter_.pose.mahalanobis2(run.poses[k + 1]))
     return filter_, health, traces, distances
@@ -113,10 +113,10 @@ def test_wheels_that_lie_are_named_and_the_image_holds_the_pose(run: MappingRun,
         for k in range(FIRST, LAST)
         if abs(fault(run, k)[0].turn - run.odometry[k].turn) > 0.005
     ]  # fmt: skip
-    told = [k for k in lies if health[k] is Health.SLIP]
-    assert len(told) >= 0.8 * len(lies)
+    collected = [k for k in lies if health[k] is Health.SLIP]
+    assert len(collected) >= 0.8 * len(lies)
     # A wheel may really slip at any time, but seldom does.
-    assert sum(said is Health.SLIP for said in health[:FIRST]) <= 6
+    assert sum(lines is Health.SLIP for lines in health[:FIRST]) <= 6
     assert max(distances) < CHI2_3
     off = filter_.pose.mean.inverse() @ run.poses[END]
     assert np.hypot(off.x, off.y) < 0.03
@@ -135,8 +135,8 @@ def test_standing_or_turning_is_reported_until_the_robot_drives(turn: float) -> 
         seen = run.camera.project(Pose2(0, 0, heading).inverse().apply(run.points))
         filter_.predict(Odometry(0.0, step))
         filter_.update(ids, seen + run.pixel_sigma * rng.normal(size=seen.shape))
-        said, why = filter_.health
-        assert said is Health.NO_PARALLAX
+        text, why = filter_.health
+        assert text is Health.NO_PARALLAX
         assert "depths" in why
     for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
         filter_.predict(odometry)
@@ -170,7 +170,7 @@ def test_pixels_worse_than_nominal_are_detected() -> None:
             plain.update(np.arange(30), pixels)
         apart.append((distances[-1], plain.pose.mahalanobis2(run.poses[END])))
         assert health[100:].count(Health.DISAGREEMENT) == 0
-    ours, without = np.mean(apart, axis=0)
+    own, without = np.mean(apart, axis=0)
     # What was learned in the first second, before the noise was known, stays too sure of itself.
-    assert ours < 25.0
-    assert ours < 0.4 * without, (ours, without)
+    assert own < 25.0
+    assert own < 0.4 * without, (own, without)

@@ -58,7 +58,7 @@ def test_refuted_wheels_get_more_noise_for_a_while() -> None:
     np.testing.assert_array_equal(trust.root(step), noise.root(step))
     np.testing.assert_array_equal(trust.refuted(step, 7.0), noise.refuted_root(step, 7.0, 0.1))
     for _ in range(DISTRUST):
-        assert trust.doubted
+        assert trust.increased
         # Wheels that claim to stand may have gone anywhere.
         assert trust.root(stands)[0, 0] == pytest.approx(0.05)
     assert not trust.increased

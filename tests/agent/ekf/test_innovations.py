@@ -38,10 +38,10 @@ def some_slots(rng: np.random.Generator, n: int) -> np.ndarray:
     return np.sort(rng.permutation(n)[: int(rng.integers(1, n + 1))]).astype(np.intp)
 
 
-def close(one: np.ndarray, other: np.ndarray, covariance: np.ndarray) -> None:
+def close(first: np.ndarray, second: np.ndarray, covariance: np.ndarray) -> None:
     """Entry ij of two covariances in units of sigma_i sigma_j."""
     sigmas = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(one / np.outer(sigmas, sigmas), other / np.outer(sigmas, sigmas), atol=1e-9)
+    np.testing.assert_allclose(first / np.outer(sigmas, sigmas), second / np.outer(sigmas, sigmas), atol=1e-9)
 
 
 def dense_inputs(wheel_root: np.ndarray, side_slip: float) -> np.ndarray:
@@ -223,14 +223,14 @@ def test_visible_landmarks(size: tuple[int, int], in_order: bool) -> None:
     pinhole = Pinhole(Camera(320, 240, 270.0, 280.0, 160.0, 120.0, mount_height=0.2))
     place = {int(landmark): slot for slot, landmark in enumerate(held)}
     rows = [k for k in range(len(ids)) if int(ids[k]) in place and np.isfinite(pixels[k]).all()]
-    believed, innovations = rng.random(len(rows)) < 0.5, rng.normal(size=(len(rows), 2))
+    estimated, innovations = rng.random(len(rows)) < 0.5, rng.normal(size=(len(rows), 2))
     assert slots_of(held, ids).tolist() == [place.get(int(landmark), -1) for landmark in ids]
     seen = ImageMeasurement.of(held, ids, pixels, pinhole)
     assert seen.rows.tolist() == rows
     assert seen.slots.tolist() == [place[int(ids[k])] for k in rows]
     np.testing.assert_allclose(pinhole.pixels(seen.slopes), pixels[rows], atol=1e-10)
-    report = seen.report(believed, innovations, 1.0, Health.GOOD, "")
-    assert report.accepted.tolist() == [k in np.array(rows, int)[believed] for k in range(len(ids))]
+    report = seen.report(estimated, innovations, 1.0, Health.GOOD, "")
+    assert report.accepted.tolist() == [k in np.array(rows, int)[estimated] for k in range(len(ids))]
     np.testing.assert_allclose(report.innovations_px[rows], innovations * pinhole.focal)
     assert np.isnan(np.delete(report.innovations_px, rows, axis=0)).all()
 
@@ -250,10 +250,10 @@ def test_the_step_is_linearised_at_the_turn_of_the_image(size: tuple[int, int]) 
     assert after.at == Odometry(0.05, pytest.approx(0.02 + vote, abs=1e-12))
     alone = step.again(at=after.at).state
     np.testing.assert_allclose(after.state.covariance, alone.covariance)
-    for one, other in zip(
+    for first, second in zip(
         examined, examine(alone.rays, alone.covariance, slots, slopes, variances), strict=True
     ):
-        np.testing.assert_allclose(one, other)
+        np.testing.assert_allclose(first, second)
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, LEAF, LEAF + 1, 60, 150])

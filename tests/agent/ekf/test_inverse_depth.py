@@ -31,26 +31,26 @@ def test_predictions_agree_with_the_camera(pose_vector: np.ndarray, mount: float
     camera = Camera(320, 240, 277.0, 250.0, 160.0, 120.0, 0.3, mount)
     points = some_points(seed)
     rays, _ = rays_of_points(points, mount, 0.3)
-    sight = project_anchored(pose_vector, rays, mount)
+    view = project_anchored(pose_vector, rays, mount)
     in_robot = Pose2.from_vector(pose_vector).inverse().apply(points)
     depth = in_robot[:, 0] - mount
-    pixels = np.array([160.0, 120.0]) + np.array([277.0, 250.0]) * sight.rays[:, :2]
+    pixels = np.array([160.0, 120.0]) + np.array([277.0, 250.0]) * view.rays[:, :2]
     ahead = depth > 0.05
     np.testing.assert_allclose(pixels[ahead], camera.project(in_robot)[ahead], atol=1e-7)
-    np.testing.assert_allclose(sight.rays[ahead, 2], 1 / depth[ahead], rtol=1e-9)
-    np.testing.assert_allclose(sight.scale, depth * rays[:, 2], atol=1e-9)
+    np.testing.assert_allclose(view.rays[ahead, 2], 1 / depth[ahead], rtol=1e-9)
+    np.testing.assert_allclose(view.scale, depth * rays[:, 2], atol=1e-9)
 
 
 @given(poses, mounts, seeds)
 def test_jacobians_of_the_projection(pose_vector: np.ndarray, mount: float, seed: int) -> None:
     rays, _ = rays_of_points(some_points(seed), mount, 0.3)
-    sight = project_anchored(pose_vector, rays, mount)
-    clear = sight.scale > 0.1
+    view = project_anchored(pose_vector, rays, mount)
+    clear = view.scale > 0.1
     by_pose = derivative(lambda p: project_anchored(p, rays, mount).rays, pose_vector)
-    np.testing.assert_allclose(sight.by_pose[clear], by_pose[clear], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(view.by_pose[clear], by_pose[clear], rtol=1e-4, atol=1e-6)
     for i in np.flatnonzero(clear):
         by_ray = derivative(lambda r: project_anchored(pose_vector, r[None], mount).rays[0], rays[i])
-        np.testing.assert_allclose(sight.by_ray[i], by_ray, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(view.by_ray[i], by_ray, rtol=1e-4, atol=1e-6)
 
 
 @given(mounts, seeds)

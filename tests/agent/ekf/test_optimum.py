@@ -69,12 +69,12 @@ def test_spoiled_tracks_are_refused() -> None:
     pixels[100:, :9] += (12.0, -9.0)
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))
     filter_.add(np.arange(30), run.pixels[0])
-    believed = []
+    estimated = []
     for odometry, seen in zip(run.odometry, pixels[1:], strict=True):
         filter_.predict(odometry)
-        believed.append(filter_.update(np.arange(30), seen).accepted)
+        estimated.append(filter_.update(np.arange(30), seen).accepted)
     seen_after = np.isfinite(pixels[101:, :, 0])
-    after = np.array(believed)[100:]
+    after = np.array(estimated)[100:]
     assert not after[:, :9].any()
     assert after[:, 9:].sum() > 0.99 * seen_after[:, 9:].sum()
 

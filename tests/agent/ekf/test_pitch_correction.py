@@ -57,14 +57,14 @@ def error(run: MappingRun, filter_: MappingFilter) -> float:
 def test_the_pitch_correction_agrees_with_a_pitched_camera(pitch: float) -> None:
     rng = np.random.default_rng(1)
     run = draw_run(rng, steps=1)
-    still, nods = (seen_pitched(CAMERA, Pose2(), run.points, one) for one in (0.0, pitch))
+    still, nods = (seen_pitched(CAMERA, Pose2(), run.points, item) for item in (0.0, pitch))
     focal = np.array([CAMERA.fx, CAMERA.fy])
     innovations, slopes = (nods - still) / focal, (nods - [CAMERA.cx, CAMERA.cy]) / focal
     covariance = (0.5 / CAMERA.fx) ** 2 * np.eye(2 * len(slopes))
-    found = pitch_offset(innovations, covariance, slopes)
-    assert found is not None
+    result = pitch_offset(innovations, covariance, slopes)
+    assert result is not None
     # To first order of the pitch, and within how far the landmarks are from the horizon.
-    np.testing.assert_allclose(found, innovations, atol=0.5 * abs(pitch) * abs(pitch) + 2e-3 * abs(pitch))
+    np.testing.assert_allclose(result, innovations, atol=0.5 * abs(pitch) * abs(pitch) + 2e-3 * abs(pitch))
 
 
 def test_offsets_within_the_filters_covariance_are_no_pitch() -> None:

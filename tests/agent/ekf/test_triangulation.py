@@ -21,20 +21,22 @@ def a_run(camera: Camera = CAMERA, seed: int = 0, landmarks: int = 150):  # type
 @pytest.mark.parametrize("camera", [CAMERA, AHEAD])
 def test_consistent_and_unbiased(camera: Camera) -> None:
     run, poses = a_run(camera)
-    found = triangulate(poses, run.pixels, camera)
+    triangulation = triangulate(poses, run.pixels, camera)
     truth = run.poses[-1].inverse().apply(run.points)
-    off = (found.rays[:, 2] - 1 / (truth[:, 0] - camera.mount_forward)) / np.sqrt(
-        found.ray_covariances[:, 2, 2]
+    off = (triangulation.rays[:, 2] - 1 / (truth[:, 0] - camera.mount_forward)) / np.sqrt(
+        triangulation.ray_covariances[:, 2, 2]
     )
     assert 0.7 < np.mean(off**2) < 1.4
     assert abs(np.mean(off)) < 0.3
-    assert 0.97 < np.mean(found.chi2) < 1.03
-    np.testing.assert_allclose(found.points_in_robot[:, 0], found.depths + camera.mount_forward)
+    assert 0.97 < np.mean(triangulation.chi2) < 1.03
+    np.testing.assert_allclose(
+        triangulation.points_in_robot[:, 0], triangulation.depths + camera.mount_forward
+    )
 
 
 def test_same_as_scipy_on_one_track() -> None:
     run, poses = a_run(AHEAD, landmarks=8)
-    found = triangulate(poses, run.pixels, AHEAD, reference=poses[0])
+    triangulation = triangulate(poses, run.pixels, AHEAD, reference=poses[0])
     for i in range(8):
 
         def residual(point: np.ndarray, track: int = i) -> np.ndarray:
@@ -43,7 +45,7 @@ def test_same_as_scipy_on_one_track() -> None:
             return off[np.isfinite(off)]
 
         best = least_squares(residual, run.points[i], xtol=1e-12, ftol=1e-12)
-        np.testing.assert_allclose(found.points_in_robot[i], best.x, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(triangulation.points_in_robot[i], best.x, rtol=1e-4, atol=1e-5)
 
 
 def test_reference_frames_agree() -> None:
@@ -58,9 +60,9 @@ def test_a_track_that_moves_shows_in_chi2() -> None:
     run, poses = a_run()
     pixels = run.pixels.copy()
     pixels[40:, 3] += np.linspace(0, 30, len(poses) - 40)[:, None]
-    found = triangulate(poses, pixels, CAMERA)
-    assert found.chi2[3] > 4
-    assert (np.delete(found.chi2, 3) < 2).all()
+    triangulation = triangulate(poses, pixels, CAMERA)
+    assert triangulation.chi2[3] > 4
+    assert (np.delete(triangulation.chi2, 3) < 2).all()
 
 
 def test_pure_rotation_gives_no_depth() -> None:
@@ -68,8 +70,8 @@ def test_pure_rotation_gives_no_depth() -> None:
     points = np.array([[3.0, 0.2, 0.4], [2.0, -0.3, 0.1]])
     rng = np.random.default_rng(0)
     seen = np.stack([CAMERA.project(Pose2.from_vector(p).inverse().apply(points)) for p in poses])
-    found = triangulate(poses, seen + 0.7 * rng.normal(size=seen.shape), CAMERA)
-    assert (found.depth_sigmas > 100).all()
+    triangulation = triangulate(poses, seen + 0.7 * rng.normal(size=seen.shape), CAMERA)
+    assert (triangulation.depth_sigmas > 100).all()
 
 
 def test_tracks_seen_once_or_never_are_nan() -> None:
@@ -77,10 +79,10 @@ def test_tracks_seen_once_or_never_are_nan() -> None:
     pixels = run.pixels.copy()
     pixels[:, 0] = np.nan
     pixels[1:, 1] = np.nan
-    found = triangulate(poses, pixels, CAMERA)
-    assert np.isnan(found.depths[:2]).all()
-    assert np.isfinite(found.depths[2:]).all()
-    assert found.seen[1] == 1
+    triangulation = triangulate(poses, pixels, CAMERA)
+    assert np.isnan(triangulation.depths[:2]).all()
+    assert np.isfinite(triangulation.depths[2:]).all()
+    assert triangulation.seen[1] == 1
 
 
 def test_shapes_are_checked() -> None:

@@ -27,14 +27,16 @@ BODY = RobotDescription(
 ALL_AROUND = np.array([[0.1, 0.1, heading, 0.5] for heading in np.arange(0.0, math.tau, 0.7)])
 
 
-def live(walls, settings: ExplorerSettings, ticks: int, told: dict[int, Answer], seed: int = 0) -> list[Step]:
-    """Let a pipeline explore a wide room with pictures ahead, with what it is told at some ticks."""
+def live(
+    walls, settings: ExplorerSettings, ticks: int, result: dict[int, Answer], seed: int = 0
+) -> list[Step]:
+    """Let a pipeline explore a wide room with pictures ahead, with given answers at some ticks."""
     pipeline = Pipeline(MAP, BODY, AgentSettings(exploration=settings, seed=seed))
     pipeline.set_mission(Explore())
     pose, moved, steps = Pose2(), Odometry(0.0, 0.0), []
     for tick in range(ticks):
         seen = Observation(tick * 100_000_000, moved, walls.render(pose), np.full(len(BEARINGS), 2.0))
-        step = pipeline.step(seen, (told[tick],) if tick in told else ())
+        step = pipeline.step(seen, (result[tick],) if tick in result else ())
         moved = Odometry(step.command.forward * BODY.tick, step.command.turn * BODY.tick)
         pose = pose @ moved.motion()
         steps.append(step)
@@ -43,8 +45,8 @@ def live(walls, settings: ExplorerSettings, ticks: int, told: dict[int, Answer],
 
 def doings(steps: list[Step]) -> list[str]:
     """What it did, in order, without repetitions."""
-    said = [step.status.doing for step in steps]
-    return [b for a, b in zip([None, *said], said, strict=False) if a != b]
+    lines = [step.status.doing for step in steps]
+    return [b for a, b in zip([None, *lines], lines, strict=False) if a != b]
 
 
 def questions(steps: list[Step]) -> list[WhatIsKnown]:
@@ -73,8 +75,8 @@ def test_no_answer_changes_nothing(walls, error):
 def test_it_does_not_map_places_that_others_have_covered(walls):
     alone = doings(live(walls, ExplorerSettings(), 12, {}))
     assert alone[:2] == [Phase.LOOKING, Phase.DRIVING]
-    told = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND, ""))})
-    assert doings(told)[1] == Phase.SCANNING
+    result = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND, ""))})
+    assert doings(result)[1] == Phase.SCANNING
     half = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND[:4], ""))})
     assert doings(half)[1] == Phase.DRIVING
     far = ALL_AROUND + np.array([2.0, 0.0, 0.0, 0.0])

@@ -75,9 +75,9 @@ def test_a_place_is_covered_by_its_nodes_fields_of_view():
     here = np.array([1.0, 2.0])
     share = 2 * CAMERA.semi_aperture / math.tau
     assert seen_around(views_of(HybridMap()), here, 0.7) == 0.0
-    one = a_map(Pose2(1.2, 2.0, 0.3))
-    assert seen_around(views_of(one), here, 0.7) == pytest.approx(share, abs=1 / 36)
-    assert seen_around(views_of(one), here, 0.1) == 0.0
+    hybrid_map = a_map(Pose2(1.2, 2.0, 0.3))
+    assert seen_around(views_of(hybrid_map), here, 0.7) == pytest.approx(share, abs=1 / 36)
+    assert seen_around(views_of(hybrid_map), here, 0.1) == 0.0
     assert seen_around(
         views_of(a_map(Pose2(1.2, 2.0, 0.3), Pose2(0.9, 2.0, 0.3))), here, 0.7
     ) == pytest.approx(share, abs=1 / 36), "twice the same way is no more"
@@ -155,8 +155,8 @@ def test_floor_behind_walls_attracts_no_exploration():
     assert end > 3.0
     around = floor.unknown_around(1.6, NOBODY)
     assert around[tuple(floor.cells(np.zeros(2)))] > 0.1, "which a square around it does not tell"
-    told = floor.unknown_in_sight(np.array([[2.5, 0.0]]), np.array([[4.0, 0.0]]), 1.6, 3.0)
-    assert told[0] < end
+    result = floor.unknown_in_sight(np.array([[2.5, 0.0]]), np.array([[4.0, 0.0]]), 1.6, 3.0)
+    assert result[0] < end
 
 
 def test_visible_floor_agrees_with_a_test_of_each_cell():
@@ -172,20 +172,20 @@ def test_visible_floor_agrees_with_a_test_of_each_cell():
             line = here + np.arange(0.0, 1.0, 0.01 / away)[:, None] * (cell - here)
             at = floor.cells(line)
             area += 0.01 * (not occupied[at[:, 0], at[:, 1]].any())
-    (found,) = floor.unknown_in_sight(here[None], NOBODY, 1.6, reach)
+    (result,) = floor.unknown_in_sight(here[None], NOBODY, 1.6, reach)
     assert area > 2.0
-    assert found == pytest.approx(area, rel=0.1)
+    assert result == pytest.approx(area, rel=0.1)
 
 
 def test_floor_that_others_know_is_not_unknown():
     """Against counting the cells of a square one by one."""
-    floor, told = corridor(), np.array([[3.0, 1.0], [-4.0, 0.0]])
-    without, shares = floor.unknown_around(1.0, NOBODY), floor.unknown_around(1.0, told)
+    floor, result = corridor(), np.array([[3.0, 1.0], [-4.0, 0.0]])
+    without, shares = floor.unknown_around(1.0, NOBODY), floor.unknown_around(1.0, result)
     here = tuple(floor.cells(np.array([3.0, 0.0])))
     square = [np.array([3.0 + dx, dy]) for dx in np.arange(-10, 11) * 0.1 for dy in np.arange(-10, 11) * 0.1]
     point = floor.unknown_around(0.0, NOBODY)
     unknown = [point[tuple(floor.cells(p + 0.05))] > 0.5 for p in square]
-    left = [u and math.dist(p + 0.05, told[0] + 0.05) > 1.0 for u, p in zip(unknown, square, strict=True)]
+    left = [u and math.dist(p + 0.05, result[0] + 0.05) > 1.0 for u, p in zip(unknown, square, strict=True)]
     assert without[here] == pytest.approx(np.mean(unknown), abs=1e-6)
     assert shares[here] == pytest.approx(np.mean(left), abs=0.03)
     far = tuple(floor.cells(np.array([0.0, 5.0])))

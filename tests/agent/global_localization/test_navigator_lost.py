@@ -139,8 +139,8 @@ def test_a_robot_that_has_lost_all_landmarks_turns_to_headings_of_nearby_nodes(h
     own = OwnMap(own_map, np.random.default_rng(0))
     lost = GlobalLocalization(BODY, eyes, motion, own, TO_NAVIGATE, FleetMap(motion))  # type: ignore[arg-type]
     # The wheels' belief is off by a little.
-    believed = TOUR[0].inverse() @ TOUR[1] @ Pose2(0.1, -0.05, turned + 0.08)
-    behaviour, moved, way, fix = lost.search(believed), Odometry(0.0, 0.0), 0.0, None
+    estimated = TOUR[0].inverse() @ TOUR[1] @ Pose2(0.1, -0.05, turned + 0.08)
+    behaviour, moved, way, fix = lost.search(estimated), Odometry(0.0, 0.0), 0.0, None
     answers: tuple[Answer, ...] = ()
     for tick in range(200):
         motion.take_in(Observation(tick * 100_000_000, moved, IMAGE, FREE), answers)

@@ -84,7 +84,7 @@ class Body:
 
 def search(
     own_map: HybridMap,
-    body: Body,
+    robot: Body,
     ticks: int = 1000,
     drives: bool = True,
     policy: SearchPolicy = QUICK,
@@ -98,7 +98,7 @@ def search(
 
     Args:
         own_map: its map.
-        body: it.
+        robot: it.
         ticks: the time.
         drives: whether it may.
         policy: of the resumption.
@@ -108,50 +108,50 @@ def search(
         scale: by how much too far they turn then.
         camera: whether there are images.
     """
-    resumption = Resumption(description, body, own_map, drives, policy=policy)  # type: ignore[arg-type]
+    resumption = Resumption(description, robot, own_map, drives, policy=policy)  # type: ignore[arg-type]
     moved, path = Odometry(0.0, 0.0), iter(carry)
     for tick in range(ticks):
         image = np.zeros((240, 320), np.uint8) if camera else None
         command = resumption.step(Observation(tick * 100_000_000, moved, image, proximity))
-        body.commands.append(command)
-        if not body.said or body.said[-1] != resumption.detail:
-            body.said.append(resumption.detail)
+        robot.commands.append(command)
+        if not robot.said or robot.said[-1] != resumption.detail:
+            robot.said.append(resumption.detail)
         if resumption.found is not None or resumption.lost:
             break
         there = next(path, None)
         if there is not None:
-            step = body.pose.inverse() @ there
-            moved, body.pose = Odometry(step.x, scale * step.heading), there
+            step = robot.pose.inverse() @ there
+            moved, robot.pose = Odometry(step.x, scale * step.heading), there
         else:
             moved = Odometry(command.forward * BODY.tick, command.turn * BODY.tick)
-            body.pose = body.pose @ moved.motion()
+            robot.pose = robot.pose @ moved.motion()
     return resumption
 
 
-def turned(body: Body) -> float:
+def turned(robot: Body) -> float:
     """By how much a body has turned, rad."""
-    return sum(abs(command.turn) for command in body.commands) * BODY.tick
+    return sum(abs(command.turn) for command in robot.commands) * BODY.tick
 
 
 @pytest.mark.parametrize("heading", [0.1, 1.5, -2.0, math.pi])
 def test_it_turns_until_two_views_agree_where_it_is(home, own_map, heading):
     start = PLACE @ Pose2(0.15, -0.1, heading)
-    body = Body(home, start)
-    resumption = search(own_map, body)
-    found = resumption.found
-    assert found is not None
-    here = found.node.map_from_robot.mean @ found.recognition.node_from_robot.mean
-    assert here.distance(PLACE.inverse() @ body.pose) < 0.05
-    assert abs(wrap_angle(here.heading - body.pose.heading)) < 0.03
-    assert body.commands[-1] == Command()
-    assert all(command.forward == 0.0 for command in body.commands)
-    assert OTHER_VIEW[1] <= turned(body) < math.pi, "and no further than it needs"
+    robot = Body(home, start)
+    resumption = search(own_map, robot)
+    result = resumption.found
+    assert result is not None
+    here = result.node.map_from_robot.mean @ result.recognition.node_from_robot.mean
+    assert here.distance(PLACE.inverse() @ robot.pose) < 0.05
+    assert abs(wrap_angle(here.heading - robot.pose.heading)) < 0.03
+    assert robot.commands[-1] == Command()
+    assert all(command.forward == 0.0 for command in robot.commands)
+    assert OTHER_VIEW[1] <= turned(robot) < math.pi, "and no further than it needs"
     # The rangers' readings are kept with the poses from which they were taken.
-    assert len(resumption.seen) == len(body.commands)
+    assert len(resumption.seen) == len(robot.commands)
     for odom_from_robot, _ in resumption.seen:
         assert odom_from_robot.distance(Pose2()) < 1e-9
-    assert (start @ resumption.odom_from_robot).distance(body.pose) < 1e-9
-    assert abs(wrap_angle((start @ resumption.odom_from_robot).heading - body.pose.heading)) < 1e-9
+    assert (start @ resumption.odom_from_robot).distance(robot.pose) < 1e-9
+    assert abs(wrap_angle((start @ resumption.odom_from_robot).heading - robot.pose.heading)) < 1e-9
 
 
 def test_a_twin_of_one_wall_is_not_enough(home, elsewhere, own_map):
@@ -160,36 +160,36 @@ def test_a_twin_of_one_wall_is_not_enough(home, elsewhere, own_map):
     wall = World(home.points[on_wall], home.normals[on_wall], home.vectors[on_wall])
     other = np.flatnonzero(elsewhere.points[:, 0] < 4.5)
     rest = World(elsewhere.points[other], elsewhere.normals[other], elsewhere.vectors[other])
-    body = Body(wall + rest, PLACE)
-    resumption = search(own_map, body)
+    robot = Body(wall + rest, PLACE)
+    resumption = search(own_map, robot)
     assert resumption.found is None
     assert resumption.lost
-    assert any("landmarks agree; another view must, too" in said for said in body.said)
-    assert body.said[-1] == ("cannot localize on its own map of 7 nodes: no two views agreed at 2 places")
+    assert any("landmarks agree; another view must, too" in lines for lines in robot.said)
+    assert robot.said[-1] == ("cannot localize on its own map of 7 nodes: no two views agreed at 2 places")
 
 
 def test_without_recognition_it_searches_elsewhere_and_gives_up(elsewhere, own_map):
-    body = Body(elsewhere, PLACE)
-    resumption = search(own_map, body)
+    robot = Body(elsewhere, PLACE)
+    resumption = search(own_map, robot)
     assert resumption.lost
     assert resumption.found is None
-    assert body.said[-1] == ("cannot localize on its own map of 7 nodes: nothing was recognised at 2 places")
-    assert "none of 7 nodes is recognised" in body.said
-    assert "nothing here is known: driving on to search from elsewhere" in body.said
-    assert turned(body) > 2 * math.tau
-    assert sum(c.forward for c in body.commands) * BODY.tick == pytest.approx(MOVE, abs=0.05)
+    assert robot.said[-1] == ("cannot localize on its own map of 7 nodes: nothing was recognised at 2 places")
+    assert "none of 7 nodes is recognised" in robot.said
+    assert "nothing here is known: driving on to search from elsewhere" in robot.said
+    assert turned(robot) > 2 * math.tau
+    assert sum(c.forward for c in robot.commands) * BODY.tick == pytest.approx(MOVE, abs=0.05)
 
 
 def test_it_turns_to_where_there_is_most_room(elsewhere, own_map):
     """Its rangers read the same after the turn, when what is near ahead stops it at once."""
     readings = np.full(len(BEARINGS), 0.05)
     readings[1:8] = 2.0
-    body = Body(elsewhere, PLACE)
-    assert search(own_map, body, proximity=readings).lost
-    assert "nothing here is known: driving on to search from elsewhere" in body.said
-    to_the_way = -sum(min(command.turn, 0.0) for command in body.commands) * BODY.tick
+    robot = Body(elsewhere, PLACE)
+    assert search(own_map, robot, proximity=readings).lost
+    assert "nothing here is known: driving on to search from elsewhere" in robot.said
+    to_the_way = -sum(min(command.turn, 0.0) for command in robot.commands) * BODY.tick
     assert to_the_way == pytest.approx(-BEARINGS[4], abs=0.1)
-    assert all(command.forward == 0.0 for command in body.commands)
+    assert all(command.forward == 0.0 for command in robot.commands)
 
 
 @pytest.mark.parametrize(
@@ -201,45 +201,45 @@ def test_it_turns_to_where_there_is_most_room(elsewhere, own_map):
     ids=["no room", "no rangers"],
 )
 def test_without_room_that_it_can_see_it_stays(elsewhere, own_map, proximity, description):
-    body = Body(elsewhere, PLACE)
-    assert search(own_map, body, proximity=proximity, description=description).lost
-    assert body.said[-1].endswith("nothing was recognised at 1 place")
-    assert all(command.forward == 0.0 for command in body.commands)
+    robot = Body(elsewhere, PLACE)
+    assert search(own_map, robot, proximity=proximity, description=description).lost
+    assert robot.said[-1].endswith("nothing was recognised at 1 place")
+    assert all(command.forward == 0.0 for command in robot.commands)
 
 
 @pytest.mark.parametrize("camera", [True, False])
 def test_with_a_covered_lens_it_is_never_lost(own_map, camera):
-    body = Body(None, PLACE)
-    assert not search(own_map, body, camera=camera).lost
-    assert body.said == ["looking", "only 0 features in view" if camera else "no image from the camera"]
-    assert all(command.forward == 0.0 for command in body.commands)
+    robot = Body(None, PLACE)
+    assert not search(own_map, robot, camera=camera).lost
+    assert robot.said == ["looking", "only 0 features in view" if camera else "no image from the camera"]
+    assert all(command.forward == 0.0 for command in robot.commands)
 
 
 def test_a_carried_robot_waits_until_it_has_seen_two_views(home, own_map):
-    body = Body(home, PLACE)
+    robot = Body(home, PLACE)
     path = [PLACE] * 20 + [PLACE @ Pose2(0.0, 0.0, 0.05 * k) for k in range(60)]
-    resumption = search(own_map, body, ticks=80, drives=False, carry=path)
+    resumption = search(own_map, robot, ticks=80, drives=False, carry=path)
     assert resumption.found is not None
-    assert 20 < len(body.commands) < 60
-    assert set(body.commands) == {Command()}
-    assert body.said[0].startswith("waiting to recognise a place of its own map: node")
+    assert 20 < len(robot.commands) < 60
+    assert set(robot.commands) == {Command()}
+    assert robot.said[0].startswith("waiting to recognise a place of its own map: node")
 
 
 def test_a_carried_robot_need_not_turn(home):
     tour = [Pose2(1.0 + 0.4 * k, 2.0) for k in range(5)]
     path = [Pose2(1.0 + 0.05 * k, 2.1) for k in range(50)]
-    body = Body(home, path[0])
-    resumption = search(map_of(home, tour), body, ticks=50, drives=False, carry=path)
+    robot = Body(home, path[0])
+    resumption = search(map_of(home, tour), robot, ticks=50, drives=False, carry=path)
     assert resumption.found is not None
-    assert body.pose.x - path[0].x >= OTHER_VIEW[0]
+    assert robot.pose.x - path[0].x >= OTHER_VIEW[0]
 
 
 def test_a_carried_robot_gives_up_in_the_end(elsewhere, own_map):
     patience = replace(TO_MAP, carried_views=5)
-    body = Body(elsewhere, PLACE)
-    assert search(own_map, body, drives=False, policy=patience).lost
-    assert body.said[-1].endswith("nothing was recognised in 5 images")
-    assert len(body.commands) == pytest.approx(5 * patience.carried_pause / BODY.tick, abs=6)
+    robot = Body(elsewhere, PLACE)
+    assert search(own_map, robot, drives=False, policy=patience).lost
+    assert robot.said[-1].endswith("nothing was recognised in 5 images")
+    assert len(robot.commands) == pytest.approx(5 * patience.carried_pause / BODY.tick, abs=6)
 
 
 @pytest.mark.parametrize(("apart", "counts"), [(9.0, False), (0.1, True)])
@@ -248,41 +248,41 @@ def test_neither_of_two_similar_places_is_accepted(home, own_map, apart, counts)
     node = next(iter(own_map.nodes.values()))
     every = np.arange(len(node.landmarks))
     there = replace(node.map_from_robot, mean=Pose2(apart))
-    one = replace(node, landmarks=node.landmarks.take(every % 2 == 0))
-    two = replace(
+    a = replace(node, landmarks=node.landmarks.take(every % 2 == 0))
+    b = replace(
         node,
         id=node.id._replace(number=99),
         map_from_robot=there,
         landmarks=node.landmarks.take(every % 2 == 1),
     )
-    body = Body(home, PLACE)
-    search(HybridMap([NodePut(one), NodePut(two)]), body, ticks=3)
-    assert ("look the same" in body.said[-1]) == (not counts)
-    assert ("another view must, too" in body.said[-1]) == counts
+    robot = Body(home, PLACE)
+    search(HybridMap([NodePut(a), NodePut(b)]), robot, ticks=3)
+    assert ("look the same" in robot.said[-1]) == (not counts)
+    assert ("another view must, too" in robot.said[-1]) == counts
 
 
 def test_a_recognition_that_is_not_exact_does_not_count(home, own_map):
-    body = Body(home, PLACE)
-    assert search(own_map, body, ticks=150, policy=replace(QUICK, sure=(1e-5, 1e-5))).found is None
-    assert any("is in view, but too far off" in said for said in body.said)
-    assert not any("landmarks agree" in said for said in body.said)
+    robot = Body(home, PLACE)
+    assert search(own_map, robot, ticks=150, policy=replace(QUICK, sure=(1e-5, 1e-5))).found is None
+    assert any("is in view, but too far off" in lines for lines in robot.said)
+    assert not any("landmarks agree" in lines for lines in robot.said)
 
 
 @pytest.mark.parametrize(("scale", "believed"), [(1.03, True), (0.97, True), (1.4, False), (0.5, False)])
 def test_views_agree_by_the_odometry_in_between(home, own_map, scale, believed):
-    body = Body(home, PLACE)
+    robot = Body(home, PLACE)
     path = [PLACE @ Pose2(0.0, 0.0, 0.05 * k) for k in range(80)]
-    resumption = search(own_map, body, ticks=80, drives=False, carry=path, scale=scale)
+    resumption = search(own_map, robot, ticks=80, drives=False, carry=path, scale=scale)
     assert (resumption.found is not None) == believed
 
 
 def test_the_same_observations_give_the_same_search(home, own_map):
-    bodies = [Body(home, PLACE @ Pose2(0.2, 0.1, 2.0)) for _ in range(2)]
-    one, two = (search(own_map, body) for body in bodies)
-    assert bodies[0].commands == bodies[1].commands
-    assert bodies[0].said == bodies[1].said
-    assert one.found is not None
-    assert two.found is not None
-    first, second = (found.recognition.node_from_robot for found in (one.found, two.found))
+    changes = [Body(home, PLACE @ Pose2(0.2, 0.1, 2.0)) for _ in range(2)]
+    a, b = (search(own_map, change) for change in changes)
+    assert changes[0].commands == changes[1].commands
+    assert changes[0].said == changes[1].said
+    assert a.found is not None
+    assert b.found is not None
+    first, second = (result.recognition.node_from_robot for result in (a.found, b.found))
     assert first.mean == second.mean
     assert np.array_equal(first.covariance, second.covariance)

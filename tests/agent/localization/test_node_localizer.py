@@ -60,8 +60,8 @@ def test_the_pose_after_a_drive(walls, description, node, start, slip):
     for tick in range(20):
         moved = Odometry(0.02 * math.cos(0.4 * tick), 0.02 * math.sin(0.3 * tick))
         pose = pose @ moved.motion()
-        told = Odometry(moved.forward * (1 + slip), moved.turn * (1 + slip))
-        localizer.step(Observation(tick, told, walls.render(pose)))
+        result = Odometry(moved.forward * (1 + slip), moved.turn * (1 + slip))
+        localizer.step(Observation(tick, result, walls.render(pose)))
     assert localizer.in_sight
     distance, angle = off(localizer, pose)
     assert distance < CENTIMETRES_3

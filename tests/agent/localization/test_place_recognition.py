@@ -47,9 +47,9 @@ def test_a_view_is_recognised_where_it_was_taken(world, tour, own_map, seed):
     near = tour[int(rng.integers(len(tour)))]
     true = near @ Pose2(*rng.uniform([-0.3, -0.3, -0.2], [0.3, 0.3, 0.2]))
     view, _ = take_view(world, true, rng)
-    found = recognise_place(own_map, view, rng)
-    assert found is not None
-    node, recognition = found
+    places = recognise_place(own_map, view, rng)
+    assert places is not None
+    node, recognition = places
     place = tour[(node.id.number - 1) // 2]
     answered = place @ recognition.node_from_robot.mean
     assert answered.distance(true) < 0.10
@@ -63,9 +63,9 @@ def test_the_node_with_the_most_inliers_is_named(world, tour, own_map, monkeypat
     monkeypatch.setattr(place_recognition, "VOTES", 1)
     rng = np.random.default_rng(3)
     view, _ = take_view(world, tour[3], rng)
-    found = recognise_place(own_map, view, rng)
-    assert found is not None
-    assert found[0].id.number == 2 * 3 + 1
+    places = recognise_place(own_map, view, rng)
+    assert places is not None
+    assert places[0].id.number == 2 * 3 + 1
 
 
 def test_a_room_that_was_never_mapped_is_not_recognised(own_map):
@@ -103,12 +103,12 @@ def test_the_limits_are_heeded(world, own_map, monkeypatch, limit, value):
 
 def test_the_same_chance_gives_the_same_answer(world, own_map):
     view, _ = take_view(world, Pose2(22.1, 2.4, 1.0), np.random.default_rng(0))
-    one, two = (recognise_place(own_map, view, np.random.default_rng(5)) for _ in range(2))
-    assert one is not None
-    assert two is not None
-    assert one[0].id == two[0].id
-    assert np.array_equal(one[1].pairs, two[1].pairs)
-    assert one[1].node_from_robot.mean == two[1].node_from_robot.mean
+    a, b = (recognise_place(own_map, view, np.random.default_rng(5)) for _ in range(2))
+    assert a is not None
+    assert b is not None
+    assert a[0].id == b[0].id
+    assert np.array_equal(a[1].pairs, b[1].pairs)
+    assert a[1].node_from_robot.mean == b[1].node_from_robot.mean
 
 
 def test_two_similar_places_are_reported_and_neighbours_are_not(world, own_map):
@@ -120,17 +120,17 @@ def test_two_similar_places_are_reported_and_neighbours_are_not(world, own_map):
 
     def recalled(aside: float):
         pose = replace(node.map_from_robot, mean=node.map_from_robot.mean @ Pose2(0.0, aside))
-        other = replace(node, id=node.id._replace(number=99), map_from_robot=pose, landmarks=rest)
-        found = recognise_places(HybridMap([NodePut(node), NodePut(other)]), view, np.random.default_rng(0))
-        assert [one.id.number for one, _ in found] == [node.id.number, 99]
-        return found
+        b = replace(node, id=node.id._replace(number=99), map_from_robot=pose, landmarks=rest)
+        places = recognise_places(HybridMap([NodePut(node), NodePut(b)]), view, np.random.default_rng(0))
+        assert [a.id.number for a, _ in places] == [node.id.number, 99]
+        return places
 
     far, near = recalled(3.0), recalled(0.2)
     share = far[1][1].inliers / far[0][1].inliers
     assert 0.3 < share < 0.7
-    told = lookalikes(far, 0.9 * share, 0.5)
-    assert told is not None
-    assert [one.id.number for one in told] == [node.id.number, 99]
+    result = lookalikes(far, 0.9 * share, 0.5)
+    assert result is not None
+    assert [a.id.number for a in result] == [node.id.number, 99]
     assert lookalikes(far, 1.1 * share, 0.5) is None, "it is not seen about as well"
     assert lookalikes(near, 0.9 * share, 0.5) is None, "it is not elsewhere"
     assert lookalikes(far[:1], 0.1, 0.5) is None

@@ -74,34 +74,34 @@ def test_a_dazzled_camera_has_no_features(walls, continuity):
 def test_the_same_wall_from_further_back_is_not_the_same(walls, continuity):
     """Less than half of what was in view is found where it should be."""
     expected = np.random.default_rng(0).uniform([20, 20], [300, 220], (40, 2))
-    found = expected.copy()
-    found[16:] = np.nan
+    result = expected.copy()
+    result[16:] = np.nan
     assert (
-        continuity.compare(walls.render(HERE), walls.render(HERE), 0.0, expected, found)
+        continuity.compare(walls.render(HERE), walls.render(HERE), 0.0, expected, result)
         is FrameOverlap.STRANGE
     )
-    found[:28] = expected[:28] + 10.0
+    result[:28] = expected[:28] + 10.0
     assert (
-        continuity.compare(walls.render(HERE), walls.render(HERE), 0.0, expected, found) is FrameOverlap.SAME
+        continuity.compare(walls.render(HERE), walls.render(HERE), 0.0, expected, result) is FrameOverlap.SAME
     )
 
 
 def test_two_blank_walls_cannot_be_told_apart(continuity):
     rng = np.random.default_rng(0)
-    one, two = (np.clip(rng.normal(128, 2, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2))
-    assert continuity.compare(one, two, 0.0, NOTHING, NOTHING) is FrameOverlap.SAME
+    first, second = (np.clip(rng.normal(128, 2, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2))
+    assert continuity.compare(first, second, 0.0, NOTHING, NOTHING) is FrameOverlap.SAME
 
 
 def test_tracks_decide_first(walls, continuity, elsewhere):
     """Where enough tracks should be in the image the corners are not asked."""
     expected = np.random.default_rng(0).uniform([20, 20], [300, 220], (40, 2))
-    found = expected + 3.0
-    assert continuity.compare(walls.render(HERE), elsewhere, 0.0, expected, found) is FrameOverlap.SAME
-    found[6:] = np.nan
+    result = expected + 3.0
+    assert continuity.compare(walls.render(HERE), elsewhere, 0.0, expected, result) is FrameOverlap.SAME
+    result[6:] = np.nan
     seen = walls.render(HERE)
-    assert continuity.compare(seen, seen, 0.0, expected, found) is FrameOverlap.STRANGE
-    found = expected + 60.0
-    assert continuity.compare(seen, seen, 0.0, expected, found) is FrameOverlap.STRANGE, (
+    assert continuity.compare(seen, seen, 0.0, expected, result) is FrameOverlap.STRANGE
+    result = expected + 60.0
+    assert continuity.compare(seen, seen, 0.0, expected, result) is FrameOverlap.STRANGE, (
         "other points than those"
     )
 
@@ -205,10 +205,10 @@ def test_a_few_tracks_that_are_lost_at_once_leave_it_to_the_whole_image(walls, c
     """A robot near a smooth wall lost ten of twelve tracks in one frame, and took itself for carried off."""
     seen, on = walls.render(HERE), walls.render(HERE @ Pose2(0.02, 0.0, 0.01))
     expected = np.random.default_rng(0).uniform([20, 20], [300, 220], (12, 2))
-    found = expected.copy()
-    found[2:] = np.nan
-    assert continuity.compare(seen, on, 0.01, expected, found) is FrameOverlap.SAME
-    assert continuity.compare(seen, elsewhere, 0.01, expected, found) is FrameOverlap.STRANGE
+    result = expected.copy()
+    result[2:] = np.nan
+    assert continuity.compare(seen, on, 0.01, expected, result) is FrameOverlap.SAME
+    assert continuity.compare(seen, elsewhere, 0.01, expected, result) is FrameOverlap.STRANGE
     assert (
-        continuity.compare(seen, (on * 0.3).astype(np.uint8), 0.01, expected, found) is not FrameOverlap.SAME
+        continuity.compare(seen, (on * 0.3).astype(np.uint8), 0.01, expected, result) is not FrameOverlap.SAME
     )

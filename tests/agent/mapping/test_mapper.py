@@ -88,7 +88,7 @@ def test_a_covered_lens_and_lost_encoders_are_named(walls, description):
     mapper.step(walls.observe(pose, pose, 0))
     mapper.begin(walls.observe(pose, pose, 0))
     assert mapper.health == ""
-    told = []
+    collected = []
     for tick in range(1, 40):
         before, pose = pose, Pose2(0.02 * tick, 0.0, 0.05 * np.sin(0.4 * tick))
         seen = walls.observe(before, pose, tick)
@@ -97,22 +97,22 @@ def test_a_covered_lens_and_lost_encoders_are_named(walls, description):
         elif tick >= 30:
             seen = replace(seen, image=None)
         mapper.step(seen)
-        told.append(mapper.health)
-    assert not any(told[:18])
-    assert sum("refute" in health for health in told[19:26]) >= 4
-    assert told[-1] == "no image for 10 steps"
+        collected.append(mapper.health)
+    assert not any(collected[:18])
+    assert sum("refute" in health for health in collected[19:26]) >= 4
+    assert collected[-1] == "no image for 10 steps"
 
 
 def test_a_camera_that_turned_away_from_all_landmarks_has_not_failed(walls, description):
     mapper = Mapper(MapId("r", 1), description)
     poses = [Pose2(0.02 * k, 0.0, 0.0) for k in range(20)] + [Pose2(0.4, 0.0, 0.1 * k) for k in range(62)]
-    told = []
+    collected = []
     for tick, (before, pose) in enumerate(pairwise([poses[0], *poses])):
         seen = walls.observe(before, pose, tick)
         mapper.step(seen)
         if not mapper.started:
             mapper.begin(seen)
-        told.append(mapper.health)
-    assert "landmark" in told[-1], "it has turned away from what it mapped"
+        collected.append(mapper.health)
+    assert "landmark" in collected[-1], "it has turned away from what it mapped"
     mapper.finish(seen)
     assert mapper.anchor_features > 0 and mapper.health == ""

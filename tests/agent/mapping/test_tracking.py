@@ -88,7 +88,7 @@ def test_further_tracks_hold_the_heading_when_wheels_lie(walls, description):
 def test_tracks_that_do_not_correct_the_filter_are_expected_where_they_were_last(
     walls, description, monkeypatch
 ):
-    """Few tracks in one corner: wheels are trusted alone, lie by and by, and nobody carried the robot off.
+    """Few tracks in one corner: only wheels are trusted, they drift, and the robot was not carried off.
 
     A robot before a bare wall once took itself for carried off when its filter was 20 px off its tracks.
     """

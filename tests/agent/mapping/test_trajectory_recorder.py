@@ -34,10 +34,10 @@ def test_one_moment_a_second_with_the_readings(clocked):
     wayside.clear(0)
     for tick in range(1, 46):
         wayside.step(seen(tick), Pose2(0.01 * tick, 0.0, 0.002 * tick))
-    wake = wayside.wake(0, clocked.ranges(np.array([1.0, 3.0])))
-    assert wake.ages == pytest.approx([1.0, 2.0, 3.0, 4.0])
-    assert wake.node_from_robot == pytest.approx(np.outer([10, 20, 30, 40], [0.01, 0.0, 0.002]))
-    assert wake.distances == pytest.approx(np.tile([1.0 + clocked.radius, 3.0 + clocked.radius], (4, 1)))
+    segment = wayside.segment(0, clocked.ranges(np.array([1.0, 3.0])))
+    assert segment.ages == pytest.approx([1.0, 2.0, 3.0, 4.0])
+    assert segment.node_from_robot == pytest.approx(np.outer([10, 20, 30, 40], [0.01, 0.0, 0.002]))
+    assert segment.distances == pytest.approx(np.tile([1.0 + clocked.radius, 3.0 + clocked.radius], (4, 1)))
 
 
 def test_a_missing_reading_carries_no_information(clocked):
@@ -45,9 +45,9 @@ def test_a_missing_reading_carries_no_information(clocked):
     wayside.clear(0)
     for tick, proximity in ((10, (2.0, 2.0)), (20, ()), (30, (2.0, 2.0))):
         wayside.step(seen(tick, proximity), Pose2())
-    wake = wayside.wake(0, clocked.ranges(np.array([1.0, 3.0])))
+    segment = wayside.segment(0, clocked.ranges(np.array([1.0, 3.0])))
     # A ray that ends at the sensor has no information about what is behind.
-    assert wake.distances[1] == pytest.approx([0.0, 0.0]) and (wake.distances[[0, 2]] > 2.0).all()
+    assert segment.distances[1] == pytest.approx([0.0, 0.0]) and (segment.distances[[0, 2]] > 2.0).all()
 
 
 def test_a_robot_without_sensors_keeps_poses_and_one_without_a_clock_nothing(description):
@@ -56,17 +56,17 @@ def test_a_robot_without_sensors_keeps_poses_and_one_without_a_clock_nothing(des
         wayside = TrajectoryRecorder(robot)
         for tick in range(10, 40):
             wayside.step(seen(tick), Pose2())
-        wake = wayside.wake(0, robot.ranges(np.zeros(0)))
-        assert (len(wake), wake.distances.shape) == (count, (count, 0))
+        segment = wayside.segment(0, robot.ranges(np.zeros(0)))
+        assert (len(segment), segment.distances.shape) == (count, (count, 0))
 
 
 def test_a_long_wait_is_thinned_evenly(clocked):
     wayside = TrajectoryRecorder(clocked)
     for tick in range(1, 2500):
         wayside.step(seen(tick), Pose2())
-    wake = wayside.wake(0, clocked.ranges(np.array([1.0, 3.0])))
-    assert MOST / 2 <= len(wake) <= MOST
-    gaps = np.diff(wake.ages)
+    segment = wayside.segment(0, clocked.ranges(np.array([1.0, 3.0])))
+    assert MOST / 2 <= len(segment) <= MOST
+    gaps = np.diff(segment.ages)
     assert gaps.max() <= 16.1 and gaps.min() == pytest.approx(gaps.max(), abs=0.2)
 
 
@@ -77,10 +77,10 @@ def test_moments_before_a_view_that_became_no_node_belong_to_the_next(clocked):
     moved = Pose2(1.0, -0.5, 2.0)
     wayside.move_anchor(moved)
     wayside.step(seen(20), Pose2(0.2, 0.0, 0.1))
-    wake = wayside.wake(1_500_000_000, clocked.ranges(np.array([1.0, 3.0])))
-    assert wake.ages == pytest.approx([-0.5, 0.5])
-    first = moved @ Pose2(*wake.node_from_robot[0])
-    assert (first.vector, tuple(wake.node_from_robot[1])) == (
+    segment = wayside.segment(1_500_000_000, clocked.ranges(np.array([1.0, 3.0])))
+    assert segment.ages == pytest.approx([-0.5, 0.5])
+    first = moved @ Pose2(*segment.node_from_robot[0])
+    assert (first.vector, tuple(segment.node_from_robot[1])) == (
         pytest.approx([0.3, 0.1, 0.5]), pytest.approx((0.2, 0.0, 0.1))
     )  # fmt: skip
 

@@ -161,20 +161,22 @@ def test_a_goal_without_features_is_reached_by_its_neighbours(home):
     start = eyes.pose
     nav = navigator(eyes, NOWHERE, B)
     goal = bare(B)
-    looks: list[float] = []
+    observations: list[float] = []
 
     def fleet(question: Question) -> Answer:
         if isinstance(question, WhichWay):
             leg = RouteLeg(goal, PoseGaussian(Pose2(0.6) if question.start == A else Pose2(), EXACT), None)
             return Answer(question.number, RouteAnswer((leg,), "a way"))
-        looks.append((start.inverse() @ eyes.pose).x)
+        observations.append((start.inverse() @ eyes.pose).x)
         return found(question, here(A, start.inverse() @ eyes.pose))
 
     trial = Trial(nav, eyes, fleet)
     trial.run(60.0, lambda: nav.arrived)
     assert nav.arrived and "its own landmarks" in nav.detail
     assert (start @ Pose2(0.6)).distance(eyes.pose) < 0.03
-    assert len(looks) == 2 and looks[1] == pytest.approx(0.6, abs=0.03), "it has looked again at the goal"
+    assert len(observations) == 2 and observations[1] == pytest.approx(0.6, abs=0.03), (
+        "it has looked again at the goal"
+    )
 
 
 def test_a_photograph_of_unknown_distance_is_driven_to_and_a_vague_pose_is_not(home):
@@ -202,7 +204,7 @@ def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home):
     eyes = Eyes(home, Pose2(0.5, 2.0))
     settings = NavigatorSettings(blind_distance=1.0, further=0.5, looks=2)
     nav = navigator(eyes, NOWHERE, B, settings)
-    looks: list[float] = []
+    observations: list[float] = []
     ahead = RouteLeg(bare(B), PoseGaussian(Pose2(9.0), EXACT), None)
 
     def fleet(question: Question) -> Answer:
@@ -210,12 +212,12 @@ def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home):
             here_first = PoseGaussian(Pose2(), EXACT) if question.start == B else ahead.previous_from_node
             legs = (replace(ahead, previous_from_node=here_first),)
             return Answer(question.number, RouteAnswer(legs, "a way"))
-        looks.append(eyes.pose.x - 0.5)
-        return found(question, here(A, Pose2())) if len(looks) == 1 else found(question)
+        observations.append(eyes.pose.x - 0.5)
+        return found(question, here(A, Pose2())) if len(observations) == 1 else found(question)
 
     trial = Trial(nav, eyes, fleet)
-    trial.run(60.0, lambda: nav.stage == Stage.LOST and len(looks) > 3)
-    assert looks[1:4] == pytest.approx([1.0, 1.5, 2.0], abs=0.1)
+    trial.run(60.0, lambda: nav.stage == Stage.LOST and len(observations) > 3)
+    assert observations[1:4] == pytest.approx([1.0, 1.5, 2.0], abs=0.1)
     assert nav.stage == Stage.LOST and nav.fix is None
     assert nav.tally.relocalizations == 1
 

@@ -80,12 +80,12 @@ def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch
     held = photograph(node, scale, pitch, roll)
     pose, lens = Pose2(-0.7, 0.12, -0.1), Lens(ROBOT.camera, ROBOT.distortion)
     lookout = NodeDetector(ROBOT, lens, Sift(lens), np.random.default_rng(0))
-    believed = Pose2(scale * pose.x, scale * pose.y, pose.heading)
-    found = lookout.find(walls.render(pose), [Expected(0, held, believed)])
-    assert found is not None
+    estimated = Pose2(scale * pose.x, scale * pose.y, pose.heading)
+    detection = lookout.find(walls.render(pose), [Expected(0, held, estimated)])
+    assert detection is not None
     rng, route = np.random.default_rng(0), (RouteLeg(held, HERE, None),)
     follower = RouteFollower(
-        ROBOT, lens, Sift(lens), route, Fix.of(found[1]), LocalPlanner(ROBOT), AgentSettings(), rng
+        ROBOT, lens, Sift(lens), route, Fix.of(detection[1]), LocalPlanner(ROBOT), AgentSettings(), rng
     )
     odometry = Odometry(0.0, 0.0)
     for tick in range(400):
@@ -118,11 +118,11 @@ def test_a_new_detection_replaces_tracks_only_with_many_more_landmarks(walls, no
     image = walls.render(pose)
     lookout = NodeDetector(ROBOT, lens, Sift(lens), np.random.default_rng(0))
     view = Sift(lens).extract(image).view(CAMERA)
-    found = recognise(node, view, None, np.random.default_rng(0))
-    assert found is not None
-    assert found.inliers > 20
-    assert lookout.find(image, [Expected(0, node, pose, tracked=found.inliers - 2)]) is None
-    taken = lookout.find(image, [Expected(0, node, pose, tracked=found.inliers // 2)])
+    recognition = recognise(node, view, None, np.random.default_rng(0))
+    assert recognition is not None
+    assert recognition.inliers > 20
+    assert lookout.find(image, [Expected(0, node, pose, tracked=recognition.inliers - 2)]) is None
+    taken = lookout.find(image, [Expected(0, node, pose, tracked=recognition.inliers // 2)])
     assert taken is not None
     assert taken[1].pose.mean.distance(pose) < 0.05
 
@@ -132,9 +132,9 @@ def test_nodes_are_found_where_they_are_expected_only(walls, node):
     lookout = NodeDetector(ROBOT, lens, Sift(lens), np.random.default_rng(0))
     image, elsewhere = walls.render(pose), pose @ Pose2(-0.5)
     assert lookout.find(image, [Expected(3, node, elsewhere)]) is None
-    found = lookout.find(image, [Expected(7, node, elsewhere), Expected(3, node, elsewhere, doubt=2.0)])
-    assert found is not None
-    assert found[0] == 3
+    detection = lookout.find(image, [Expected(7, node, elsewhere), Expected(3, node, elsewhere, doubt=2.0)])
+    assert detection is not None
+    assert detection[0] == 3
 
 
 def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypatch):

@@ -77,14 +77,14 @@ def test_a_server_reports_the_newest_map_on_its_disk(hub: MemoryHub, bus: Memory
 
 
 def test_nonsense_answers_are_ignored(hub: MemoryHub, bus: MemoryBus) -> None:
-    said = [b"\x00", NewestMap(LARGEST + 1).encode()]
+    lines = [b"\x00", NewestMap(LARGEST + 1).encode()]
     liar = MemoryBus(hub)
 
     def answer(request: Request) -> None:
-        request.reply(said[0])
+        request.reply(lines[0])
 
     liar.serve(KEYS.all_acks("s0"), answer)
-    while said:
+    while lines:
         assert newest_on_server(bus, KEYS, "s0", "r0", 0.0) is None
-        said.pop(0)
+        lines.pop(0)
     liar.close()

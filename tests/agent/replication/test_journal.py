@@ -143,9 +143,9 @@ def test_pruning_waits_for_every_required_server(journal: Journal) -> None:
     assert journal.head(map_id) == 5
 
 
-def state(bodies: Iterator[ChangeBody]) -> tuple[dict[NodeId, bytes], dict[NodeId, bytes], set[object]]:
+def state(contents: Iterator[ChangeBody]) -> tuple[dict[NodeId, bytes], dict[NodeId, bytes], set[object]]:
     """What a replay makes, without the order of nodes."""
-    hybrid = HybridMap(bodies)
+    hybrid = HybridMap(contents)
     nodes = {key: encode_body(NodePut(node)) for key, node in hybrid.nodes.items()}
     edges = {key: encode_body(EdgePut(edge)) for key, edge in hybrid.edges.items()}
     return nodes, edges, {frozenset(component) for component in hybrid.components()}
@@ -202,8 +202,10 @@ def test_a_journal_in_use_is_refused(path: Path, journal: Journal) -> None:
         f"try: Journal(Path({str(path)!r}), 'r0')\n"
         "except InvalidFile as error: print(error)\n"
     )
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert said == f"{path}: agent journal is in use by another process\n"
+    output = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout
+    assert output == f"{path}: agent journal is in use by another process\n"
 
 
 @pytest.mark.parametrize("data", [b"no database at all" * 100, b"SQLite format 3\0" + b"\xff" * 4096])

@@ -77,8 +77,8 @@ def test_a_sound_log_gives_its_replay_and_numbers_above_all(
     journal.close()
     whole = HybridMap(log)
     loose = [e.id for e in whole.edges.values() if e.a not in whole.nodes or e.b not in whole.nodes]
-    for one in loose:
-        whole.apply(EdgeRetired(one))
+    for item in loose:
+        whole.apply(EdgeRetired(item))
     assert sorted(map(encode_body, kept.contents)) == sorted(map(encode_body, whole.contents()))
     used = {b.node.id.number for b in log if isinstance(b, NodePut)}
     used |= {b.edge.id.number for b in log if isinstance(b, EdgePut)}

@@ -51,18 +51,18 @@ def test_plans_lead_to_the_goal_in_view(
 ) -> None:
     draw_points, draw_start = draw
     rng = np.random.default_rng(5)
-    found = 0
+    count = 0
     for _ in range(15):
         points = draw_points(rng)
         start = draw_start(rng, points)
         around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
         plan = planner(around, start, 0.02, Price())
         if plan is not None:
-            found += 1
+            count += 1
             assert plan.start == start
             assert plan.length >= math.hypot(start.x, start.y) - 1e-9
             check(plan, start, points, robot.camera, seen, around.obstacles)
-    assert found >= 12
+    assert count >= 12
 
 
 @pytest.mark.parametrize("half", [0.3, 0.45, 0.6])

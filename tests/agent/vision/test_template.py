@@ -60,15 +60,15 @@ def test_slopes_are_those_of_finite_differences(pictures, name):
             (patches(image, at + step)[0] - patches(image, at - step)[0]) / (2 * h)
             for step in (np.array([h, 0]), np.array([0, h]))
         ]
-        found = templates.slopes[number] / weights
+        result = templates.slopes[number] / weights
         for k, wanted in enumerate(expected):
             # Half a pixel is no small step: contrast changes a little over it, which slopes leave out.
-            assert np.corrcoef(found[k], wanted)[0, 1] > 0.97
-            assert np.linalg.norm(found[k]) == pytest.approx(np.linalg.norm(wanted), rel=0.15)
+            assert np.corrcoef(result[k], wanted)[0, 1] > 0.97
+            assert np.linalg.norm(result[k]) == pytest.approx(np.linalg.norm(wanted), rel=0.15)
         grown = (patches(image, at, 1.05)[0] - patches(image, at, 0.95)[0]) / 0.1
-        assert np.corrcoef(found[2], grown)[0, 1] > 0.9
-        assert np.abs(found @ (weights * patch)).max() < 2e-3, "contrast changes nothing"
-        assert np.abs(found @ weights).max() < 2e-3, "nor does brightness"
+        assert np.corrcoef(result[2], grown)[0, 1] > 0.9
+        assert np.abs(result @ (weights * patch)).max() < 2e-3, "contrast changes nothing"
+        assert np.abs(result @ weights).max() < 2e-3, "nor does brightness"
 
 
 @pytest.mark.parametrize("name", ["camera", "coins", "page"])
@@ -91,9 +91,9 @@ def test_a_match_is_the_best_there_is(pictures, name):
             (weights * wanted) @ patches(seen, at + np.array([dx, dy]), scale * growth)[0]
             for dx in steps for dy in steps for growth in growths
         ]  # fmt: skip
-        found = (weights * wanted) @ patches(seen, at, scale)[0]
+        result = (weights * wanted) @ patches(seen, at, scale)[0]
         # Along an edge the optimum is flat, and Gauss and Newton's model of it is not exact.
-        assert max(alike) - found < 0.004
+        assert max(alike) - result < 0.004
         checked += 1
     assert checked >= 4
 
@@ -171,9 +171,9 @@ def test_matching_changes_nothing_and_repeats_itself(pictures):
     matcher = TemplateMatcher()
     templates = matcher.cut(image, SPOTS)
     were = [column.copy() for column in templates.columns]
-    one, two = (matcher.match(templates, seen, SPOTS) for _ in range(2))
-    assert np.array_equal(one.raw, two.raw)
-    assert np.array_equal(one.templates.scales, two.templates.scales)
+    first, second = (matcher.match(templates, seen, SPOTS) for _ in range(2))
+    assert np.array_equal(first.raw, second.raw)
+    assert np.array_equal(first.templates.scales, second.templates.scales)
     assert all(np.array_equal(a, b) for a, b in zip(templates.columns, were, strict=True))
 
 

@@ -50,10 +50,10 @@ def ask(served: Web, query: str, of: str = "explain") -> tuple[int, dict]:
 
 
 def test_maps_and_nodes_are_explained(served: Web) -> None:
-    status, told = ask(served, "")
-    (one,) = told["maps"]
+    status, result = ask(served, "")
+    (one,) = result["maps"]
     assert status == 200 and one["joined"] and (one["first"], one["second"]) == ("r0.1", "r1.1")
-    assert ask(served, "?a=r1.1&b=r0.1") == (200, told)
+    assert ask(served, "?a=r1.1&b=r0.1") == (200, result)
     weakest = one["nearest"][0]
     status, pair = ask(served, f"?a={weakest['b']}&b={weakest['a']}")
     merged = two_maps()
@@ -79,14 +79,14 @@ def test_maps_and_nodes_are_explained(served: Web) -> None:
     ],
 )
 def test_unknown_nodes_are_reported_in_one_line(served: Web, query: str, words: str) -> None:
-    status, told = ask(served, query)
-    assert status == 400 and words in told["error"] and "\n" not in told["error"]
+    status, result = ask(served, query)
+    assert status == 400 and words in result["error"] and "\n" not in result["error"]
 
 
 def test_a_busy_server_gives_a_retry_time(served: Web, desk: Desk) -> None:
     desk.refusal = Busy(0.5)
-    status, told = ask(served, "")
-    assert status == 503 and told["retry_after"] == 0.5
+    status, result = ask(served, "")
+    assert status == 503 and result["retry_after"] == 0.5
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -97,11 +97,11 @@ def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: py
         a, b = (NodeId.parse(word) for word in page.run(LINKS)[0].split(" - "))
         page.run("document.querySelector('#told a').click()")
         eventually(lambda: f"{a} and {b}: linked: " in page.run(TOLD))
-        told = explain_nodes(two_maps(), a, b)
-        assert page.run(count(".agree")) == len(told.shared)
-        assert page.run(count(".alike")) == len(told.matches) - len(told.shared)
-        assert page.run(count("circle")) == len(told.a.landmarks) + len(told.b.landmarks)
-        assert f"{told.a_from_b.mean.x:.3f} m ahead" in page.run(TOLD)
+        explanation = explain_nodes(two_maps(), a, b)
+        assert page.run(count(".agree")) == len(explanation.shared)
+        assert page.run(count(".alike")) == len(explanation.matches) - len(explanation.shared)
+        assert page.run(count("circle")) == len(explanation.a.landmarks) + len(explanation.b.landmarks)
+        assert f"{explanation.a_from_b.mean.x:.3f} m ahead" in page.run(TOLD)
         # The address shows the same page at once, and the back button works.
         address = page.run("return location.href")
         assert address.endswith(f"/why?a={a}&b={b}")
@@ -123,22 +123,25 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(
     served: Web, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     start, goal = NodeId("r0", 1, 1), NodeId("r1", 1, 7)
-    told = explain_route(Router(two_maps()), start, goal)
-    assert told.found and ask(served, f"?a={start}&b={goal}", "route") == (200, json_values(told))
+    explanation = explain_route(Router(two_maps()), start, goal)
+    assert explanation.found and ask(served, f"?a={start}&b={goal}", "route") == (
+        200,
+        json_values(explanation),
+    )
     with Browser(tmp_path_factory.mktemp("profile")) as page:
         page.open(f"http://127.0.0.1:{served.port}/why")
         page.type("#a", str(start))
         page.type("#b", str(goal))
         page.run("document.querySelector('[name=route]').click()")
-        eventually(lambda: f"{start} to {goal}: the way leads so: {told.reason}" in page.run(TOLD))
-        assert page.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in told.hops]
+        eventually(lambda: f"{start} to {goal}: the route is: {explanation.reason}" in page.run(TOLD))
+        assert page.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in explanation.hops]
         address = page.run("return location.href")
         assert address.endswith(f"/why?a={start}&b={goal}&route=1")
         page.open(f"http://127.0.0.1:{served.port}/why")
         page.open(address)
-        eventually(lambda: f"{start} to {goal}: the way leads so" in page.run(TOLD))
+        eventually(lambda: f"{start} to {goal}: the route is" in page.run(TOLD))
         page.run("document.querySelector('#told a').click()")
-        eventually(lambda: f"{told.hops[0].a} and {told.hops[0].b}: " in page.run(TOLD))
+        eventually(lambda: f"{explanation.hops[0].a} and {explanation.hops[0].b}: " in page.run(TOLD))
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -166,11 +169,11 @@ def test_the_history_is_listed_newest_first(
 def test_the_history_is_listed_with_times(served: Web, desk: Desk) -> None:
     desk.happenings = (MapEvent(10**18, MapEventKind.RULED, "no"),)
     with urlopen(f"http://127.0.0.1:{served.port}/history", timeout=20) as reply:
-        (one,) = json.load(reply)["history"]
-    assert one == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "ruled", "words": "no"}
+        (event,) = json.load(reply)["history"]
+    assert event == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "ruled", "words": "no"}
 
 
 def test_a_way_leads_from_node_to_node(served: Web) -> None:
     for query, words in (("", "write /route?a="), ("?a=r0.1&b=r1.1", "from node to node")):
-        status, told = ask(served, query, "route")
-        assert status == 400 and words in told["error"]
+        status, result = ask(served, query, "route")
+        assert status == 400 and words in result["error"]

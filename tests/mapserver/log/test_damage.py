@@ -59,27 +59,27 @@ def edge(map_id: MapId, number: int, a: int, b: int) -> EdgePut:
 
 def life(map_id: MapId, rng: np.random.Generator, length: int) -> list[ChangeBody]:
     """Nodes with edges; some are put again, some are retired."""
-    bodies: list[ChangeBody] = []
+    changes: list[ChangeBody] = []
     nodes: list[int] = []
     edges: list[int] = []
     for number in range(1, length):
         draw = rng.random()
         if len(nodes) < 3 or not edges or draw < 0.5:
-            bodies.append(node(map_id, number, rng))
+            changes.append(node(map_id, number, rng))
             nodes.append(number)
             if len(nodes) > 1:
                 edges.append(1000 + number)
-                bodies.append(edge(map_id, edges[-1], nodes[-2], number))
+                changes.append(edge(map_id, edges[-1], nodes[-2], number))
         elif draw < 0.7:
-            bodies.append(node(map_id, int(rng.choice(nodes)), rng))
+            changes.append(node(map_id, int(rng.choice(nodes)), rng))
         elif draw < 0.8:
             a, b = rng.choice(nodes, 2, replace=False)
-            bodies.append(edge(map_id, int(rng.choice(edges)), int(a), int(b)))
+            changes.append(edge(map_id, int(rng.choice(edges)), int(a), int(b)))
         elif draw < 0.9:
-            bodies.append(EdgeRetired(NodeId(*map_id, edges.pop(int(rng.integers(len(edges)))))))
+            changes.append(EdgeRetired(NodeId(*map_id, edges.pop(int(rng.integers(len(edges)))))))
         else:
-            bodies.append(NodeRetired(NodeId(*map_id, nodes.pop(int(rng.integers(len(nodes)))))))
-    return bodies
+            changes.append(NodeRetired(NodeId(*map_id, nodes.pop(int(rng.integers(len(nodes)))))))
+    return changes
 
 
 @dataclass
@@ -189,9 +189,9 @@ def truth(whole: Path) -> tuple[dict[MapId, list[bytes]], dict[MapId, list[bytes
 
 def journal_bodies(whole: Path, one: MapId) -> list[ChangeBody]:
     journal = Journal(whole / one.agent, one.agent)
-    bodies = list(journal.replay(one))
+    changes = list(journal.replay(one))
     journal.close()
-    return bodies
+    return changes
 
 
 def bodies_in(path: Path) -> list[tuple[MapId, int, bytes]]:
@@ -221,10 +221,10 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
         while True:
             map_id, sequence, body = rows[rng.integers(len(rows))]
             start = int(rng.integers(max(len(body) - 40, 1)))
-            found = data.find(body[start : start + 40])
-            if len(body) > 60 and found >= 0 and data.count(body[start : start + 40]) == 1:
+            position = data.find(body[start : start + 40])
+            if len(body) > 60 and position >= 0 and data.count(body[start : start + 40]) == 1:
                 break
-        flip(fleet.path, found + int(rng.integers(40)), int(rng.integers(8)))
+        flip(fleet.path, position + int(rng.integers(40)), int(rng.integers(8)))
         hit.add((map_id, sequence))
     fleet.start_server()
     lost = {(gap.map, k) for gap in fleet.store.damaged() for k in range(gap.first, gap.last + 1)}
@@ -351,7 +351,7 @@ def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog: pytest.Log
     disk.commit()
     disk.close()
     store = Store(fleet.path)
-    assert [ruling.stamp_ns for ruling in RulingBook(store).rulings.made] == [0, 2, 3, 4]
+    assert [constraint.stamp_ns for constraint in RulingBook(store).rulings.made] == [0, 2, 3, 4]
     assert "1 damaged rows of table ruling" in caplog.text
     store.close()
 
@@ -360,11 +360,11 @@ def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.
     monkeypatch.setattr(store_module, "MAX_RULINGS", 7)
     store = Store(fleet.path)
     book = RulingBook(store)
-    ruling = book.rulings.made[0]
+    constraint = book.rulings.made[0]
     for k in range(2):
-        book.add(replace(ruling, stamp_ns=100 + k))
+        book.add(replace(constraint, stamp_ns=100 + k))
     with pytest.raises(InvalidValue, match="the record of manual constraints is full: 7"):
-        book.add(ruling)
+        book.add(constraint)
     assert len(book.rulings.made) == 7
     store.close()
     store = Store(fleet.path)
@@ -385,8 +385,12 @@ def test_a_store_with_broken_pages_is_extracted(
     data[middle : middle + PAGE] = np.random.default_rng(3).bytes(PAGE)
     fleet.path.write_bytes(bytes(data))
     assert main(["server", "--data", str(fleet.folder), "--listen", f"tcp/127.0.0.1:{free_port()}"]) == 1
-    said = capfd.readouterr().err.splitlines()
-    assert len(said) == 1 and "is damaged (" in said[0] and "`mapweave map extract FILE -o FOLDER`" in said[0]
+    output = capfd.readouterr().err.splitlines()
+    assert (
+        len(output) == 1
+        and "is damaged (" in output[0]
+        and "`mapweave map extract FILE -o FOLDER`" in output[0]
+    )
     out = fleet.folder / "out"
     assert main(["map", "extract", str(fleet.path), "-o", str(out)]) == 1
     assert "pages that cannot be read" in capfd.readouterr().err
@@ -410,9 +414,9 @@ def test_a_whole_store_is_extracted_whole(
     before = fleet.path.read_bytes()
     assert main(["map", "extract", str(fleet.path), "-o", str(fleet.folder / "out")]) == 0
     assert capfd.readouterr().err == "" and fleet.path.read_bytes() == before
-    for one, bodies in maps.items():
+    for one, changes in maps.items():
         content = read_map_file(fleet.folder / "out" / f"{one}.mapweave")
-        assert sorted(map(encode_body, content.changes)) == bodies
+        assert sorted(map(encode_body, content.changes)) == changes
     for path, words in ((fleet.folder / "nothing", "no such file"), (Path(__file__), "cannot be read")):
         assert main(["map", "extract", str(path), "-o", str(fleet.folder / "out")]) == 1
         assert words in capfd.readouterr().err

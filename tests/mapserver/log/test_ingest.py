@@ -126,33 +126,33 @@ def test_a_fresh_epoch_is_another_map(hub: MemoryHub, server: Server, agent: Han
 
 
 def test_the_pause_doubles_and_a_sign_of_life_ends_it() -> None:
-    one = AgentLog(MAP, 1, PullSettings(grace=0.5, first_pause=1.0, longest_pause=5.0), newest=9)
-    assert one.missing(0.0) is None
-    assert one.missing(0.4) is None
-    assert one.missing(0.5) == LogRequest(1, 9)
-    assert one.missing(0.5) is None, "one at a time"
+    agent_log = AgentLog(MAP, 1, PullSettings(grace=0.5, first_pause=1.0, longest_pause=5.0), newest=9)
+    assert agent_log.missing(0.0) is None
+    assert agent_log.missing(0.4) is None
+    assert agent_log.missing(0.5) == LogRequest(1, 9)
+    assert agent_log.missing(0.5) is None, "one at a time"
     waits = []
     now = 0.5
     for _ in range(4):
-        one.pulled(now, gained=False)
-        waits.append(one.pull_at - now)
-        now = one.pull_at
-        assert one.missing(now) is not None
+        agent_log.pulled(now, gained=False)
+        waits.append(agent_log.pull_at - now)
+        now = agent_log.pull_at
+        assert agent_log.missing(now) is not None
     assert waits == [1.0, 2.0, 4.0, 5.0]
-    one.pulled(now, gained=False)
-    one.heard(now)
-    assert one.pull_at - now == 1.0
+    agent_log.pulled(now, gained=False)
+    agent_log.heard(now)
+    assert agent_log.pull_at - now == 1.0
 
 
 def test_memory_for_changes_ahead_is_bounded() -> None:
-    one = AgentLog(MAP, 1, PullSettings(ahead=10))
+    agent_log = AgentLog(MAP, 1, PullSettings(ahead=10))
     for sequence in range(2, 100):
-        one.offer(Entry(sequence, b"", "x"))
-    assert len(one.ahead) == 10
-    one.offer(Entry(1, b"", "x"))
-    assert [entry.sequence for entry in one.next_run()] == list(range(1, 12))
-    one.settled(Applied((), (), 5))
-    assert min(one.ahead) == 6
+        agent_log.offer(Entry(sequence, b"", "x"))
+    assert len(agent_log.ahead) == 10
+    agent_log.offer(Entry(1, b"", "x"))
+    assert [entry.sequence for entry in agent_log.next_run()] == list(range(1, 12))
+    agent_log.settled(Applied((), (), 5))
+    assert min(agent_log.ahead) == 6
 
 
 def test_messages_while_closing_are_no_error(server: Server, agent: HandAgent) -> None:

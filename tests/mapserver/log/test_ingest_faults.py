@@ -127,14 +127,14 @@ def test_the_store_becomes_the_journals(
     server.stop()
     server.start()
     for robot in robots:
-        for one in (one for one in maps if one.agent == robot.name):
-            journal = [encode_change(c) for c in robot.journal.changes(one, 1, robot.journal.head(one))]
-            stored = [encode_change(change) for change in server.store.replay(one)]
+        for map in (map for map in maps if map.agent == robot.name):
+            journal = [encode_change(c) for c in robot.journal.changes(map, 1, robot.journal.head(map))]
+            stored = [encode_change(change) for change in server.store.replay(map)]
             assert stored == journal
-            assert len(journal) == server.store.watermark(one)
+            assert len(journal) == server.store.watermark(map)
     for life in server.lives:
-        for one in maps:
-            passed_on = [change.sequence for change in life if change.map == one]
+        for map in maps:
+            passed_on = [change.sequence for change in life if change.map == map]
             assert passed_on == list(range(1, len(passed_on) + 1)), "once and in order, from the beginning"
     assert server.store.refused() == 0
     for robot in robots:

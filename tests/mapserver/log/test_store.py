@@ -183,21 +183,21 @@ def test_a_transaction_that_fails_leaves_nothing(path: Path, store: Store) -> No
 
 def test_the_wire_bytes_of_the_maps(store: Store) -> None:
     assert math.isnan(store.traffic().bytes_per_node)
-    bodies: list[ChangeBody] = [node_put(1, 100), node_put(1, 120), node_put(2, 50), edge_put(11, 1, 2)]
-    entries = [entry(k, body) for k, body in enumerate(bodies, 1)]
+    changes: list[ChangeBody] = [node_put(1, 100), node_put(1, 120), node_put(2, 50), edge_put(11, 1, 2)]
+    entries = [entry(k, body) for k, body in enumerate(changes, 1)]
     store.apply(MAP, 5, entries)
     store.apply(MAP, 5, entries)
-    sizes = [len(one.message) for one in entries]
+    sizes = [len(first.message) for first in entries]
     traffic = store.traffic(MAP)
     assert (traffic.nodes, traffic.node_puts, traffic.edge_puts) == (2, 3, 1)
     assert (traffic.node_bytes, traffic.edge_bytes) == (sum(sizes[:3]), sizes[3])
     assert traffic.bytes_per_node == pytest.approx(sum(sizes[:3]) / 3)
     assert store.traffic(OTHER).node_puts == 0
     assert store.traffic() == traffic
-    other = encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER)))
-    store.apply(OTHER, 5, [Entry.read(OTHER, 1, other)])
+    second = encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER)))
+    store.apply(OTHER, 5, [Entry.read(OTHER, 1, second)])
     assert store.traffic().nodes == 3
-    assert store.traffic().payload_bytes == sum(sizes) + len(other)
+    assert store.traffic().payload_bytes == sum(sizes) + len(second)
 
 
 def test_results_are_kept_by_name(store: Store) -> None:

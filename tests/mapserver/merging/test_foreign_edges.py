@@ -25,7 +25,7 @@ def sound() -> Log:
     log: Log = []
     for agent in ("r0", "r1"):
         nodes, edges = take_map(world, MapId(agent, 1), tour, rng)
-        log += [(MapId(agent, 1), body) for body in (*map(NodePut, nodes), *map(EdgePut, edges))]
+        log += [(MapId(agent, 1), change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))]
     return log
 
 

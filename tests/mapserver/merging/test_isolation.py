@@ -44,9 +44,9 @@ def test_the_good_rows_are_kept_and_usable(bad: list[list[int]], order: list[int
 
     kept, left_out = leave_out(order, attempt)
     assert kept | left_out.keys() == set(range(10)) and not kept & left_out.keys()
-    for one in left_out:
+    for node_id in left_out:
         with pytest.raises(ZeroDivisionError):
-            attempt(kept | {one})
+            attempt(kept | {node_id})
 
 
 def test_one_bad_map_of_many_is_found_in_few_attempts() -> None:
@@ -78,7 +78,7 @@ def logs() -> dict[MapId, Log]:
     out: dict[MapId, Log] = {}
     for map_id, world in ((R0, here), (R1, here), (BAD, elsewhere), (WORSE, here)):
         nodes, edges = take_map(world, map_id, tour, rng)
-        out[map_id] = [(map_id, body) for body in (*map(NodePut, nodes), *map(EdgePut, edges))]
+        out[map_id] = [(map_id, change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))]
     return out
 
 
@@ -87,9 +87,9 @@ def told() -> dict[MapId, Log]:
     return logs()
 
 
-def merger_of(told: dict[MapId, Log], *maps: MapId) -> Merger:
+def merger_of(result: dict[MapId, Log], *maps: MapId) -> Merger:
     merger = Merger()
-    merger.read(one for map_id in maps for one in told[map_id])
+    merger.read(item for map_id in maps for item in result[map_id])
     return merger
 
 
@@ -280,7 +280,7 @@ def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(told: dict[Ma
         next(body for _, body in told[BAD] if isinstance(body, kind)) for kind in (NodePut, EdgePut)
     )
     ids = [NodeId(*BAD, 100 + k) for k in range(12)]
-    log: Log = [(BAD, NodePut(replace(node.node, id=one))) for one in ids]
+    log: Log = [(BAD, NodePut(replace(node.node, id=node_id))) for node_id in ids]
     log += [
         (BAD, EdgePut(replace(edge.edge, id=NodeId(*BAD, 200 + k), a=a, b=b, a_from_b=far)))
         for k, (a, b) in enumerate(pairwise(ids))
@@ -295,7 +295,7 @@ def test_files_are_merged_with_all_maps_or_not_at_all(
 ) -> None:
     """Else the map would be missing in what is written."""
     alone_fails(monkeypatch, BAD)
-    maps = {one: HybridMap(body for _, body in told[one]) for one in (R0, BAD)}
+    maps = {item: HybridMap(body for _, body in told[item]) for item in (R0, BAD)}
     with pytest.raises(InvalidValue, match=r"map bad\.1 cannot be merged: the merge fails with it .*retire"):
         merge_parts(maps, ManualConstraints())
     retired = merge_parts(maps, ManualConstraints([ManualConstraint((BAD, BAD), True, "anna", 1)]))

@@ -57,14 +57,14 @@ def merger(scene: Scene) -> Merger:
     return scene.merger(scene.logs[A] + scene.logs[B])
 
 
-def same(one: MergedMap, two: MergedMap) -> bool:
+def same(first: MergedMap, second: MergedMap) -> bool:
     return (
-        [link.pair for link in one.links] == [link.pair for link in two.links]
-        and [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
-        and one.components == two.components
+        [link.pair for link in first.links] == [link.pair for link in second.links]
+        and [(r.pair, r.reason) for r in first.refused] == [(r.pair, r.reason) for r in second.refused]
+        and first.components == second.components
         and all(
-            np.array_equal(p.merged_from_robot.mean.vector, two.poses[n].merged_from_robot.mean.vector)
-            for n, p in one.poses.items()
+            np.array_equal(p.merged_from_robot.mean.vector, second.poses[n].merged_from_robot.mean.vector)
+            for n, p in first.poses.items()
         )
     )
 
@@ -169,14 +169,14 @@ def relocalizer(merger: Merger) -> Relocalizer:
 
 def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger) -> None:
     rng, service = np.random.default_rng(5), relocalizer(merger)
-    found, distances, errors = 0, [], []
+    count, distances, errors = 0, [], []
     for node, stop in list(scene.truth.items())[::2]:
         here = stop @ Pose2(*rng.uniform([-0.3, -0.3, -0.15], [0.3, 0.3, 0.15]))
         view, _ = take_view(scene.world, here, rng)
         answer = service.answer(view)
         if answer.certainty is not Certainty.FOUND:
             continue
-        found += 1
+        count += 1
         best = answer.candidates[0]
         true = scene.truth[best.node].inverse() @ here
         distances.append(best.node_from_robot.mahalanobis2(true))
@@ -186,7 +186,7 @@ def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger) -
         assert best.merged_from_robot is not None
         assert best.merged_from_robot.mean.distance(expected) < 1e-9
         assert node.map in (A, B)
-    assert found >= 11
+    assert count >= 11
     assert max(distances) < 20 and np.median(errors) < 0.06
 
 
@@ -220,9 +220,9 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
         if one.certainty is Certainty.FOUND:
             counts += few, len(examined) - few
             assert one.candidates[0].node.map in (A, B)
-            ours, theirs = one.candidates[0], two.candidates[0] if two.candidates else None
-            if theirs is not None and ours.merged_from_robot and theirs.merged_from_robot:
-                assert ours.merged_from_robot.mean.distance(theirs.merged_from_robot.mean) < 0.15
+            own, theirs = one.candidates[0], two.candidates[0] if two.candidates else None
+            if theirs is not None and own.merged_from_robot and theirs.merged_from_robot:
+                assert own.merged_from_robot.mean.distance(theirs.merged_from_robot.mean) < 0.15
     assert counts[0] > 3 and counts[0] < 0.5 * counts[1]
 
 
@@ -252,8 +252,8 @@ def test_two_similar_rooms_are_ambiguous() -> None:
     answer = service.answer(view)
     assert answer.certainty is Certainty.AMBIGUOUS
     assert {nodes[1].id, nodes[9].id} <= {candidate.node for candidate in answer.candidates}
-    told = [candidate.probability for candidate in answer.candidates]
-    assert "may be" in answer.reason and max(told) < 0.9 and sum(told) < 1.0 + 1e-9
+    collected = [candidate.probability for candidate in answer.candidates]
+    assert "may be" in answer.reason and max(collected) < 0.9 and sum(collected) < 1.0 + 1e-9
     # In the room between there is nothing to doubt.
     view, _ = take_view(world, stops[5] @ Pose2(0.1, 0.05, 0.05), rng)
     assert service.answer(view).certainty is Certainty.FOUND

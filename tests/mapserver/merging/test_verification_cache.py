@@ -38,7 +38,7 @@ def logged() -> Log:
     for map_id, rooms in ((A, (0, 5)), (B, (5, 10))):
         stops = [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.9 * k) for x in rooms for k in range(7)]
         nodes, edges = take_map(world, map_id, stops, rng)
-        log += [(map_id, body) for body in (*map(NodePut, nodes), *map(EdgePut, edges))]
+        log += [(map_id, change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))]
     return log
 
 
@@ -56,18 +56,18 @@ def saved(merger: Merger, path: Path) -> Path:
     return path.with_name(path.name + SUFFIX)
 
 
-def same(one: MergedMap, two: MergedMap) -> bool:
+def same(first: MergedMap, second: MergedMap) -> bool:
     """To the last bit."""
     return (
-        [link.pair for link in one.links] == [link.pair for link in two.links]
-        and [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
-        and list(one.poses) == list(two.poses)
+        [link.pair for link in first.links] == [link.pair for link in second.links]
+        and [(r.pair, r.reason) for r in first.refused] == [(r.pair, r.reason) for r in second.refused]
+        and list(first.poses) == list(second.poses)
         and all(
-            place.merged_from_robot.mean == two.poses[node].merged_from_robot.mean
+            place.merged_from_robot.mean == second.poses[node].merged_from_robot.mean
             and np.array_equal(
-                place.merged_from_robot.covariance, two.poses[node].merged_from_robot.covariance
+                place.merged_from_robot.covariance, second.poses[node].merged_from_robot.covariance
             )
-            for node, place in one.poses.items()
+            for node, place in first.poses.items()
         )
     )
 

@@ -60,12 +60,12 @@ def told_and_killed(store: Path) -> dict[str, Any]:
     process = subprocess.Popen([sys.executable, "-c", SERVER, str(store)], stdout=subprocess.PIPE)
     try:
         assert process.stdout is not None
-        told: dict[str, Any] = json.loads(process.stdout.readline())
+        collected: dict[str, Any] = json.loads(process.stdout.readline())
         eventually(store.with_name(store.name + SUFFIX).exists)
     finally:
         process.kill()
         process.communicate()
-    return told
+    return collected
 
 
 def test_a_server_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:

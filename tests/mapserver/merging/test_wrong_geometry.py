@@ -34,10 +34,10 @@ def answer_outcomes(merger: Merger, fleet: Fleet, scene: str) -> Counter[AnswerO
 def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     fleet = draw_fleet(SEED, SCENES["room"], Fault.SLIP, stops=2)
     alone = answer_outcomes(merged_fleet(fleet, frozenset({ODD})), fleet, "room")
-    merger, chronicle = merged_fleet(fleet), MapHistory()
+    merger, history = merged_fleet(fleet), MapHistory()
     merged = merger.merged()
-    chronicle.follow(merged)
-    assert chronicle.newest.startswith(f"map {ODD} contradicts r0.1, r1.1 and r2.1")
+    history.follow(merged)
+    assert history.newest.startswith(f"map {ODD} contradicts r0.1, r1.1 and r2.1")
     sound = [{node.map for node in part} for part in merged.components if ODD not in {n.map for n in part}]
     assert sound == [{MapId(f"r{k}", 1) for k in range(3)}]
     with_it = answer_outcomes(merger, fleet, "room")
@@ -46,11 +46,11 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
         with_it[AnswerOutcome.RIGHT] >= 0.9 * alone[AnswerOutcome.RIGHT] and not with_it[AnswerOutcome.WRONG]
     )
     # Reported once, and the map counts again when a person has retired those that it contradicts.
-    before = chronicle.happenings
-    chronicle.follow(merged)
-    assert chronicle.happenings == before
+    before = history.happenings
+    history.follow(merged)
+    assert history.happenings == before
     gone = [
-        ManualConstraint((one, one), True, "anna", 1, "moved") for one in (MapId("r0", 1), MapId("r1", 1))
+        ManualConstraint((item, item), True, "anna", 1, "moved") for item in (MapId("r0", 1), MapId("r1", 1))
     ]
     merger.rule(ManualConstraints(gone))
     assert not merger.merged().wrong

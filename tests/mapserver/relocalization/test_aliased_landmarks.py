@@ -35,8 +35,8 @@ def node(number: int, at: Pose2, seed: int):
 def test_an_aliased_node_explains_common_landmarks_and_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     first, twin = node(1, AT, 2), node(2, AT @ Pose2(0.1, -0.05, 0.1), 3)
     view, _ = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.05), np.random.default_rng(4))
-    found = recognise(first, view, None, np.random.default_rng(0))
-    assert found is not None
+    recognition = recognise(first, view, None, np.random.default_rng(0))
+    assert recognition is not None
     doubles = AliasedLandmarks(RecognitionSettings())
     likeness = doubles.compare(twin, first)
     assert likeness is not None
@@ -50,57 +50,57 @@ def test_an_aliased_node_explains_common_landmarks_and_is_cached(monkeypatch: py
         with pytest.raises(AssertionError, match="already"):
             doubles.compare(twin, replace(first, stamp_ns=first.stamp_ns + 1))  # changed
     settings = RecognitionSettings().matching
-    told = carried(twin, likeness, NodeMatch(first.id, found), view, settings, 12.0)
-    assert told.alike == first.id and told.node == twin.id
+    result = carried(twin, likeness, NodeMatch(first.id, recognition), view, settings, 12.0)
+    assert result.alike == first.id and result.node == twin.id
     # The twin is mapped 0.1 m aside, and the view is where it would be seen from there.
     expected = (AT @ Pose2(0.1, -0.05, 0.1)).inverse() @ AT @ Pose2(0.05, 0.0, 0.05)
-    assert told.recognition.node_from_robot.mean.distance(expected) < 0.05
+    assert result.recognition.node_from_robot.mean.distance(expected) < 0.05
     direct = recognise(twin, view, None, np.random.default_rng(0))
     assert direct is not None
-    shared = {tuple(pair) for pair in told.recognition.pairs} & {tuple(pair) for pair in direct.pairs}
+    shared = {tuple(pair) for pair in result.recognition.pairs} & {tuple(pair) for pair in direct.pairs}
     assert len(shared) > 0.6 * direct.inliers
-    assert len(set(told.recognition.pairs[:, 1])) == told.recognition.inliers
+    assert len(set(result.recognition.pairs[:, 1])) == result.recognition.inliers
 
 
 def nowhere_joined(places: list) -> MergedMap:
     """A map of parts that nothing joins, one a node."""
-    poses = {one.id: Placement(k, HERE) for k, one in enumerate(places)}
-    graphs = tuple(solve_graph(one.id, Pose2(), []) for one in places)
-    return MergedMap({}, (), (), tuple(frozenset([one.id]) for one in places), poses, graphs)
+    poses = {place.id: Placement(k, HERE) for k, place in enumerate(places)}
+    graphs = tuple(solve_graph(place.id, Pose2(), []) for place in places)
+    return MergedMap({}, (), (), tuple(frozenset([place.id]) for place in places), poses, graphs)
 
 
 def test_a_place_whose_twin_was_not_recognised_is_ambiguous() -> None:
     first, twin = node(1, AT, 2), node(2, AT, 3)
     view, _ = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.02), np.random.default_rng(4))
-    found = recognise(first, view, None, np.random.default_rng(0))
-    assert found is not None
+    recognition = recognise(first, view, None, np.random.default_rng(0))
+    assert recognition is not None
     places = [first, twin]
-    by_id = {one.id: one for one in places}
+    by_id = {place.id: place for place in places}
 
     class Ranked:
         def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
             return [(first.id, 2.0), (twin.id, 1.0)]
 
     service = Relocalizer(Ranked(), by_id.get, nowhere_joined(places))
-    matches = service.registration.refined(view, [NodeMatch(first.id, found)])
+    matches = service.registration.refined(view, [NodeMatch(first.id, recognition)])
     alone = service.conclude(Registration(Candidates(view, [(first.id, 2.0)]), matches))
     assert alone.certainty is Certainty.FOUND
     both = service.conclude(Registration(Candidates(view, Ranked().query(view)), matches))
-    assert both.certainty is Certainty.AMBIGUOUS and "look alike on the map" in both.reason
-    assert {one.node for one in both.candidates} == {first.id, twin.id}
-    assert max(one.probability for one in both.candidates) < 0.9
+    assert both.certainty is Certainty.AMBIGUOUS and "look the same on the map" in both.reason
+    assert {place.node for place in both.candidates} == {first.id, twin.id}
+    assert max(place.probability for place in both.candidates) < 0.9
 
 
 def test_landmarks_at_one_place_are_not_aliased() -> None:
     first, twin = node(1, AT, 2), node(2, AT, 3)
     view, _ = take_view(WORLD, AT, np.random.default_rng(4))
-    found = recognise(first, view, None, np.random.default_rng(0))
-    assert found is not None
-    poses = {one.id: Placement(0, PoseGaussian(AT, HERE.covariance)) for one in (first, twin)}
+    recognition = recognise(first, view, None, np.random.default_rng(0))
+    assert recognition is not None
+    poses = {item.id: Placement(0, PoseGaussian(AT, HERE.covariance)) for item in (first, twin)}
     merged = MergedMap({}, (), (), (frozenset(poses),), poses, ())
     service = Relocalizer(PlaceIndex(), {first.id: first, twin.id: twin}.get, merged)
     ranked = [(first.id, 2.0), (twin.id, 1.0)]
-    assert not service.aliasing.matches(view, NodeMatch(first.id, found), ranked)
+    assert not service.aliasing.matches(view, NodeMatch(first.id, recognition), ranked)
 
 
 def test_matches_that_a_pose_explains() -> None:
@@ -119,17 +119,17 @@ def test_matches_on_one_thing_count_as_isolated_only_if_the_rest_is_missing() ->
     middle = points[known[len(known) // 2]]
     near = known[np.argsort(np.linalg.norm(points[known] - middle, axis=1))[:12]]
     view, _ = take_view(WORLD, AT, np.random.default_rng(4), Sensing(most=150))
-    found = recognise(one, view, None, np.random.default_rng(0))
-    assert found is not None
-    evidence = {**found.evidence, "seen": 0.4}
+    recognition = recognise(one, view, None, np.random.default_rng(0))
+    assert recognition is not None
+    evidence = {**recognition.evidence, "seen": 0.4}
 
     def resting_on(landmarks: np.ndarray, camera: Camera, others: np.ndarray = NOTHING) -> bool:
         """Of a view that shows these landmarks, and other features at these pixels."""
         pixels = np.concatenate([one.landmarks.pixels[landmarks], others]).astype(np.float32)
         seen = View(pixels, np.zeros((len(pixels), 32), np.uint8), camera)
         pairs = np.column_stack([landmarks, np.arange(len(landmarks))])
-        told: Recognition = replace(found, node_from_robot=HERE, pairs=pairs, evidence=evidence)
-        return is_lonely(one, seen, told)
+        result: Recognition = replace(recognition, node_from_robot=HERE, pairs=pairs, evidence=evidence)
+        return is_lonely(one, seen, result)
 
     spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(points[near][:, :2].T))[-1]))
     assert spread < 0.35
@@ -149,20 +149,20 @@ def test_matches_on_one_thing_count_as_isolated_only_if_the_rest_is_missing() ->
 def test_a_person_occludes_one_strip() -> None:
     """Against all strips that begin at a missing landmark, feature by feature."""
     rng, counts = np.random.default_rng(6), set()
-    found = recognise(node(1, AT, 2), take_view(WORLD, AT, np.random.default_rng(4))[0], None, rng)
-    assert found is not None
+    recognition = recognise(node(1, AT, 2), take_view(WORLD, AT, np.random.default_rng(4))[0], None, rng)
+    assert recognition is not None
     for _ in range(60):
         agree, missing = int(rng.integers(5, 20)), rng.uniform(0, 320, int(rng.integers(1, 15)))
         across = np.concatenate([rng.normal(rng.uniform(60, 260), 40, agree), rng.uniform(0, 320, 20)])
         pixels = np.column_stack([across, np.full(len(across), 100.0)]).astype(np.float32)
         view = View(pixels, np.zeros((len(across), 32), np.uint8), CAMERA)
-        told = replace(found, pairs=np.column_stack([np.arange(agree)] * 2))
+        result = replace(recognition, pairs=np.column_stack([np.arange(agree)] * 2))
         most = 0
         for left in missing:
             strip = [k for k, u in enumerate(pixels[:, 0]) if left <= u <= left + 128]
             own, others = [k for k in strip if k < agree], [k for k in strip if k >= agree]
             if len(own) <= agree / 10 and len(others) >= 3:
                 most = max(most, sum(left <= u <= left + 128 for u in missing))
-        assert hidden(missing, view, told) == most
+        assert hidden(missing, view, result) == most
         counts.add(most)
     assert len(counts) > 4 and 0 in counts

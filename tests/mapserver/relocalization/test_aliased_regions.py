@@ -47,8 +47,8 @@ def taken(number: int, at: Pose2, shift: Pose2, seed: int, agent: str = "r0", wo
 
 def here_and_there(world=ROOM, agent: str = "r0") -> list[Node]:
     """The node that is recognised, its neighbours, and what was mapped of the second room."""
-    looks = [SEEN, *ASIDE]
-    here = [taken(1 + k, STOP @ look, Pose2(), 10 + k) for k, look in enumerate(looks)]
+    observations = [SEEN, *ASIDE]
+    here = [taken(1 + k, STOP @ look, Pose2(), 10 + k) for k, look in enumerate(observations)]
     there = [
         taken(4 + k, STOP @ look @ Pose2(0.06, 0.04, 0.05), AWAY, 20 + k, agent, world)
         for k, look in enumerate(ASIDE)
@@ -118,16 +118,16 @@ def test_unobserved_places_are_no_evidence() -> None:
     nodes = [*here, *there]
     answer = asked(nodes, joined(nodes)).answer(VIEW)
     assert answer.certainty is Certainty.AMBIGUOUS
-    assert answer.candidates[1].node in {one.id for one in there}
+    assert answer.candidates[1].node in {item.id for item in there}
     # A view of the same spot with other things decides; a view from elsewhere does not.
-    for turn, told in ((0.0, Certainty.FOUND), (0.9, Certainty.AMBIGUOUS)):
+    for turn, result in ((0.0, Certainty.FOUND), (0.9, Certainty.AMBIGUOUS)):
         other = taken(19, STOP @ SEEN @ Pose2(0.05, 0.0, turn), AWAY, 30, world=OTHER)
         more = [*nodes, other]
-        assert asked(more, joined(more)).answer(VIEW).certainty is told
+        assert asked(more, joined(more)).answer(VIEW).certainty is result
     # One thing that is there twice says nothing of what lies beside it.
     thing = [
-        replace(one, landmarks=one.landmarks.take(np.abs(one.landmarks.pixels[:, 0] - 160.0) < 35.0))
-        for one in there
+        replace(item, landmarks=item.landmarks.take(np.abs(item.landmarks.pixels[:, 0] - 160.0) < 35.0))
+        for item in there
     ]
     few = [*here[:2], thing[0]]
     settings = {"least_nodes": 1, "least_around": 1}
@@ -150,8 +150,8 @@ def test_the_needed_share_of_nodes_is_a_setting() -> None:
     assert (
         asked(nodes, merged, least_share=0.9, most_looked_at=-1.0).answer(VIEW).certainty is Certainty.FOUND
     )
-    told = asked(nodes, merged, least_nodes=2, least_share=0.3).answer(VIEW)
-    assert told.certainty is Certainty.AMBIGUOUS
+    result = asked(nodes, merged, least_nodes=2, least_share=0.3).answer(VIEW)
+    assert result.certainty is Certainty.AMBIGUOUS
 
 
 def test_the_same_room_mapped_twice_is_one_place() -> None:
@@ -174,11 +174,11 @@ def concluded(
 
 def test_maps_that_are_not_merged_have_their_own_frames() -> None:
     nodes = here_and_there(agent="r1")
-    found = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
-    assert found is not None
+    recognition = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
+    assert recognition is not None
     ranked = [(nodes[0].id, 2.0), (nodes[1].id, 0.1), (nodes[2].id, 0.1)]
     service = asked(nodes, MergedMap.empty())
-    answer = concluded(service, NodeMatch(nodes[0].id, found), ranked)
+    answer = concluded(service, NodeMatch(nodes[0].id, recognition), ranked)
     assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason
     assert answer.candidates[1].node.agent == "r1" and answer.candidates[1].merged_from_robot is None
 
@@ -189,8 +189,8 @@ def test_aliasing_is_cached_and_kept_up_to_date() -> None:
     index, alike = OnlyTheFirst(nodes, VIEW), AliasCache(RecognitionSettings())
 
     def of(node: Node, known: MergedMap = merged) -> set[NodeId]:
-        found = alike.of(node, index, by_id.get, lambda a, b: between(known, a, b))
-        return {one.other.id for one in found}
+        result = alike.of(node, index, by_id.get, lambda a, b: between(known, a, b))
+        return {one.other.id for one in result}
 
     one, twin = nodes[1], nodes[3]
     assert of(one) == {twin.id} and of(one) == {twin.id} and index.asked == 1
@@ -218,9 +218,9 @@ def test_a_merge_that_is_undone_is_noticed() -> None:
     index, alike = OnlyTheFirst([*nodes, again], VIEW), AliasCache(RecognitionSettings())
     by_id = {one.id: one for one in [*nodes, again]}
     for known, expected in ((merged, {nodes[3].id}), (MergedMap.empty(), {nodes[3].id, again.id})):
-        found = alike.of(nodes[1], index, by_id.get, lambda a, b, known=known: between(known, a, b))
-        assert {one.other.id for one in found} >= expected
-        assert (again.id in {one.other.id for one in found}) == (again.id in expected)
+        result = alike.of(nodes[1], index, by_id.get, lambda a, b, known=known: between(known, a, b))
+        assert {one.other.id for one in result} >= expected
+        assert (again.id in {one.other.id for one in result}) == (again.id in expected)
 
 
 def test_prepared_results_are_not_computed_again() -> None:
@@ -247,21 +247,25 @@ def test_a_server_evaluates_the_aliasing_of_nodes_in_advance(
 
     prepare = Relocalizer.prepare
     monkeypatch.setattr(Relocalizer, "prepare", noted)
-    upkeep = MergeWorker(schedule(), 1.0)
-    upkeep.start()
+    worker = MergeWorker(schedule(), 1.0)
+    worker.start()
     for k, one in enumerate(nodes):
-        upkeep.take(Change(one.id.map, k + 1, 0, NodePut(one)))
-    assert upkeep.settle(20.0)
-    eventually(lambda: all(upkeep._merger.alike.knows(one) for one in nodes))
-    upkeep.close()
+        worker.take(Change(one.id.map, k + 1, 0, NodePut(one)))
+    assert worker.settle(20.0)
+    eventually(lambda: all(worker._merger.alike.knows(one) for one in nodes))
+    worker.close()
     assert max(looked) == PREPARED_AT_ONCE
 
 
 def test_landmarks_without_depths_are_in_no_region() -> None:
     nodes = here_and_there()
-    found = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
-    assert found is not None
-    for blind, told in (({0}, Certainty.FOUND), ({0, 1, 2}, Certainty.FOUND), ({1, 2}, Certainty.AMBIGUOUS)):
+    recognition = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
+    assert recognition is not None
+    for blind, result in (
+        ({0}, Certainty.FOUND),
+        ({0, 1, 2}, Certainty.FOUND),
+        ({1, 2}, Certainty.AMBIGUOUS),
+    ):
         fewer = [
             replace(
                 one,
@@ -276,5 +280,5 @@ def test_landmarks_without_depths_are_in_no_region() -> None:
             for k, one in enumerate(nodes)
         ]
         service = asked(fewer, joined(fewer))
-        answer = concluded(service, NodeMatch(nodes[0].id, found), [(nodes[0].id, 2.0)])
-        assert answer.certainty is told
+        answer = concluded(service, NodeMatch(nodes[0].id, recognition), [(nodes[0].id, 2.0)])
+        assert answer.certainty is result

@@ -35,10 +35,10 @@ def places(seed: int) -> tuple[World, list[Node]]:
 
 
 def told(nodes: list[Node], view: View) -> RelocalizeAnswer:
-    one = HybridMap(map(NodePut, nodes))
+    hybrid_map = HybridMap(map(NodePut, nodes))
     way = PoseGaussian(NEXT, HERE.covariance)
-    one.apply(EdgePut(Edge(NodeId("p0", 1, 9), nodes[0].id, nodes[1].id, way, EdgeKind.MAPPED)))
-    index, maps = PlaceIndex(), {MapId("p0", 1): one}
+    hybrid_map.apply(EdgePut(Edge(NodeId("p0", 1, 9), nodes[0].id, nodes[1].id, way, EdgeKind.MAPPED)))
+    index, maps = PlaceIndex(), {MapId("p0", 1): hybrid_map}
     index.extend(nodes)
     merged = Islands().merge(maps, Verdicts(), set(maps), ManualConstraints())
     return Relocalizer(index, {node.id: node for node in nodes}.get, merged).answer(view)

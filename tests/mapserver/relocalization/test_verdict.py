@@ -55,7 +55,7 @@ OTHER_WAY = take_view(WORLD, ASIDE, np.random.default_rng(5))[0]
         (VIEW, Ranked(), {}, 18, Outcome.NO_CANDIDATE, "no node of any map"),
         (VIEW, FOUND, {}, 18, Outcome.NOT_RECOGNISED, "are gone"),
         (OTHER_WAY, FOUND, {NODE.id: NODE}, 18, Outcome.NOT_RECOGNISED, f"nearest is {NODE.id}"),
-        (VIEW, FOUND, {NODE.id: NODE}, 1000, Outcome.ONE_WEAK_NODE, "no other node says the same"),
+        (VIEW, FOUND, {NODE.id: NODE}, 1000, Outcome.ONE_WEAK_NODE, "no other node confirms it"),
         (VIEW, FOUND, {NODE.id: NODE}, 18, Outcome.FOUND, f"landmarks of {NODE.id} agree"),
     ],
     ids=["few features", "no candidate", "gone", "not recognised", "one weak node", "found"],

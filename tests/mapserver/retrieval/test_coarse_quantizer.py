@@ -39,9 +39,9 @@ def test_a_question_finds_nearly_all_of_the_nearest_means() -> None:
     means = CoarseQuantizer.learn(codes_of(8000, 3), 256)
     vectors = codes_of(200, 4).astype(np.float32)
     nearest = np.argsort(squared(vectors, means.means), axis=1)[:, :8]
-    found = means.searched.search(vectors, 8)[1]
+    result = means.searched.search(vectors, 8)[1]
     assert len(means.heads) == 16
-    assert np.mean([len(set(a) & set(b)) / 8 for a, b in zip(nearest, found, strict=True)]) > 0.9
+    assert np.mean([len(set(a) & set(b)) / 8 for a, b in zip(nearest, result, strict=True)]) > 0.9
 
 
 def test_few_landmarks_make_as_many_means_at_most() -> None:

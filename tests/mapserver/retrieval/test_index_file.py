@@ -51,11 +51,9 @@ def changed(node: Node) -> Node:
     return replace(node, landmarks=replace(node.landmarks, codes=node.landmarks.codes[::-1].copy()))
 
 
-def alike(one: PlaceIndex, two: PlaceIndex, views: list[View]) -> bool:
-    assert len(one) == len(two) and len(one.landmarks) == len(two.landmarks)
-    return all(
-        dict(one.query(view, 99)) == pytest.approx(dict(two.query(view, 99)), rel=1e-4) for view in views
-    )
+def alike(a: PlaceIndex, b: PlaceIndex, views: list[View]) -> bool:
+    assert len(a) == len(b) and len(a.landmarks) == len(b.landmarks)
+    return all(dict(a.query(view, 99)) == pytest.approx(dict(b.query(view, 99)), rel=1e-4) for view in views)
 
 
 @pytest.mark.parametrize("count", [5, 16])
@@ -72,9 +70,9 @@ def test_a_loaded_index_answers_as_the_saved_one(
     for node in nodes:
         assert again.overlaps(node, known.get) == pytest.approx(index.overlaps(node, known.get), rel=1e-4)
     # It goes on as if nothing had been: nodes come and go.
-    for one in (index, again):
-        one.extend(nodes)
-        one.remove(nodes[1].id)
+    for item in (index, again):
+        item.extend(nodes)
+        item.remove(nodes[1].id)
     assert alike(index, again, views)
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
 
@@ -189,9 +187,9 @@ def test_any_change_changes_the_fingerprint() -> None:
     assert len(others) == 204 and fingerprint(codes[:0]) == 0
 
 
-def put(store: Store, bodies: list[NodePut | NodeRetired], first: int = 1) -> None:
-    changes = [Change(MAP, first + k, 0, body) for k, body in enumerate(bodies)]
-    entries = [Entry.read(MAP, one.sequence, encode_change(one)) for one in changes]
+def put(store: Store, contents: list[NodePut | NodeRetired], first: int = 1) -> None:
+    changes = [Change(MAP, first + k, 0, body) for k, body in enumerate(contents)]
+    entries = [Entry.read(MAP, entry.sequence, encode_change(entry)) for entry in changes]
     assert not store.apply(MAP, 77, entries).refusals
 
 
@@ -218,10 +216,10 @@ def test_a_server_that_starts_again_has_its_places_at_once(
     put(store, [NodePut(node) for node in many(90)])
 
     def replayed() -> list[Node]:
-        return [one.body.node for one in store.replay(MAP) if isinstance(one.body, NodePut)]
+        return [entry.body.node for entry in store.replay(MAP) if isinstance(entry.body, NodePut)]
 
     places = PlaceDatabase(store, path)
-    assert f"made anew: {path}{SUFFIX}: there is none yet" in caplog.text and len(places) == 0
+    assert f"built again: {path}{SUFFIX}: there is none yet" in caplog.text and len(places) == 0
     places.put(replayed())
     places.close()
     put(store, [NodeRetired(NodeId("a", 1, 4)), *(NodePut(node) for node in many(3, 200))], 91)

@@ -48,11 +48,11 @@ def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]) -> None:
     codes, ids = landmarks
     cells, questions = filled(codes, ids, 64), asked(codes, 50, 2)
     every = squared_distances(decode(questions), decode(codes))
-    squared, found = cells.nearest(questions, 10, probes=1000)
+    squared, result = cells.nearest(questions, 10, probes=1000)
     assert np.allclose(squared, np.sort(every, axis=1)[:, :10], atol=1e-4)
     # Equal distances may come in any order.
     column = {int(number): k for k, number in enumerate(ids)}
-    again = np.array([[every[r, column[int(number)]] for number in row] for r, row in enumerate(found)])
+    again = np.array([[every[r, column[int(number)]] for number in row] for r, row in enumerate(result)])
     assert np.allclose(again, squared, atol=1e-4)
 
 
@@ -79,8 +79,8 @@ def test_removed_entries_are_gone_and_the_rest_is_kept(landmarks: tuple[Codes, I
 def test_the_same_landmarks_make_the_same_cells(landmarks: tuple[Codes, Ids]) -> None:
     codes, ids = landmarks
     questions = asked(codes, 100, 4)
-    one, two = (filled(codes, ids, 64).nearest(questions, 5, probes=2) for _ in range(2))
-    assert np.array_equal(one[1], two[1]) and np.array_equal(one[0], two[0])
+    a, b = (filled(codes, ids, 64).nearest(questions, 5, probes=2) for _ in range(2))
+    assert np.array_equal(a[1], b[1]) and np.array_equal(a[0], b[0])
 
 
 def test_fewer_landmarks_than_cells() -> None:
@@ -102,11 +102,11 @@ def test_forgetting_a_row_equals_forgetting_its_node(landmarks: tuple[Codes, Ids
         cells.remove(first, first + 100, gone[::-1] if told == "all" else 63 - gone)
         searched.remove(first, first + 100)
     assert len(cells) == len(searched) == 2700
-    for one, other in zip(contents(cells), contents(searched), strict=True):
-        assert np.array_equal(one, other)
+    for a, b in zip(contents(cells), contents(searched), strict=True):
+        assert np.array_equal(a, b)
     assert sum(lists.invlists.list_size(k) for k in range(lists.nlist)) == 2700
     questions = asked(codes, 50, 4)
-    for one, other in zip(cells.nearest(questions, 8, 64), searched.nearest(questions, 8, 64), strict=True):
-        assert np.array_equal(np.sort(one, axis=1), np.sort(other, axis=1))
+    for a, b in zip(cells.nearest(questions, 8, 64), searched.nearest(questions, 8, 64), strict=True):
+        assert np.array_equal(np.sort(a, axis=1), np.sort(b, axis=1))
     cells.add(codes[:100], np.arange(10_000, 10_100))
     assert len(cells) == 2800

@@ -57,11 +57,11 @@ def test_scores_against_brute_force(building: tuple[World, list[Node], list[Pose
     view, _ = take_view(world, tour[2], np.random.default_rng(2))
     view = View(view.pixels[:40], view.codes[:40], view.camera)
     expected = brute_force(few, view, s)
-    found = filled(few, s).query(view, k=8)
-    assert found
-    for node, score in found:
+    result = filled(few, s).query(view, k=8)
+    assert result
+    for node, score in result:
         assert score == pytest.approx(expected[node], rel=1e-3)
-    assert [node for node, _ in found] == sorted(
+    assert [node for node, _ in result] == sorted(
         (n for n in expected if expected[n] > 0), key=lambda n: -expected[n]
     )
 
@@ -83,9 +83,9 @@ def test_overlaps_are_those_of_the_exhaustive_table(building: tuple[World, list[
     assert len(table) > 10
     for node in nodes:
         expected = {(a if b == node.id else b): v for (a, b), v in table.items() if node.id in (a, b)}
-        found = index.overlaps(node, {}.get)
-        assert set(found) == set(expected)
-        for other, value in found.items():
+        result = index.overlaps(node, {}.get)
+        assert set(result) == set(expected)
+        for other, value in result.items():
             assert value == pytest.approx(expected[other], rel=1e-3)
 
 
@@ -102,8 +102,8 @@ def test_nodes_with_equal_landmarks_cost_no_more_than_others() -> None:
         nodes.append(Node(NodeId("a", 1, k), k, pose, CAMERA, marks))
         index.add(nodes[-1])
     assert len(index.landmarks) == 3 * MOST_LANDMARKS
-    told = index.landmarks.within(nodes[0].landmarks.codes[:10], 0.5)
-    assert told is not None and np.bincount(told[0]).max() <= MOST_WITHIN
+    result = index.landmarks.within(nodes[0].landmarks.codes[:10], 0.5)
+    assert result is not None and np.bincount(result[0]).max() <= MOST_WITHIN
     # The first of equals are returned: they need not be of every node.
     assert index.overlaps(nodes[2], {}.get).keys() <= {nodes[0].id, nodes[1].id}
     index.remove(nodes[1].id, nodes[1].landmarks.codes)
@@ -123,11 +123,11 @@ def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(
     missed = 0
     for node in nodes:
         expected = {(a if b == node.id else b): v for (a, b), v in table.items() if node.id in (a, b)}
-        found = all_of_them.overlaps(node, known.get)
-        assert all(found[other] == pytest.approx(expected[other], rel=1e-3) for other in found)
-        missed += len(expected) - len(found)
+        result = all_of_them.overlaps(node, known.get)
+        assert all(result[other] == pytest.approx(expected[other], rel=1e-3) for other in result)
+        missed += len(expected) - len(result)
         best = few.overlaps(node, known.get)
-        assert len(best) <= 3 and best.items() <= found.items() and node.id not in best
+        assert len(best) <= 3 and best.items() <= result.items() and node.id not in best
     assert missed <= 0.1 * 2 * len(table)
     assert few.overlaps(nodes[0], {}.get) == {}
 
@@ -189,7 +189,7 @@ def test_a_removed_node_stays_removed_despite_its_landmarks(
 def test_dropped_landmarks_are_removed_at_any_number(
     building: tuple[World, list[Node], list[Pose2]], few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(place_index, "FEW_GONE", few)
+    monkeypatch.setattr(place_index, "FEW_REMOVED", few)
     searched: list[bool] = []
     real = InvertedFile.remove
 
@@ -267,8 +267,8 @@ def test_cells_are_trained_in_the_background(building: tuple[World, list[Node], 
     plain = filled(nodes[1:])
     assert len(index.landmarks) == len(plain.landmarks)
     view, _ = take_view(world, tour[5], np.random.default_rng(10))
-    ours, theirs = dict(index.query(view, 5)), dict(plain.query(view, 5))
-    assert set(ours) == set(theirs)
+    own, theirs = dict(index.query(view, 5)), dict(plain.query(view, 5))
+    assert set(own) == set(theirs)
 
 
 def test_an_index_that_cannot_be_trained_reports_it_and_goes_on(

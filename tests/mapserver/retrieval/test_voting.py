@@ -19,15 +19,15 @@ def test_votes_against_plain_loops() -> None:
                 best[slot] = max(best.get(slot, 0.0), 1 - d / 0.5**2)
         for slot, weight in best.items():
             expected[slot] += weight / np.sqrt(len(best))
-    found, scores = voting.votes(squared, slots, 0.5)
-    assert dict(zip(found.tolist(), scores.tolist(), strict=True)) == pytest.approx(
+    votes, scores = voting.votes(squared, slots, 0.5)
+    assert dict(zip(votes.tolist(), scores.tolist(), strict=True)) == pytest.approx(
         {slot: score for slot, score in expected.items() if score > 0}
     )
 
 
 def test_distant_descriptors_get_no_votes() -> None:
-    found, scores = voting.votes(np.full((3, 2), 1.0, np.float32), np.array([[1, 2]] * 3), 0.5)
-    assert len(found) == len(scores) == 0
+    votes, scores = voting.votes(np.full((3, 2), 1.0, np.float32), np.array([[1, 2]] * 3), 0.5)
+    assert len(votes) == len(scores) == 0
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -40,7 +40,7 @@ def test_overlaps_agree_with_one_node_at_a_time(seed: int) -> None:
         int(slot): overlap(rows[slots == slot], columns[slots == slot], squared[slots == slot], 0.5)
         for slot in set(slots.tolist())
     }
-    found, values = voting.overlaps(rows, columns, squared, slots, 0.5, 3.0)
-    assert dict(zip(found.tolist(), values.tolist(), strict=True)) == pytest.approx(
+    overlaps, values = voting.overlaps(rows, columns, squared, slots, 0.5, 3.0)
+    assert dict(zip(overlaps.tolist(), values.tolist(), strict=True)) == pytest.approx(
         {slot: value for slot, value in expected.items() if value >= 3.0}
     )

@@ -27,9 +27,9 @@ def attempts() -> list[Attempt]:
     rng = np.random.default_rng(1)
     attempts = []
     for seed in range(5, 12):
-        ate, recall, found = float(rng.uniform(0, 0.1)), float(rng.uniform(0, 1)), seed != 7
+        ate, recall, result = float(rng.uniform(0, 0.1)), float(rng.uniform(0, 1)), seed != 7
         figures = replace(
-            FIGURES, merged_ate_m=ate, link_recall=recall, found=found, nodes=int(rng.integers(99))
+            FIGURES, merged_ate_m=ate, link_recall=recall, found=result, nodes=int(rng.integers(99))
         )
         attempts.append(Attempt(seed, figures, check(figures, WANTED)))
     attempts.append(Attempt(12, failure="agent r0 [it] died with status 3"))
@@ -41,11 +41,11 @@ def test_median_and_worst_are_of_the_right_side(attempts):
     figures = {a.seed: a.figures for a in attempts if a.figures}
     ates = {seed: f.merged_ate_m for seed, f in figures.items()}
     recalls = {seed: f.link_recall for seed, f in figures.items()}
-    ate, recall, found = by_name["merged_ate_m"], by_name["link_recall"], by_name["found"]
+    ate, recall, result = by_name["merged_ate_m"], by_name["link_recall"], by_name["found"]
     assert ate.median == pytest.approx(np.median(list(ates.values())))
     assert (ate.worst, ate.worst_seed) == (max(ates.values()), max(ates, key=ates.get))
     assert (recall.worst, recall.worst_seed) == (min(recalls.values()), min(recalls, key=recalls.get))
-    assert (found.worst, found.worst_seed, found.median) == (0.0, 7, 1.0)
+    assert (result.worst, result.worst_seed, result.median) == (0.0, 7, 1.0)
     assert by_name["nodes"].worst is None, "neither more nor less of them is better"
     assert (by_name["nodes"].least, by_name["nodes"].most) == (
         min(f.nodes for f in figures.values()), max(f.nodes for f in figures.values()),

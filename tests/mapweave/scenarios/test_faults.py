@@ -76,8 +76,8 @@ def test_a_bad_day(tmp_path):
     assert min(stamps) < killed < max(stamps)
     # What the journal has the store has, in the same order: counted here without the trial's own count.
     store = Store(options.out / "server" / "s0.sqlite")
-    for one in (journal.maps()[0],):
-        assert [c.sequence for c in store.replay(one)] == list(range(1, journal.head(one) + 1))
+    for item in (journal.maps()[0],):
+        assert [c.sequence for c in store.replay(item)] == list(range(1, journal.head(item) + 1))
     journal.close()
     store.close()
     for name in ("film.webm", "report.md", "figures.json", "map.png", "r0.truth.tum"):

@@ -47,20 +47,20 @@ def test_invalid_figures_are_refused_in_one_line(change, word):
 def test_every_figure_is_explained_and_has_a_unit_where_it_needs_one(of):
     explained = set(re.findall(r"^        (\w+):", of.__doc__, re.MULTILINE))
     assert explained == {f.name for f in fields(of)}
-    for one in fields(of):
-        if "float" in str(one.type):
+    for field in fields(of):
+        if "float" in str(field.type):
             units = ("_m", "_deg", "_s", "_minute", "_per_node", "_precision", "_recall", "_factor", "_share")
-            assert one.name.endswith(units), one.name
+            assert field.name.endswith(units), field.name
 
 
 def test_the_kinds_are_those_of_the_class():
-    found = kinds()
-    assert found["nodes"] is int
-    assert found["merged_ate_m"] is float
-    assert found["found"] is bool
-    assert found["map_hash"] is str
-    assert set(found) == {f.name for f in fields(Figures)} - {"robots"}
-    assert set(found) > MORE_IS_BETTER
+    values = kinds()
+    assert values["nodes"] is int
+    assert values["merged_ate_m"] is float
+    assert values["found"] is bool
+    assert values["map_hash"] is str
+    assert set(values) == {f.name for f in fields(Figures)} - {"robots"}
+    assert set(values) > MORE_IS_BETTER
 
 
 def test_the_page_has_every_figure_once():

@@ -24,12 +24,12 @@ def frames(count: int, size: tuple[int, int] = (320, 240)) -> list[np.ndarray]:
 
 
 def read(path) -> tuple[list[np.ndarray], float]:
-    film, found = cv2.VideoCapture(str(path)), []
+    film, collected = cv2.VideoCapture(str(path)), []
     while True:
         there, frame = film.read()
         if not there:
-            return found, film.get(cv2.CAP_PROP_FPS)
-        found.append(frame)
+            return collected, film.get(cv2.CAP_PROP_FPS)
+        collected.append(frame)
 
 
 def test_a_film_has_its_frames_in_order(tmp_path, capfd):
@@ -44,10 +44,10 @@ def test_a_film_has_its_frames_in_order(tmp_path, capfd):
     assert path.read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
     assert b"webm" in path.read_bytes()[:64]
     assert b"V_VP8" in path.read_bytes()[:1024]
-    found, rate = read(path)
+    result, rate = read(path)
     assert rate == 12.5
-    assert len(found) == 25
-    for there, wanted in zip(found, shown, strict=True):
+    assert len(result) == 25
+    for there, wanted in zip(result, shown, strict=True):
         assert np.abs(there.astype(int) - wanted).mean() < 6
     assert capfd.readouterr() == ("", "")
 

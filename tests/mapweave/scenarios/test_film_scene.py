@@ -140,8 +140,8 @@ def test_places_are_drawn_also_when_an_array_is_filled_in_place():
 def test_words_are_written_and_never_outside_of_their_cell():
     scene, again = (FilmFrame(PLAN, ["r0", "r1"]) for _ in range(2))
     silent = scene.draw(snapshot())
-    said = again.draw(snapshot(), statuses={"r0": "looks for itself " * 30}, caption="r0 is kidnapped — now")
-    changed = np.argwhere((silent != said).any(axis=2))
+    text = again.draw(snapshot(), statuses={"r0": "looks for itself " * 30}, caption="r0 is kidnapped — now")
+    changed = np.argwhere((silent != text).any(axis=2))
     (x, y), (width, height) = scene.layout.corners[0], scene.layout.cell
     in_label = (changed[:, 0] >= y + height) & (changed[:, 0] < y + height + 20)
     in_label &= (changed[:, 1] >= x) & (changed[:, 1] < x + width)

@@ -74,16 +74,16 @@ def plot(
 @pytest.mark.parametrize("seed", range(25))
 def test_the_rules_are_kept(seed):
     standing = [Pose2(2, 4), Pose2(6, 3.5), Pose2(10, 4)]
-    found, truth = plot(occupied=standing, seed=seed)
-    place = found.world_from_robot
-    in_room = {n.agent for n, p in truth.items() if PLAN.room_at(p.x, p.y) == found.room}
-    assert in_room == {found.host}, "only the host has mapped it"
-    assert found.robot != found.host
-    assert found.goal.agent not in (found.robot, found.host)
-    goal = truth[found.goal]
-    assert PLAN.room_at(goal.x, goal.y) not in (found.room, "corridor")
+    plan, truth = plot(occupied=standing, seed=seed)
+    place = plan.world_from_robot
+    in_room = {n.agent for n, p in truth.items() if PLAN.room_at(p.x, p.y) == plan.room}
+    assert in_room == {plan.host}, "only the host has mapped it"
+    assert plan.robot != plan.host
+    assert plan.goal.agent not in (plan.robot, plan.host)
+    goal = truth[plan.goal]
+    assert PLAN.room_at(goal.x, goal.y) not in (plan.room, "corridor")
     assert PLAN.clearances(np.array([[place.x, place.y]]))[0] >= CLEARANCE
-    hosts = [p for n, p in truth.items() if n.agent == found.host and PLAN.room_at(p.x, p.y) == found.room]
+    hosts = [p for n, p in truth.items() if n.agent == plan.host and PLAN.room_at(p.x, p.y) == plan.room]
     assert min(place.distance(p) for p in hosts) <= NEAR
     assert min(place.distance(p) for p in standing) > 0.6
 
@@ -99,18 +99,18 @@ def test_with_two_robots_the_goal_may_be_its_own():
     where = {"r0": [(2, 3), (1, 1)], "r1": [(6, 3), (6, 1)]}
     goals = set()
     for seed in range(20):
-        found, truth = plot(where, ("r0", "r1"), seed=seed)
-        assert found.robot != found.host
-        goal = truth[found.goal]
-        assert PLAN.room_at(goal.x, goal.y) not in (found.room, "corridor")
-        goals.add(found.goal.agent == found.robot)
+        plan, truth = plot(where, ("r0", "r1"), seed=seed)
+        assert plan.robot != plan.host
+        goal = truth[plan.goal]
+        assert PLAN.room_at(goal.x, goal.y) not in (plan.room, "corridor")
+        goals.add(plan.goal.agent == plan.robot)
     assert True in goals
 
 
 def test_a_goal_in_the_corridor_is_the_last_resort():
-    found, truth = plot({"r0": [(2, 3)], "r1": [(6, 3)], "r2": [(10, 1)]}, robots=("r0", "r1"))
-    goal = truth[found.goal]
-    assert found.goal.agent == "r2"
+    plan, truth = plot({"r0": [(2, 3)], "r1": [(6, 3)], "r2": [(10, 1)]}, robots=("r0", "r1"))
+    goal = truth[plan.goal]
+    assert plan.goal.agent == "r2"
     assert PLAN.room_at(goal.x, goal.y) == "corridor"
 
 
@@ -140,8 +140,8 @@ def test_nodes_without_truth_play_no_part():
     merged, components, truth = a_map(EACH_ITS_ROOM)
     stranger = replace(next(iter(merged.nodes.values())), id=NodeId("r2", 1, 50))
     merged.apply(NodePut(stranger))
-    found = plan_kidnapping(merged, components, truth, PLAN, ("r0", "r1", "r2"), {}, 3)
-    assert found.goal in truth
+    plan = plan_kidnapping(merged, components, truth, PLAN, ("r0", "r1", "r2"), {}, 3)
+    assert plan.goal in truth
 
 
 def test_a_goal_that_the_others_cut_off_is_none():
@@ -156,8 +156,8 @@ def test_a_goal_that_the_others_cut_off_is_none():
     merged, components, truth = a_map({"r0": [(1, 1), (2, 2)], "r1": [(6, 1), (6, 3)]})
     robots = ("r0", "r1")
     aside = {"r0": Pose2(1, 3), "r1": Pose2(7, 3)}
-    found = plan_kidnapping(merged, components, truth, hall, robots, aside, 3)
-    assert found.robot in robots
+    plan = plan_kidnapping(merged, components, truth, hall, robots, aside, 3)
+    assert plan.robot in robots
     in_the_gap = {name: Pose2(4.0, 2.0) for name in ("r0", "r1")}
     with pytest.raises(NothingToShow, match="leave a way"):
         plan_kidnapping(merged, components, truth, hall, robots, in_the_gap, 3)

@@ -63,15 +63,15 @@ def test_it_carries_bytes_both_ways_and_counts_them(cable):
 
 
 def test_a_cut_link_breaks_and_accepts_no_connection_until_restored(cable):
-    with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
-        assert talk(one, b"hello") == b"hello"
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as first:
+        assert talk(first, b"hello") == b"hello"
         cable.cut()
-        assert one.recv(10) == b""
+        assert first.recv(10) == b""
     with (
-        socket.create_connection(("127.0.0.1", cable.port), 2) as two,
+        socket.create_connection(("127.0.0.1", cable.port), 2) as second,
         contextlib.suppress(ConnectionError),
     ):
-        assert talk(two, b"hello") == b""
+        assert talk(second, b"hello") == b""
     cable.restore()
     with socket.create_connection(("127.0.0.1", cable.port), 2) as three:
         assert talk(three, b"hello") == b"hello"

@@ -70,15 +70,15 @@ def busy() -> Iterator[None]:
             process.wait()
 
 
-def same(one, other):
+def same(first, second):
     """Maps, true drives, what the lost robot found out, and every figure that knows no wall clock."""
-    assert one.figures.map_hash == other.figures.map_hash
-    for robot, record in one.recording.robots.items():
-        assert np.array_equal(record.truth.poses, other.recording.robots[robot].truth.poses)
-    assert one.recording.lost == other.recording.lost
-    assert one.recording.merged.poses.keys() == other.recording.merged.poses.keys()
+    assert first.figures.map_hash == second.figures.map_hash
+    for robot, record in first.recording.robots.items():
+        assert np.array_equal(record.truth.poses, second.recording.robots[robot].truth.poses)
+    assert first.recording.lost == second.recording.lost
+    assert first.recording.merged.poses.keys() == second.recording.merged.poses.keys()
     for name in ("nodes", "edges", "links", "merged_ate_m", "bytes_per_node", "found", "found_error_m"):
-        assert getattr(one.figures, name) == getattr(other.figures, name), name
+        assert getattr(first.figures, name) == getattr(second.figures, name), name
 
 
 @pytest.mark.timeout(400)

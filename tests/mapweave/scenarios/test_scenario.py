@@ -45,9 +45,9 @@ def load(tmp_path: Path, text: str, overrides=()):
 def refused(tmp_path: Path, text: str, overrides=()) -> str:
     with pytest.raises(SettingsError) as error:
         load(tmp_path, text, overrides)
-    said = str(error.value)
-    assert "\n" not in said
-    return said
+    output = str(error.value)
+    assert "\n" not in output
+    return output
 
 
 def test_a_file_is_parsed_as_written(tmp_path):

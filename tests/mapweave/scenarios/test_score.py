@@ -47,22 +47,22 @@ def wandering(seed: int, noise: float = 0.02) -> tuple[Trajectory, Trajectory]:
     truth = Trajectory(np.arange(500, dtype=np.int64) * TICK_NS, np.array(poses))
     frame = Pose2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3))
     known = np.sort(rng.choice(np.arange(20, 480), 300, replace=False))
-    believed = [
+    estimated = [
         (frame @ Pose2.from_vector(v) @ Pose2(*rng.normal(0, noise, 3))).vector for v in truth.poses[known]
     ]
-    return truth, Trajectory(truth.stamps_ns[known], np.array(believed))
+    return truth, Trajectory(truth.stamps_ns[known], np.array(estimated))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_trajectories_score_as_evo_scores_them(seed):
     truth, estimate = wandering(seed)
-    found = score_trajectory(truth, estimate)
+    outcome = score_trajectory(truth, estimate)
     pair = sync.associate_trajectories(for_evo(truth), for_evo(estimate))
     absolute = ape(*copy.deepcopy(pair), metrics.PoseRelation.translation_part, align=True)
-    assert found.ate_m == pytest.approx(absolute.stats["rmse"], rel=1e-6)
+    assert outcome.ate_m == pytest.approx(absolute.stats["rmse"], rel=1e-6)
     for value, relation in (
-        (found.rpe_m, metrics.PoseRelation.translation_part),
-        (found.rpe_deg, metrics.PoseRelation.rotation_angle_deg),
+        (outcome.rpe_m, metrics.PoseRelation.translation_part),
+        (outcome.rpe_deg, metrics.PoseRelation.rotation_angle_deg),
     ):
         relative = rpe(
             *copy.deepcopy(pair),
@@ -93,18 +93,20 @@ def test_relative_errors_are_those_of_pairs_a_metre_apart(seed):
         )
         error = real.inverse() @ told
         errors.append([math.hypot(error.x, error.y), math.degrees(abs(error.heading))])
-    found = score_trajectory(truth, estimate)
-    assert [found.rpe_m, found.rpe_deg] == pytest.approx(np.sqrt(np.square(errors).mean(axis=0)), rel=1e-5)
+    outcome = score_trajectory(truth, estimate)
+    assert [outcome.rpe_m, outcome.rpe_deg] == pytest.approx(
+        np.sqrt(np.square(errors).mean(axis=0)), rel=1e-5
+    )
 
 
 def test_errors_over_time_make_up_the_ate():
     truth, estimate = wandering(1)
-    found = score_trajectory(truth, estimate)
-    assert np.array_equal(found.stamps_ns, estimate.stamps_ns)
-    assert math.sqrt(np.square(found.errors).mean()) == pytest.approx(found.ate_m)
-    moved = found.world_from_map.apply(estimate.poses[:, :2])
+    outcome = score_trajectory(truth, estimate)
+    assert np.array_equal(outcome.stamps_ns, estimate.stamps_ns)
+    assert math.sqrt(np.square(outcome.errors).mean()) == pytest.approx(outcome.ate_m)
+    moved = outcome.world_from_map.apply(estimate.poses[:, :2])
     true = truth.poses[np.searchsorted(truth.stamps_ns, estimate.stamps_ns), :2]
-    assert np.allclose(np.hypot(*(moved - true).T), found.errors)
+    assert np.allclose(np.hypot(*(moved - true).T), outcome.errors)
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 100])
@@ -116,10 +118,10 @@ def test_straight_and_short_ways_have_a_score_where_evo_alone_has_none(ticks):
     estimate = Trajectory(
         truth.stamps_ns, np.array([(Pose2(3, 4, 2) @ Pose2.from_vector(v)).vector for v in truth.poses])
     )
-    found = score_trajectory(truth, estimate)
-    assert found.ate_m == pytest.approx(0.0, abs=1e-9)
-    assert found.rpe_m is None
-    assert found.rpe_deg is None
+    outcome = score_trajectory(truth, estimate)
+    assert outcome.ate_m == pytest.approx(0.0, abs=1e-9)
+    assert outcome.rpe_m is None
+    assert outcome.rpe_deg is None
 
 
 def test_times_outside_the_truth():
@@ -161,10 +163,10 @@ def test_the_merged_map_scores_as_evo_scores_it(staged):
     staged.edges = []
     figures = score(staged.recording())
     true = np.array([staged.true_pose(n).vector for n in staged.nodes])
-    told = np.array([p.vector for _, p, _ in staged.nodes.values()])
+    outcome = np.array([p.vector for _, p, _ in staged.nodes.values()])
     stamps = np.arange(len(true)) * TICK_NS
     result = ape(
-        for_evo(Trajectory(stamps, true)), for_evo(Trajectory(stamps, told)),
+        for_evo(Trajectory(stamps, true)), for_evo(Trajectory(stamps, outcome)),
         metrics.PoseRelation.translation_part, align=True,
     )  # fmt: skip
     assert figures.merged_ate_m == pytest.approx(result.stats["rmse"], rel=1e-6)

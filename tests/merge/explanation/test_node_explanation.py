@@ -52,8 +52,8 @@ def fleet() -> Merger:
     for map_id, rooms in ((A, (0, 5)), (B, (5,)), (C, (20,))):
         stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
         nodes, edges = take_map(world, map_id, stops, rng)
-        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, body)
+        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, change)
     return merger
 
 
@@ -63,12 +63,12 @@ def between(merged: MergedMap) -> list[Link]:
 
 def test_residuals_are_those_of_the_pinhole(merged: MergedMap) -> None:
     link = between(merged)[0]
-    told = explain_nodes(merged, link.b, link.a)
-    assert told.standing is Standing.LINKED and (told.a.id, told.b.id) == link.pair
-    a, b, camera = told.a.landmarks, told.b.landmarks, told.a.camera
+    explanation = explain_nodes(merged, link.b, link.a)
+    assert explanation.standing is Standing.LINKED and (explanation.a.id, explanation.b.id) == link.pair
+    a, b, camera = explanation.a.landmarks, explanation.b.landmarks, explanation.a.camera
     x, y, heading = link.a_from_b.mean.vector
     turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
-    for (i, j), residual in zip(told.shared, told.residuals_px, strict=True):
+    for (i, j), residual in zip(explanation.shared, explanation.residuals_px, strict=True):
         here, there, inverse = (a, b, False) if np.isfinite(a.depths[i]) else (b, a, True)
         k, other = (j, i) if inverse else (i, j)
         depth = float(here.depths[k])
@@ -82,7 +82,7 @@ def test_residuals_are_those_of_the_pinhole(merged: MergedMap) -> None:
             camera.cy - camera.fy * (height - camera.mount_height) / ahead,
         ]
         assert residual == pytest.approx(np.linalg.norm(predicted - there.pixels[other]), abs=1e-3)
-    assert {tuple(pair) for pair in told.shared} <= {tuple(pair) for pair in told.matches}
+    assert {tuple(pair) for pair in explanation.shared} <= {tuple(pair) for pair in explanation.matches}
 
 
 def test_the_misfit_is_the_difference_to_the_merged_poses(merged: MergedMap) -> None:
@@ -105,16 +105,16 @@ def without(merged: MergedMap, left_out: Link | None) -> PoseGaussian:
         Measurement(*link.pair, link.a_from_b, robust=True) for link in merged.links if link is not left_out
     ]
     graph = solve_graph(left_out.a, Pose2(), measurements)
-    found = graph.relative([left_out.a], [left_out.b])
-    return PoseGaussian(Pose2.from_vector(found.means[0]), found.covariances[0])
+    result = graph.relative([left_out.a], [left_out.b])
+    return PoseGaussian(Pose2.from_vector(result.means[0]), result.covariances[0])
 
 
 def test_leaving_a_link_out_is_as_good_as_solving_without_it(merged: MergedMap) -> None:
     links = between(merged)
     graph = merged.graphs[0]
-    found = standpoints(links, graph, kept=True)
+    result = standpoints(links, graph, kept=True)
     area = max(np.prod(np.ptp(graph.means[:, :2], axis=0)), LEAST_AREA)
-    for link, one in list(zip(links, found, strict=True))[::3]:
+    for link, one in list(zip(links, result, strict=True))[::3]:
         rest = without(merged, link)
         off = (link.a_from_b.mean.inverse() @ rest.mean).vector
         spread = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2) + rest.covariance + FLOOR
@@ -133,8 +133,8 @@ def test_a_link_that_alone_joins_has_the_odds_of_all_links(merged: MergedMap) ->
         [m for f in fragments_of(merged.maps) for m in f.measurements]
         + [Measurement(*link.pair, link.a_from_b, robust=True)],
     )
-    (found,) = standpoints([link], graph, kept=True)
-    assert found.alone and found.log_factor == 0.0
+    (result,) = standpoints([link], graph, kept=True)
+    assert result.alone and result.log_factor == 0.0
 
 
 def test_false_links_are_improbable_and_true_ones_are_not(merged: MergedMap) -> None:
@@ -147,18 +147,20 @@ def test_false_links_are_improbable_and_true_ones_are_not(merged: MergedMap) -> 
              x.a_from_b.covariance), x.shared, x.evidence)
         for x in links
     ]  # fmt: skip
-    assert all(one.log_factor < -10 for one in standpoints(shifted, merged.graphs[0], kept=False))
+    assert all(
+        standpoint.log_factor < -10 for standpoint in standpoints(shifted, merged.graphs[0], kept=False)
+    )
     assert prior_odds(merged) > 1
 
 
 def test_other_links_close_loops_as_composed_poses(merged: MergedMap) -> None:
     link = between(merged)[1]
-    told = explain_nodes(merged, *link.pair)
+    explanation = explain_nodes(merged, *link.pair)
     s = ConsistencySettings()
     by_pair = {other.pair: other for other in merged.links}
     pieces = {node: fragment for fragment in fragments_of(merged.maps) for node in fragment.nodes}
-    assert len(told.witnesses) >= 3
-    for witness in told.witnesses:
+    assert len(explanation.witnesses) >= 3
+    for witness in explanation.witnesses:
         if (witness.a, witness.b) not in by_pair:
             continue
         # The merge begins each loop at the smaller pair.
@@ -175,9 +177,9 @@ def test_other_links_close_loops_as_composed_poses(merged: MergedMap) -> None:
 
 def test_refused_pairs_say_what_they_lack(merged: MergedMap) -> None:
     refused = next(r for r in merged.refused if r.link is None and r.edge is None)
-    told = explain_nodes(merged, refused.a, refused.b)
-    assert (told.standing, told.reason) == (Standing.REFUSED, refused.reason)
-    assert told.probability is None and len(told.matches) > 0
+    explanation = explain_nodes(merged, refused.a, refused.b)
+    assert (explanation.standing, explanation.reason) == (Standing.REFUSED, refused.reason)
+    assert explanation.probability is None and len(explanation.matches) > 0
 
 
 def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None:
@@ -188,32 +190,36 @@ def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None
     a = merged.maps[link.a.map].nodes[link.a]
     few = HybridMap([NodePut(replace(a, landmarks=a.landmarks.take(shared[:, 0])))])
     both = replace(merged, maps={**merged.maps, link.a.map: few}, links=(), refused=())
-    told = explain_nodes(both, *link.pair, strict)
-    assert told.standing is Standing.UNCOMPARED and told.a_from_b is None
-    assert "11 features match" in told.reason
-    told = explain_nodes(both, *link.pair, RecognitionSettings(least_cells=25))
-    assert told.reason.endswith("of 24 image cells") and told.a_from_b is not None
-    assert len(told.shared) == told.evidence["inliers"] == len(told.residuals_px) >= 10
-    assert {(int(shared[i, 0]), int(j)) for i, j in told.shared} <= set(map(tuple, shared.tolist()))
-    assert told.a_from_b.mean.distance(link.a_from_b.mean) < 0.1
-    assert told.misfit is not None and told.witnesses == () and told.probability is None
+    explanation = explain_nodes(both, *link.pair, strict)
+    assert explanation.standing is Standing.UNCOMPARED and explanation.a_from_b is None
+    assert "11 features match" in explanation.reason
+    explanation = explain_nodes(both, *link.pair, RecognitionSettings(least_cells=25))
+    assert explanation.reason.endswith("of 24 image cells") and explanation.a_from_b is not None
+    assert len(explanation.shared) == explanation.evidence["inliers"] == len(explanation.residuals_px) >= 10
+    assert {(int(shared[i, 0]), int(j)) for i, j in explanation.shared} <= set(map(tuple, shared.tolist()))
+    assert explanation.a_from_b.mean.distance(link.a_from_b.mean) < 0.1
+    assert explanation.misfit is not None and explanation.witnesses == () and explanation.probability is None
 
 
 def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap) -> None:
-    told = explain_nodes(merged, sorted(merged.maps[A].nodes)[0], sorted(merged.maps[C].nodes)[0])
-    assert told.standing is Standing.UNCOMPARED and "compared now: " in told.reason
+    explanation = explain_nodes(merged, sorted(merged.maps[A].nodes)[0], sorted(merged.maps[C].nodes)[0])
+    assert explanation.standing is Standing.UNCOMPARED and "compared now: " in explanation.reason
 
 
 def test_a_robots_own_edge_is_explained_with_its_pose(merged: MergedMap) -> None:
     edge = min(merged.maps[A].edges.values(), key=lambda edge: edge.id)
-    told = explain_nodes(merged, edge.b, edge.a)
-    assert told.standing is Standing.OWN and told.reason.endswith(f" (edge {edge.id})")
-    assert told.a_from_b is edge.a_from_b and told.probability is None and not told.witnesses
-    assert told.misfit is not None and not told.claims
+    explanation = explain_nodes(merged, edge.b, edge.a)
+    assert explanation.standing is Standing.OWN and explanation.reason.endswith(f" (edge {edge.id})")
+    assert (
+        explanation.a_from_b is edge.a_from_b
+        and explanation.probability is None
+        and not explanation.witnesses
+    )
+    assert explanation.misfit is not None and not explanation.claims
     relative = merged.relative(edge.a, edge.b)
     assert relative is not None
     off = (edge.a_from_b.mean.inverse() @ relative.mean).vector
-    assert np.allclose(told.misfit.off, off, atol=1e-9)
+    assert np.allclose(explanation.misfit.off, off, atol=1e-9)
 
 
 def test_a_robots_own_loop_closure_is_explained_with_its_constraints() -> None:
@@ -223,27 +229,27 @@ def test_a_robots_own_loop_closure_is_explained_with_its_constraints() -> None:
     assert true is not None
     loop = Edge(NodeId("a", 1, 99), first, last, true, EdgeKind.LOOP)
     merger.apply(A, EdgePut(loop))
-    told = explain_nodes(merger.merged(), first, last)
-    assert told.standing is Standing.OWN and told.probability is not None
-    ruling = ManualConstraint((first, last), True, "anna", 0, "no")
-    merger.rule(ManualConstraints([ruling]))
-    told = explain_nodes(merger.merged(), first, last)
-    assert told.standing is Standing.UNDONE and told.reason == reason_of(ruling)
-    assert any("(edge a.1.99); refused: undone by anna" in claim for claim in told.claims)
+    explanation = explain_nodes(merger.merged(), first, last)
+    assert explanation.standing is Standing.OWN and explanation.probability is not None
+    constraint = ManualConstraint((first, last), True, "anna", 0, "no")
+    merger.rule(ManualConstraints([constraint]))
+    explanation = explain_nodes(merger.merged(), first, last)
+    assert explanation.standing is Standing.UNDONE and explanation.reason == reason_of(constraint)
+    assert any("(edge a.1.99); refused: undone by anna" in claim for claim in explanation.claims)
     wrong = replace(loop, a_from_b=PoseGaussian(true.mean @ Pose2(2.0, 1.0, 1.0), true.covariance))
     merger.rule(ManualConstraints())
     merger.apply(A, EdgePut(wrong))
-    told = explain_nodes(merger.merged(), first, last)
-    assert told.standing is Standing.REFUSED and "contradicts" in told.reason
-    assert told.misfit is not None and told.misfit.strain2 > 100.0
+    explanation = explain_nodes(merger.merged(), first, last)
+    assert explanation.standing is Standing.REFUSED and "contradicts" in explanation.reason
+    assert explanation.misfit is not None and explanation.misfit.strain2 > 100.0
 
 
 def test_landmarks_that_have_faded_hold_no_servo(merged: MergedMap) -> None:
-    link = next(one for one in between(merged) if "can be driven" in reach_words(merged, one.edge()))
+    link = next(item for item in between(merged) if "can be driven" in reach_words(merged, item.edge()))
     count = len(merged.maps[link.a.map].nodes[link.a].landmarks)
     faded = replace(merged, faded={link.a: np.ones(count, np.bool_)})
-    told = explain_nodes(faded, *link.pair)
-    (words,) = [claim for claim in told.claims if claim.startswith("the link ")]
+    explanation = explain_nodes(faded, *link.pair)
+    (words,) = [claim for claim in explanation.claims if claim.startswith("the link ")]
     assert "not driven: no landmark stays in view" in words
     assert words.endswith(f"({len(link.shared)} more have faded)")
 
@@ -259,18 +265,19 @@ def test_two_maps(merged: MergedMap) -> None:
     assert apart.unverified == sum({r.a.map, r.b.map} == {A, C} for r in merged.refused)
     assert [e.joined for e in explain_fleet(merged, 10)] == [False, False, True]
     assert explain_fleet(merged, 10) == tuple(
-        explain_maps(merged, told.second, told.first) for told in explain_fleet(merged, 10)
+        explain_maps(merged, explanation.second, explanation.first)
+        for explanation in explain_fleet(merged, 10)
     )
 
 
 def test_manual_constraints_are_listed() -> None:
     merger = fleet()
     link = between(merger.merged())[0]
-    ruling = ManualConstraint(link.pair, True, "anna", 0, "no")
-    merger.rule(ManualConstraints([ruling]))
-    told = explain_nodes(merger.merged(), *link.pair)
-    assert told.standing is Standing.UNDONE and told.rulings == (ruling,)
-    assert told.probability is not None and told.probability > 0.9, (
+    constraint = ManualConstraint(link.pair, True, "anna", 0, "no")
+    merger.rule(ManualConstraints([constraint]))
+    explanation = explain_nodes(merger.merged(), *link.pair)
+    assert explanation.standing is Standing.UNDONE and explanation.rulings == (constraint,)
+    assert explanation.probability is not None and explanation.probability > 0.9, (
         "a manual constraint changes no measurement"
     )
     merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
@@ -284,7 +291,7 @@ def test_a_merge_that_loses_its_support_is_reported() -> None:
     before = merger.merged()
     parts = joined_maps(before)
     assert partings(parts, before.links, before) == () == joinings(parts, before)
-    (joined,) = [one for one in joinings(joined_maps(alone), before) if "a.1 and b.1" in one]
+    (joined,) = [joining for joining in joinings(joined_maps(alone), before) if "a.1 and b.1" in joining]
     assert joined == f"a.1 and b.1 are one map now, by {len(between(before))} links"
     assert joined in joinings([frozenset([B])], before)  # whichever of the two was heard of first
     merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
@@ -304,18 +311,18 @@ def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
     merger = Merger()
     for map_id in [MapId(name, 1) for name in "abcdef"]:
         nodes, edges = take_map(world, map_id, [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)], rng)
-        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, body)
+        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, change)
     merged = merger.merged()
     assert len(merged.components) == 1
-    told = joinings((), merged)
+    result = joinings((), merged)
     assert (
-        told[0].startswith("a.1 and ")
-        and told[1].startswith("a.1+")
-        and told[-1].startswith("5 maps with a.1 and ")
-        and len(told) == 5
+        result[0].startswith("a.1 and ")
+        and result[1].startswith("a.1+")
+        and result[-1].startswith("5 maps with a.1 and ")
+        and len(result) == 5
     )
-    count = sum(int(words.rsplit(" by ", 1)[1].split()[0]) for words in told)
+    count = sum(int(words.rsplit(" by ", 1)[1].split()[0]) for words in result)
     assert count == sum(not link.within for link in merged.links)
 
 
@@ -338,15 +345,15 @@ def test_a_split_by_a_retired_map_names_the_person() -> None:
     for map_id, rooms in ((A, (0,)), (B, (0, 5)), (C, (5,))):
         stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
         nodes, edges = take_map(world, map_id, stops, rng)
-        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, body)
+        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, change)
     before = merger.merged()
     assert before.joined(A, C)
-    ruling = ManualConstraint((B, B), True, "anna", 0, "moved house")
-    merger.rule(ManualConstraints([ruling]))
+    constraint = ManualConstraint((B, B), True, "anna", 0, "moved house")
+    merger.rule(ManualConstraints([constraint]))
     (words,) = partings(joined_maps(before), before.links, merger.merged())
     assert words.startswith("a.1 and c.1 are no longer one map: ")
-    assert words.endswith(f" gone, since {reason_of(ruling)}") and "moved house" in words
+    assert words.endswith(f" gone, since {reason_of(constraint)}") and "moved house" in words
 
 
 @pytest.mark.parametrize(

@@ -29,10 +29,10 @@ def test_the_last_links_are_returned_and_only_new_pairs_are_fresh(
     known, before = Adjacency(), set[Ends]()
     for chosen in rounds:
         now = [links[which][pair] for pair, which in chosen.items()]
-        assert {one.pair for one in known.follow(now)} == set(chosen) - before
+        assert {item.pair for item in known.follow(now)} == set(chosen) - before
         before = set(chosen)
         for node in NODES:
-            assert {id(one) for one in known.at(node)} == {id(one) for one in now if node in one.pair}
+            assert {id(item) for item in known.at(node)} == {id(item) for item in now if node in item.pair}
         for a, b in PAIRS:
-            there = next((one for one in now if one.pair == (a, b)), None)
+            there = next((item for item in now if item.pair == (a, b)), None)
             assert known.between(a, b) is there and known.between(b, a) is there

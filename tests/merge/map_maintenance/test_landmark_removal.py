@@ -34,34 +34,34 @@ NODE = take_node(
 )
 
 
-def look(shown: list[bool], found: list[bool], visit: int = 0) -> LandmarkObservations:
+def look(shown: list[bool], result: list[bool], visit: int = 0) -> LandmarkObservations:
     """A view that finds half of what it should show besides; the first landmarks are those in question."""
     rest = [True] * 20
     half = [True, False] * 10
     link = Link(NodeId("a", 1, 1), NodeId("b", 1, 1), PoseGaussian(Pose2(), np.eye(3)))
     view = replace(NODE, stamp_ns=visit * 10**12)
-    return LandmarkObservations(NODE, view, link, Pose2(), np.array(shown + rest), np.array(found + half))
+    return LandmarkObservations(NODE, view, link, Pose2(), np.array(shown + rest), np.array(result + half))
 
 
 @pytest.mark.parametrize("story", list(product([None, False, True], repeat=4)))
 def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]) -> None:
     """Every sequence of there and gone, hidden and not, weighed with it and with what was seen."""
-    looks = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(story)]
+    views = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(story)]
     weights = {True: 0.0, False: 0.0}
-    told = [(seen, detection_rate(ALONE, one)) for seen, one in zip(story, looks, strict=True)]
-    told = [(seen, rate) for seen, rate in told if seen is not None]
-    for states in product([True, False], repeat=len(told) + 1):
-        for veils in product([True, False], repeat=len(told)):
+    collected = [(seen, detection_rate(ALONE, one)) for seen, one in zip(story, views, strict=True)]
+    collected = [(seen, rate) for seen, rate in collected if seen is not None]
+    for states in product([True, False], repeat=len(collected) + 1):
+        for veils in product([True, False], repeat=len(collected)):
             weight = removal.AT_FIRST if states[0] else 1 - removal.AT_FIRST
-            for (before, now), veil, (seen, rate) in zip(pairwise(states), veils, told, strict=True):
+            for (before, now), veil, (seen, rate) in zip(pairwise(states), veils, collected, strict=True):
                 stays = 1 - removal.GOES if before else 1 - removal.COMES
                 weight *= stays if now == before else 1 - stays
                 weight *= removal.HIDDEN if veil else 1 - removal.HIDDEN
-                # Who finds by mistake what is gone finds it whatever stands there.
+                # A false detection does not depend on what is there.
                 likely = (0.0 if veil else rate) if now else removal.MISTAKEN
                 weight *= likely if seen else 1 - likely
             weights[states[-1]] += weight
-    there = presence(ALONE, looks)[0]
+    there = presence(ALONE, views)[0]
     assert there == pytest.approx(weights[True] / sum(weights.values()), abs=1e-12)
 
 
@@ -73,9 +73,9 @@ def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None
     together[6:, 6:] = True
 
     def after(misses: int, hits: int = 0, things: np.ndarray = together) -> np.ndarray:
-        story = [look([True] * 6, [False] * 6, k) for k in range(misses)]
-        story += [look([True] * 6, [True] + [False] * 5, misses + k) for k in range(hits)]
-        return presence(things, story)
+        sequence = [look([True] * 6, [False] * 6, k) for k in range(misses)]
+        sequence += [look([True] * 6, [True] + [False] * 5, misses + k) for k in range(hits)]
+        return presence(things, sequence)
 
     course = [after(k)[0] for k in range(12)]
     assert all(later < earlier for earlier, later in pairwise(course))
@@ -144,7 +144,7 @@ def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.Monkey
     monkeypatch.setattr(node_superseding, "FOUND", 10_000)
     merger = Merger()
     epochs = [world, *[other] * 8, *[world] * 3]
-    told: dict[int, np.ndarray] = {}
+    collected: dict[int, np.ndarray] = {}
     first: np.ndarray | None = None
     for epoch, now in enumerate(epochs, start=1):
         tour = [Pose2(2.6 + 0.5 * k, 2.0 + rng.normal(0, 0.04), 0.05 * k) for k in range(2)]
@@ -153,19 +153,19 @@ def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.Monkey
         node = merged.maps[MapId("r1", 1)].nodes[NodeId("r1", 1, 1)]
         if first is None:
             first = _behind(world, tour[0], node.points_in_robot, thing)
-        told[epoch] = merged.faded.get(node.id, np.zeros(len(node.landmarks), np.bool_))
-        assert len(without_faded(node, merged).landmarks) == (~told[epoch]).sum()
+        collected[epoch] = merged.faded.get(node.id, np.zeros(len(node.landmarks), np.bool_))
+        assert len(without_faded(node, merged).landmarks) == (~collected[epoch]).sum()
     assert first is not None and first.sum() >= 10 and (~first).sum() >= 20
-    assert not told[2].any(), "one view is not enough"
-    assert told[9][first].mean() > 0.6, "what has gone has faded"
-    assert told[9][~first].mean() < 0.25, "what is there has not, most of it"
-    assert told[12][first].mean() < 0.5 * told[9][first].mean(), "what is back is used again"
+    assert not collected[2].any(), "one view is not enough"
+    assert collected[9][first].mean() > 0.6, "what has gone has faded"
+    assert collected[9][~first].mean() < 0.25, "what is there has not, most of it"
+    assert collected[12][first].mean() < 0.5 * collected[9][first].mean(), "what is back is used again"
 
 
 def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The wall behind has stayed, and tells where the robot stands; half of what is there is found."""
+    """The wall behind has stayed, and localizes the robot; half of what is there is found."""
     rng = np.random.default_rng(3)
     world = room(0, 0, 6, 4, 1200, rng)
     wall = np.flatnonzero(world.normals[:, 0] < -0.5)
@@ -199,8 +199,8 @@ def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.Mon
     rng = np.random.default_rng(4)
     world = room(0, 0, 8, 4, 950, rng)
     thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
-    other = replace(world, vectors=world.vectors.copy())
-    other.vectors[thing] = random_vectors(len(thing), rng)
+    b = replace(world, vectors=world.vectors.copy())
+    b.vectors[thing] = random_vectors(len(thing), rng)
     monkeypatch.setattr(removal, "MOVED", 0.01)
     merger = Merger()
     judged: list[int] = []
@@ -211,7 +211,7 @@ def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.Mon
 
     monkeypatch.setattr("mapweave.merge.map_maintenance.landmark_removal.presence", counted)
     counts, faded, agree = [], 0, []
-    for epoch, now in enumerate([world, *[other] * 6], start=1):
+    for epoch, now in enumerate([world, *[b] * 6], start=1):
         # The first drives go through all of the room, the last ones through its western end.
         xs = np.arange(1.0, 7.0 if epoch < 5 else 2.5, 0.5)
         tour = [Pose2(x, 2.0 + rng.normal(0, 0.04), rng.normal(0, 0.03)) for x in xs]
@@ -219,10 +219,10 @@ def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.Mon
         judged.clear()
         merged = merger.merged()
         counts.append(len(judged))
-        anew = LandmarkRemover().fade(replace(merged, faded={})).faded
-        for one in set(anew) | set(merged.faded):
-            none = np.zeros(len(merged.maps[one.map].nodes[one].landmarks), np.bool_)
-            agree.append((anew.get(one, none) == merged.faded.get(one, none)).mean())
+        fresh = LandmarkRemover().fade(replace(merged, faded={})).faded
+        for a in set(fresh) | set(merged.faded):
+            none = np.zeros(len(merged.maps[a.map].nodes[a].landmarks), np.bool_)
+            agree.append((fresh.get(a, none) == merged.faded.get(a, none)).mean())
         faded += sum(gone.sum() for gone in merged.faded.values())
     assert faded > 10 and np.mean(agree) > 0.98
     assert len(merged.superseded) > 5
@@ -233,12 +233,12 @@ def _drive(
     merger: Merger, world: World, map_id: MapId, tour: list[Pose2], rng: np.random.Generator
 ) -> HybridMap:
     nodes, edges = take_map(world, map_id, tour, rng, SHARP, sigma_xy=0.01, sigma_heading=0.005)
-    bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    for number, body in enumerate(bodies, start=1):
+    changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+    for number, change in enumerate(changes, start=1):
         stamp = int(map_id.agent[1:]) * 10**12
-        if isinstance(body, NodePut):
-            body = NodePut(replace(body.node, stamp_ns=stamp + body.node.stamp_ns, clock="wall"))
-        merger.on_change(Change(map_id, number, 0, body))
+        if isinstance(change, NodePut):
+            change = NodePut(replace(change.node, stamp_ns=stamp + change.node.stamp_ns, clock="wall"))
+        merger.on_change(Change(map_id, number, 0, change))
     return merger.maps[map_id]
 
 

@@ -45,8 +45,8 @@ class Drives:
             tour = [Pose2(1.5 + 0.8 * k, y, heading) for k in range(5)]
             nodes, edges = take_map(self.world, map_id, tour, rng, sigma_xy=0.01, sigma_heading=0.01)
             self.truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
-            bodies = [*map(NodePut, nodes), *map(EdgePut, edges)]
-            self.changes[map_id] = [Change(map_id, k + 1, 0, body) for k, body in enumerate(bodies)]
+            changes = [*map(NodePut, nodes), *map(EdgePut, edges)]
+            self.changes[map_id] = [Change(map_id, k + 1, 0, body) for k, body in enumerate(changes)]
 
     def merger(self, *maps: MapId) -> Merger:
         merger = Merger()
@@ -122,9 +122,9 @@ def test_a_file_has_the_superseded_nodes_with_reasons(merger: Merger) -> None:
     again = merged_of(unpack_map_file(pack_map_file(map_file_of(merged))))
     assert again.superseded == merged.superseded
     node, fate = next(iter(again.superseded.items()))
-    told = explain_nodes(again, node, fate.by)
-    assert any(f"{node} is superseded: {fate.by} replaces it" in claim for claim in told.claims)
-    assert any("stay in view" in claim for claim in told.claims)
+    explanation = explain_nodes(again, node, fate.by)
+    assert any(f"{node} is superseded: {fate.by} replaces it" in claim for claim in explanation.claims)
+    assert any("stay in view" in claim for claim in explanation.claims)
 
 
 def test_questions_are_answered_by_active_nodes(drives: Drives, merger: Merger) -> None:
@@ -190,7 +190,7 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
     before = {link.pair for link in merged.links}
     merger.apply(OLD, NodePut(node))
     merged = merger.merged()
-    assert {one for one in merged.poses if one in merger.places} == living(merged)
+    assert {node_id for node_id in merged.poses if node_id in merger.places} == living(merged)
     assert {link.pair for link in merged.links} == before, "what tied it ties it still"
     merger.rule(
         ManualConstraints(
@@ -198,17 +198,17 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
         )
     )
     merged = merger.merged()
-    assert not merged.superseded and all(one in merger.places for one in merged.poses)
+    assert not merged.superseded and all(node_id in merger.places for node_id in merged.poses)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where ways do not matter: each node has a living one that covers it, and none can be spared."""
+    """Where ways do not matter: each node has an active one that covers it, and none can be removed."""
     rng = np.random.default_rng(seed)
     world = room(0, 0, 6, 4, 1200, rng)
-    # Whoever stands in one place gets there: all the room is one.
+    # Nodes at one place reach each other: the whole room is one.
     monkeypatch.setattr(rules, "NEAR", 100.0)
     monkeypatch.setattr(rules, "DETOUR", 1000.0)
     merger = Merger()
@@ -222,20 +222,20 @@ def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(
         for node, fate in merged.superseded.items():
             assert covers(merged, node, fate.by)
             stood_for.setdefault(fate.by, []).append(node)
-        for one in alive:
-            whom = [one, *stood_for.get(one, [])]
-            spare = all(any(covers(merged, node, by) for by in alive - {one}) for node in whom)
-            assert not spare, f"{one} could be spared"
+        for item in alive:
+            whom = [item, *stood_for.get(item, [])]
+            spare = all(any(covers(merged, node, by) for by in alive - {item}) for node in whom)
+            assert not spare, f"{item} could be spared"
     assert len(alive) < 18
 
 
-def covers(merged: MergedMap, one: NodeId, other: NodeId) -> bool:
-    a, b = (merged.maps[node.map].nodes[node] for node in (one, other))
-    between = merged.pose(one).inverse() @ merged.pose(other)
+def covers(merged: MergedMap, first: NodeId, second: NodeId) -> bool:
+    a, b = (merged.maps[node.map].nodes[node] for node in (first, second))
+    between = merged.pose(first).inverse() @ merged.pose(second)
     link = verify(*sorted((a, b), key=lambda node: node.id))
-    if one.map == other.map or not isinstance(link, Link) or abs(between.heading) > WIDEST:
+    if first.map == second.map or not isinstance(link, Link) or abs(between.heading) > WIDEST:
         return False
-    shared = link.shared if link.a == one else link.shared[:, ::-1]
+    shared = link.shared if link.a == first else link.shared[:, ::-1]
     depths = b.landmarks.has_depth.sum() >= min(rules.DEPTHS * a.landmarks.has_depth.sum(), rules.ENOUGH)
     return bool(depths and least_in_view(shared, a, b, between) >= rules.FOUND)
 

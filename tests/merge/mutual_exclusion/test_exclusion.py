@@ -72,18 +72,18 @@ def apart(a: Walk, b: Walk) -> Array:
 
 def trails(
     a: Walk, b: Walk, clocks: tuple[str, str] = ("net", "net"), agents: str = "ab",
-    radii: tuple[float, float] = (0.0, 0.0), wakes: bool = False,
+    radii: tuple[float, float] = (0.0, 0.0), segments: bool = False,
 ) -> list[BodyTrajectory]:  # fmt: skip
-    found = []
+    collected = []
     for k, walk in enumerate((a, b)):
         nodes = [
             Node(NodeId(agents[k], k, i), round(time * 1e9), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
                  Landmarks.empty(), clocks[k], radii[k], Ranges(),
-                 walk.wake(i) if wakes else TrajectorySegment())
+                 walk.wake(i) if segments else TrajectorySegment())
             for i, time in enumerate(walk.times)
         ]  # fmt: skip
-        found += trajectories_of(nodes)
-    return found
+        collected += trajectories_of(nodes)
+    return collected
 
 
 def graph(a: Walk, b: Walk, rng: np.random.Generator, agents: str = "ab", sigma: float = 0.02) -> PoseGraph:
@@ -108,24 +108,24 @@ def twins(seed: int) -> tuple[Walk, Walk, np.random.Generator]:
 
 
 def clash(a: Walk, b: Walk, rng: np.random.Generator, **how: tuple[str, str]) -> Collision | None:
-    one, two = trails(a, b, **how)
-    return clash_of(graph(a, b, rng), one, two)
+    first, second = trails(a, b, **how)
+    return clash_of(graph(a, b, rng), first, second)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_twins_clash_and_the_reason_has_numbers(seed: int) -> None:
     a, b, rng = twins(seed)
-    found = clash(a, b, rng)
-    assert found is not None and found.evidence > 10 and found.nearest < 0.1
-    assert found.reason.startswith("a and b would have been at the same place at the same time: 0.0")
-    assert f"{found.time:.1f} s of clock net, {found.moments} such moments" in found.reason
+    collision = clash(a, b, rng)
+    assert collision is not None and collision.evidence > 10 and collision.nearest < 0.1
+    assert collision.reason.startswith("a and b would have been at the same place at the same time: 0.0")
+    assert f"{collision.time:.1f} s of clock net, {collision.moments} such moments" in collision.reason
 
 
 def test_it_is_the_same_from_either_side() -> None:
     a, b, rng = twins(4)
-    one, two = trails(a, b)
+    first, second = trails(a, b)
     whole = graph(a, b, rng)
-    forth, back = clash_of(whole, one, two), clash_of(whole, two, one)
+    forth, back = clash_of(whole, first, second), clash_of(whole, second, first)
     assert forth is not None and back is not None
     assert back == replace(forth, first="b", second="a", evidence=back.evidence)
     assert np.isclose(forth.evidence, back.evidence, rtol=0.1)
@@ -148,10 +148,10 @@ def test_trajectory_segments_fill_gaps_between_nodes(seed: int) -> None:
     """Between nodes the robots' poses are unknown, without trajectory segments."""
     a, b, rng = scarce(seed, 0.7)
     whole = graph(a, b, rng)
-    found = clash_of(whole, *trails(a, b, wakes=True))
-    assert found is not None and found.evidence > 10 and found.nearest < 0.15
+    collision = clash_of(whole, *trails(a, b, segments=True))
+    assert collision is not None and collision.evidence > 10 and collision.nearest < 0.15
     bare = clash_of(whole, *trails(a, b))
-    assert bare is None or bare.evidence < found.evidence / 2
+    assert bare is None or bare.evidence < collision.evidence / 2
 
 
 def test_moments_of_segments_move_with_their_nodes() -> None:
@@ -164,19 +164,19 @@ def test_moments_of_segments_move_with_their_nodes() -> None:
             Node(NodeId("a", 1, k), round(1e10 * (k + 1)), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
                  Landmarks.empty(), "net", 0.2, Ranges(), TrajectorySegment(ages, poses, np.zeros((k, 0))))
         )  # fmt: skip
-    (trail,) = trajectories_of(list(reversed(nodes)))
+    (trajectory,) = trajectories_of(list(reversed(nodes)))
     ids = tuple(node.id for node in nodes)
-    found = trail.poses(PoseGraph(ids[0], ids, means, scipy.sparse.eye(15, format="csc")))
+    pose = trajectory.poses(PoseGraph(ids[0], ids, means, scipy.sparse.eye(15, format="csc")))
     expected = [
         (10.0 * (k + 1) + age, k, (Pose2(*means[k]) @ Pose2(*beside)).vector)
         for k, node in enumerate(nodes)
         for age, beside in [(0.0, np.zeros(3)), *zip(node.wake.ages, node.wake.node_from_robot, strict=True)]
     ]
     expected.sort(key=lambda row: row[0])
-    assert trail.times == pytest.approx([time for time, _, _ in expected])
-    assert trail.nodes == tuple(ids[k] for _, k, _ in expected)
-    assert found[:, :2] == pytest.approx(np.array([vector[:2] for _, _, vector in expected]))
-    assert np.exp(1j * found[:, 2]) == pytest.approx(np.exp([1j * vector[2] for _, _, vector in expected]))
+    assert trajectory.times == pytest.approx([time for time, _, _ in expected])
+    assert trajectory.nodes == tuple(ids[k] for _, k, _ in expected)
+    assert pose[:, :2] == pytest.approx(np.array([vector[:2] for _, _, vector in expected]))
+    assert np.exp(1j * pose[:, 2]) == pytest.approx(np.exp([1j * vector[2] for _, _, vector in expected]))
 
 
 def test_no_evidence_without_a_common_clock() -> None:
@@ -190,8 +190,8 @@ def test_no_evidence_without_a_common_clock() -> None:
 
 def test_a_robot_does_not_clash_with_itself() -> None:
     a, b, rng = twins(0)
-    one, two = trails(a, b, agents="aa")
-    assert clash_of(graph(a, b, rng, agents="aa"), one, two) is None
+    first, second = trails(a, b, agents="aa")
+    assert clash_of(graph(a, b, rng, agents="aa"), first, second) is None
 
 
 def test_a_moment_or_two_prove_nothing() -> None:
@@ -225,8 +225,8 @@ def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma:
     step = 0.02 * np.array([np.cos(angle), np.sin(angle)])
     while apart(a, b).min() < 0.35:
         b.moved(step)
-    one, two = trails(a, b, wakes=wakes)
-    assert clash_of(graph(a, b, rng, sigma=sigma), one, two) is None
+    first, second = trails(a, b, segments=wakes)
+    assert clash_of(graph(a, b, rng, sigma=sigma), first, second) is None
 
 
 @pytest.mark.parametrize("wakes", [False, True])
@@ -240,7 +240,7 @@ def test_robots_that_nearly_touch_rarely_count_as_collisions(wakes: bool) -> Non
         b = Walk(rng, way=a.way + rng.normal(0, 0.1, a.way.shape))
         while apart(a, b).min() < 0.2:
             b.moved(np.array([0.02, 0.0]))
-        refused += clash_of(graph(a, b, rng), *trails(a, b, wakes=wakes), s) is not None
+        refused += clash_of(graph(a, b, rng), *trails(a, b, segments=wakes), s) is not None
     assert refused <= 10
 
 
@@ -251,8 +251,8 @@ def test_known_radii_decide_the_least_distance() -> None:
     b = Walk(rng, way=a.way + np.array([0.25, 0.0]) + rng.normal(0, 0.03, a.way.shape))
     b.times = a.times
     whole = graph(a, b, rng)
-    found = clash_of(whole, *trails(a, b, radii=(0.2, 0.2)))
-    assert found is not None and found.nearest > 0.15
+    collision = clash_of(whole, *trails(a, b, radii=(0.2, 0.2)))
+    assert collision is not None and collision.nearest > 0.15
     for radii in ((0.04, 0.04), (0.0, 0.0), (0.4, 0.0)):
         assert clash_of(whole, *trails(a, b, radii=radii)) is None
     tiny = ExclusionSettings(least_apart=0.4)
@@ -269,6 +269,6 @@ def test_probabilities_agree_with_monte_carlo() -> None:
     chances = chances_clear(offsets, shifts, spreads, 0.2)
     for offset, shift, spread, chance in zip(offsets, shifts, spreads, chances, strict=True):
         centre = offset * (1 + shift / np.hypot(*offset))
-        draws = rng.multivariate_normal(centre, spread + 1e-4 * np.eye(2), 20000)
-        assert abs((np.hypot(*draws.T) >= 0.2).mean() - chance) < 0.05
+        samples = rng.multivariate_normal(centre, spread + 1e-4 * np.eye(2), 20000)
+        assert abs((np.hypot(*samples.T) >= 0.2).mean() - chance) < 0.05
     assert chances_clear(np.zeros((1, 2)), np.zeros(1), np.zeros((1, 2, 2)), 0.2)[0] < 0.02

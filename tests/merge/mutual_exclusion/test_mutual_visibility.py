@@ -119,9 +119,9 @@ def test_a_true_merge_has_mean_odds_of_at_most_one(missed: float, spread: float,
     hit = np.where((across2 < RADIUS**2) & (along > 0), along - np.sqrt(np.abs(RADIUS**2 - across2)), np.inf)
     hit[rng.random(n) < missed] = np.inf
     lengths = np.minimum(np.minimum(hit, rng.exponential(clutter, (n, k)) + 0.2), 3.16)
-    found = odds(looks(offsets, lengths * (1 + 0.01 * rng.standard_normal((n, k))), spread))
-    assert found.mean() < 1.0 + 3.0 * found.std() / np.sqrt(n)
-    assert found.min() < 0.3 and (missed == 0.0 or found.max() > 3.0)
+    result = odds(looks(offsets, lengths * (1 + 0.01 * rng.standard_normal((n, k))), spread))
+    assert result.mean() < 1.0 + 3.0 * result.std() / np.sqrt(n)
+    assert result.min() < 0.3 and (missed == 0.0 or result.max() > 3.0)
 
 
 def chain(share: float = 1.0, n: int = 8) -> PoseGraph:
@@ -159,7 +159,7 @@ def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
     # The 26 ways of a shell are even: their mean square is a third of that of each component.
     assert np.array_equal(errors.shifts[0], np.zeros((16, 2))) and len(errors.shifts) == 1 + 3 * 26
     full = errors.shifts[-26:] / rules.SIGMAS[-1]
-    # All ways together are about as wide as what they stand for.
+    # All modes together are about as wide as the covariance.
     wide = np.einsum("s,smi,smj->mij", errors.weights, errors.shifts, errors.shifts)
     assert errors.weights.sum() == pytest.approx(1.0)
     assert np.trace(wide, axis1=1, axis2=2) == pytest.approx(
@@ -195,7 +195,7 @@ def test_looking_at_a_thousand_nodes_takes_no_time(wake: int, most: float) -> No
     """Four robots, each in a room of its own with thin walls: all are in reach, none is in sight."""
     rng = np.random.default_rng(1)
     bearings, pose = np.arange(16) * np.pi / 8, PoseGaussian(Pose2(), np.zeros((3, 3)))
-    ids, means, trails = [], [], []
+    ids, means, trajectories = [], [], []
     for room, agent in enumerate("abcd"):
         corner = np.array([3.0 * (room % 2), 3.0 * (room // 2)])
         steps = np.cumsum(rng.uniform(-0.3, 0.3, (250, 2)), axis=0)
@@ -214,13 +214,15 @@ def test_looking_at_a_thousand_nodes_takes_no_time(wake: int, most: float) -> No
         ]  # fmt: skip
         ids += [node.id for node in nodes]
         means.append(np.column_stack([places + corner, headings]))
-        trails += trajectories_of(nodes)
+        trajectories += trajectories_of(nodes)
     information = scipy.sparse.csc_matrix(scipy.sparse.diags(np.full(3000, 1e4)))
     graph = PoseGraph(ids[0], tuple(ids), np.concatenate(means), information)
     took = []
     for _ in range(5):
         start = time.process_time()
-        assert [clash_of(graph, one, two) for one, two in combinations(trails, 2)] == [None] * 6
+        assert [clash_of(graph, first, second) for first, second in combinations(trajectories, 2)] == [
+            None
+        ] * 6
         took.append(time.process_time() - start)
     # 21 and 80 ms where this was written.
     assert min(took) < most

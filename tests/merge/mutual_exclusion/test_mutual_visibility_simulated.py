@@ -56,16 +56,16 @@ class Walks:
             for name in simulation.robots:
                 simulation.apply(Fail(name, "camera", "drop", 1.0))
             for instant in range(instants):
-                one, two = instant % 2, 1 - instant % 2
+                a, b = instant % 2, 1 - instant % 2
                 # One has arrived, two is midway.
-                now[one] = to[one]
-                simulation.kidnap(f"r{two}", Pose2(*(now[two] + to[two]) / 2, 0.0))
-                simulation.kidnap(f"r{one}", Pose2(*now[one], rng.uniform(-np.pi, np.pi)))
-                self._observe(simulation, f"r{one}", instant)
-                ends = free[one][np.hypot(*(free[one] - now[one]).T) < 0.5]
-                clear = [np.hypot(*(x - to[two]).T) > APART + 0.02 for x in (ends, (ends + now[one]) / 2)]
+                now[a] = to[a]
+                simulation.kidnap(f"r{b}", Pose2(*(now[b] + to[b]) / 2, 0.0))
+                simulation.kidnap(f"r{a}", Pose2(*now[a], rng.uniform(-np.pi, np.pi)))
+                self._observe(simulation, f"r{a}", instant)
+                ends = free[a][np.hypot(*(free[a] - now[a]).T) < 0.5]
+                clear = [np.hypot(*(x - to[b]).T) > APART + 0.02 for x in (ends, (ends + now[a]) / 2)]
                 ends = ends[clear[0] & clear[1]]
-                to[one] = rng.permutation(ends)[0] if len(ends) else now[one]
+                to[a] = rng.permutation(ends)[0] if len(ends) else now[a]
 
     def _observe(self, simulation: Simulation, name: str, instant: int) -> None:
         d, node_id = simulation.describe(name), NodeId(name, 1, instant)
@@ -88,14 +88,14 @@ def clash_of_mapped(
 ) -> Collision | None:  # fmt: skip
     """Whether two robots clash, each node mapped with an error of 1 cm, the second as a whole with 2 cm."""
     rng = np.random.default_rng(1)
-    one, two = ([node for node in nodes if node.id.agent == name] for name in (first, second))
-    ids = [node.id for node in one + two]
+    a, b = ([node for node in nodes if node.id.agent == name] for name in (first, second))
+    ids = [node.id for node in a + b]
     means = np.array([truth[node].vector for node in ids])
     means[:, :2] += rng.normal(0, 0.01, (len(ids), 2))
-    means[len(one) :, :2] += rng.normal([moved, 0.0], 0.02)
+    means[len(a) :, :2] += rng.normal([moved, 0.0], 0.02)
     information = scipy.sparse.diags(np.tile([3e3, 3e3, 1e5], len(ids)))
     graph = PoseGraph(ids[0], tuple(ids), means, scipy.sparse.csc_matrix(information))
-    return clash_of(graph, trajectories_of(one)[0], trajectories_of(two)[0], settings)
+    return clash_of(graph, trajectories_of(a)[0], trajectories_of(b)[0], settings)
 
 
 def between_twins(seed: int) -> float:
@@ -107,11 +107,11 @@ def between_twins(seed: int) -> float:
 @pytest.mark.parametrize("seed", range(4))
 def test_twins_should_have_seen_each_other(seed: int) -> None:
     """Within five minutes, in any room: where little floor is free they rarely see each other."""
-    found = Walks("twins", seed, (0, 1), 150).clash(between_twins(seed))
-    assert found is not None and found.where and found.evidence > 6.9
-    assert f"{found.first} would have seen {found.second} " in found.reason
-    assert f"m {found.where} at {found.time:.1f} s of clock" in found.reason
-    assert f"its sensors saw nothing there, {found.moments} such moments" in found.reason
+    collision = Walks("twins", seed, (0, 1), 150).clash(between_twins(seed))
+    assert collision is not None and collision.where and collision.evidence > 6.9
+    assert f"{collision.first} would have seen {collision.second} " in collision.reason
+    assert f"m {collision.where} at {collision.time:.1f} s of clock" in collision.reason
+    assert f"its sensors saw nothing there, {collision.moments} such moments" in collision.reason
 
 
 def with_wakes(walks: Walks, every: int = 5) -> None:
@@ -121,13 +121,13 @@ def with_wakes(walks: Walks, every: int = 5) -> None:
         nodes = [node for node in walks.nodes if node.id.agent == name]
         for k in range(0, len(nodes), every):
             node, after = nodes[k], nodes[k + 1 : k + every]
-            beside = [(walks.truth[node.id].inverse() @ walks.truth[one.id]).vector for one in after]
-            wake = TrajectorySegment(
-                np.array([(one.stamp_ns - node.stamp_ns) / 1e9 for one in after]),
+            beside = [(walks.truth[node.id].inverse() @ walks.truth[item.id]).vector for item in after]
+            segment = TrajectorySegment(
+                np.array([(item.stamp_ns - node.stamp_ns) / 1e9 for item in after]),
                 np.array(beside).reshape(-1, 3),
-                np.array([one.ranges.distances for one in after]).reshape(-1, len(node.ranges)),
+                np.array([item.ranges.distances for item in after]).reshape(-1, len(node.ranges)),
             )
-            kept.append(replace(node, wake=wake))
+            kept.append(replace(node, wake=segment))
     walks.nodes = kept
 
 
@@ -137,11 +137,11 @@ def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
     walks = Walks("twins", seed, (0, 1), 150)
     all_nodes = walks.clash(between_twins(seed))
     with_wakes(walks)
-    found = walks.clash(between_twins(seed))
+    collision = walks.clash(between_twins(seed))
     walks.nodes = [replace(node, wake=TrajectorySegment()) for node in walks.nodes]
     bare = walks.clash(between_twins(seed))
-    assert all_nodes is not None and found is not None and found.evidence > 6.9
-    assert bare is None or bare.moments < found.moments / 2
+    assert all_nodes is not None and collision is not None and collision.evidence > 6.9
+    assert bare is None or bare.moments < collision.moments / 2
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -215,11 +215,11 @@ class Exploration:
 @pytest.mark.slow
 def test_exploring_twin_rooms_are_distinguished_within_100_seconds() -> None:
     """In most rooms; in some they are hardly in sight of each other."""
-    found = []
+    collected = []
     for seed in range(5, 9):
         made = Exploration("twins", seed, 2, 100.0)
-        found.append(clash_of_mapped(made.nodes, made.truth, "r0", "r1", between_twins(seed)))
-    assert sum(clash is not None and bool(clash.where) for clash in found) >= 3
+        collected.append(clash_of_mapped(made.nodes, made.truth, "r0", "r1", between_twins(seed)))
+    assert sum(clash is not None and bool(clash.where) for clash in collected) >= 3
 
 
 @pytest.mark.slow

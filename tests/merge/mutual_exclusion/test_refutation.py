@@ -38,13 +38,13 @@ def tour(places: Array) -> list[Pose2]:
 
 def in_room(rng: np.random.Generator, n: int = 30) -> Array:
     """(N, 2) m, a walk in a room of 4 by 3 m in steps of half a metre that ends at the door at (2, 0)."""
-    found = [np.array([2.0, 0.3])]
-    while len(found) < n:
+    outcome = [np.array([2.0, 0.3])]
+    while len(outcome) < n:
         angle = rng.uniform(-np.pi, np.pi)
-        place = found[-1] + 0.5 * np.array([np.cos(angle), np.sin(angle)])
+        place = outcome[-1] + 0.5 * np.array([np.cos(angle), np.sin(angle)])
         if (place > [0.3, 0.3]).all() and (place < [3.7, 2.7]).all():
-            found.append(place)
-    return np.array(found[::-1])
+            outcome.append(place)
+    return np.array(outcome[::-1])
 
 
 def mapped(
@@ -53,35 +53,35 @@ def mapped(
     """A robot's map of a tour that takes it four seconds a stop, and the truth."""
     ids = [NodeId(agent, 1, 2 * k + 1) for k in range(len(stops))]
     pose = PoseGaussian(Pose2(), np.zeros((3, 3)))
-    one = HybridMap()
+    hybrid_map = HybridMap()
     for k, node_id in enumerate(ids):
         if k:
             noise = Pose2.from_vector(rng.normal(0, EDGE_SIGMAS))
             step = PoseGaussian(stops[k - 1].inverse() @ stops[k] @ noise, np.diag(EDGE_SIGMAS**2))
             pose = pose @ step
         stamp = round((start + 4.0 * k) * 1e9)
-        one.apply(NodePut(Node(node_id, stamp, pose, CAMERA, Landmarks.empty(), clock)))
+        hybrid_map.apply(NodePut(Node(node_id, stamp, pose, CAMERA, Landmarks.empty(), clock)))
         if k:
             edge_id = NodeId(agent, 1, 2 * k)
-            one.apply(EdgePut(Edge(edge_id, ids[k - 1], node_id, step, EdgeKind.MAPPED)))
-    return one, dict(zip(ids, stops, strict=True))
+            hybrid_map.apply(EdgePut(Edge(edge_id, ids[k - 1], node_id, step, EdgeKind.MAPPED)))
+    return hybrid_map, dict(zip(ids, stops, strict=True))
 
 
 def links(
-    one: Truth, two: Truth, pairs: Sequence[tuple[int, int]], rng: np.random.Generator,
+    first: Truth, second: Truth, pairs: Sequence[tuple[int, int]], rng: np.random.Generator,
     shift: Pose2 | None = None, inliers: int = 30,
 ) -> list[Link]:  # fmt: skip
     """Links between stops; `shift` is where the second robot's world is taken for the first one's."""
-    a, b = list(one), list(two)
-    found = []
+    a, b = list(first), list(second)
+    collected = []
     for i, j in pairs:
-        true = one[a[i]].inverse() @ (shift or Pose2()) @ two[b[j]]
+        true = first[a[i]].inverse() @ (shift or Pose2()) @ second[b[j]]
         mean = true @ Pose2.from_vector(rng.normal(0, LINK_SIGMAS))
         evidence = {"inliers": float(inliers), "share": 0.8}
-        found.append(
+        collected.append(
             Link(a[i], b[j], PoseGaussian(mean, np.diag(LINK_SIGMAS**2)), evidence=evidence).canonical()
         )
-    return found
+    return collected
 
 
 class Twins:
@@ -110,8 +110,8 @@ class Twins:
         return links(self.truth_a, self.truth_b, pairs, self.rng, inliers=inliers)
 
 
-def pairs(found: Sequence[Link]) -> set[tuple[NodeId, NodeId]]:
-    return {link.pair for link in found}
+def pairs(result: Sequence[Link]) -> set[tuple[NodeId, NodeId]]:
+    return {link.pair for link in result}
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -120,9 +120,9 @@ def test_closed_twins_stay_two(seed: int) -> None:
     merged = merge_maps(twins.maps, twins.false)
     assert len(merged.components) == 2 and not merged.links
     assert pairs([r.link for r in merged.refused if r.link]) == pairs(twins.false)
-    told = merged.explain(*twins.false[0].pair)
-    assert "are not linked: a and b would have been at the same place at the same time: 0.0" in told
-    assert "such moments" in told
+    explanation = merged.explain(*twins.false[0].pair)
+    assert "are not linked: a and b would have been at the same place at the same time: 0.0" in explanation
+    assert "such moments" in explanation
 
 
 @pytest.mark.parametrize(("clock", "late"), [("", 0.0), ("net", 500.0)])
@@ -203,12 +203,12 @@ def test_true_merges_of_robots_that_map_together_are_kept() -> None:
 def test_order_does_not_matter() -> None:
     twins = Twins(2)
     given = twins.false + twins.corridor(4)
-    one = merge_maps(twins.maps, given)
-    two = merge_maps(dict(reversed(twins.maps.items())), given[::-1])
-    assert [link.pair for link in one.links] == [link.pair for link in two.links]
-    assert [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
-    for node, place in one.poses.items():
-        other = two.poses[node].merged_from_robot.mean
+    first = merge_maps(twins.maps, given)
+    second = merge_maps(dict(reversed(twins.maps.items())), given[::-1])
+    assert [link.pair for link in first.links] == [link.pair for link in second.links]
+    assert [(r.pair, r.reason) for r in first.refused] == [(r.pair, r.reason) for r in second.refused]
+    for node, place in first.poses.items():
+        other = second.poses[node].merged_from_robot.mean
         assert np.array_equal(place.merged_from_robot.mean.vector, other.vector)
 
 

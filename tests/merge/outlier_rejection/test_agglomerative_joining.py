@@ -11,8 +11,8 @@ def keys(weights: dict[tuple[int, int], float]) -> dict[Key, float]:
     return {(K[a], K[b]): weight for (a, b), weight in weights.items()}
 
 
-def pairs(found: list[Key]) -> list[tuple[int, int]]:
-    return [(a.number, b.number) for a, b in found]
+def pairs(result: list[Key]) -> list[tuple[int, int]]:
+    return [(a.number, b.number) for a, b in result]
 
 
 def test_joined_pieces_are_not_tested_again() -> None:

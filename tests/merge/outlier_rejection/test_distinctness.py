@@ -46,7 +46,7 @@ class Aisle:
 
     def drive(self, agent: str, bays: Sequence[int], views: int = 3) -> None:
         """Map some bays, a few nodes in each."""
-        one = HybridMap()
+        hybrid_map = HybridMap()
         before: NodeId | None = None
         stops = [(bay, view) for bay in bays for view in range(views)]
         for k, (bay, view) in enumerate(stops):
@@ -55,11 +55,11 @@ class Aisle:
             self.truth[node] = Pose2(BAY * bay + 0.5 * view, aside, turn)
             self.things[node] = self.shown(bay)
             still = PoseGaussian(Pose2(), np.zeros((3, 3)))
-            one.apply(NodePut(Node(node, k * 10**9, still, CAMERA, Landmarks.empty())))
+            hybrid_map.apply(NodePut(Node(node, k * 10**9, still, CAMERA, Landmarks.empty())))
             if before is not None:
-                one.apply(EdgePut(self.step(before, node, NodeId(agent, 1, 2 * k))))
+                hybrid_map.apply(EdgePut(self.step(before, node, NodeId(agent, 1, 2 * k))))
             before = node
-        self.maps[MapId(agent, 1)] = one
+        self.maps[MapId(agent, 1)] = hybrid_map
 
     def step(self, a: NodeId, b: NodeId, edge_id: NodeId) -> Edge:
         """A step of the way; within a bay its landmarks were tracked."""
@@ -76,7 +76,7 @@ class Aisle:
 
     def links(self, least: int = 10) -> list[Link]:
         """What comparing nodes gives: each takes the other's bay for its own, if they show enough alike."""
-        found = []
+        collected = []
         for a, b in combinations(sorted(self.truth), 2):
             shared = self.common(a, b)
             if len(shared) < least or (a.map == b.map and b.number - a.number < 6):
@@ -86,8 +86,8 @@ class Aisle:
             apparent = self.truth[a].inverse() @ Pose2(there.x + shift, there.y, there.heading)
             mean = apparent @ Pose2.from_vector(self.rng.normal(0, SIGMAS))
             evidence = {"inliers": float(len(shared)), "share": 0.6}
-            found.append(Link(a, b, PoseGaussian(mean, np.diag(SIGMAS**2)), shared, evidence))
-        return found
+            collected.append(Link(a, b, PoseGaussian(mean, np.diag(SIGMAS**2)), shared, evidence))
+        return collected
 
     def true(self, link: Link) -> bool:
         """Whether a link's two nodes really stand to each other as it says."""
@@ -214,8 +214,8 @@ def test_order_does_not_matter() -> None:
     aisle.drive("a", [0, 1, 2])
     aisle.drive("b", [1, 2, 3])
     links = aisle.links()
-    told = {link.pair: link.doubles for link in aisle.weighed(links)}
+    collected = {link.pair: link.doubles for link in aisle.weighed(links)}
     aisle.rng.shuffle(links)  # type: ignore[arg-type]
     aisle.maps = dict(reversed(aisle.maps.items()))
     turned = [link.turned() if k % 2 else link for k, link in enumerate(links)]
-    assert {link.canonical().pair: link.doubles for link in aisle.weighed(turned)} == told
+    assert {link.canonical().pair: link.doubles for link in aisle.weighed(turned)} == collected

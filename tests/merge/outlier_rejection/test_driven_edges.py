@@ -99,14 +99,14 @@ def test_the_server_still_compares_nodes_connected_by_a_drive(scene: Scene) -> N
     """Neighbours on a robot's way are not compared, for they share its tracks; ends of a drive do not."""
     merger = Merger()
     for map_id in (A, B):
-        for body in scene.maps[map_id].contents():
-            merger.apply(map_id, body)
+        for change in scene.maps[map_id].contents():
+            merger.apply(map_id, change)
     links = [link.pair for link in merger.merged().links]
     assert links
     for a, b in links:
         scene.drive(a, b)
-    for body in scene.maps[GUEST].contents():
-        merger.apply(GUEST, body)
+    for change in scene.maps[GUEST].contents():
+        merger.apply(GUEST, change)
     assert [link.pair for link in merger.merged().links] == links
 
 

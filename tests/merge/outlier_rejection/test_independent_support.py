@@ -44,13 +44,13 @@ def test_neighbours_at_both_ends_count_as_one_place() -> None:
     near = neighbours(links, a, b, 2.0)
     assert crowds(np.ones((5, 5), bool), near).tolist() == [3, 3, 3, 1, 1]
     assert crowds(np.eye(5, dtype=bool), near).tolist() == [1] * 5
-    found = support_of([0, 1, 2, 4], np.ones(5, bool), np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
-    assert found.places == pytest.approx(2.0) and found.coincidence == pytest.approx(0.01)
-    assert found.others.tolist() == [1]
+    support = support_of([0, 1, 2, 4], np.ones(5, bool), np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
+    assert support.places == pytest.approx(2.0) and support.coincidence == pytest.approx(0.01)
+    assert support.others.tolist() == [1]
     # Landmarks that occur at other places too do not count, on either side.
     telling = np.array([True, True, True, False, False])
-    found = support_of([0, 1, 2, 4], telling, np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
-    assert found.places == pytest.approx(1.0) and found.others.tolist() == []
+    support = support_of([0, 1, 2, 4], telling, np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
+    assert support.places == pytest.approx(1.0) and support.others.tolist() == []
 
 
 def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
@@ -62,10 +62,10 @@ def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
     drawn = rng.uniform(*limits, (400_000, 3))
     distances2 = (drawn * np.linalg.solve(covariance, drawn.T).T).sum(axis=1)
     for reach2 in (1.0, 4.0, 9.0):
-        told = chances(
+        result = chances(
             np.array([[reach2]]), np.array([[math.sqrt(np.linalg.det(covariance))]]), square, square
         )
-        assert told[0, 0] == pytest.approx((distances2 < reach2).mean(), rel=0.05)
+        assert result[0, 0] == pytest.approx((distances2 < reach2).mean(), rel=0.05)
 
 
 def test_the_number_of_chance_sets_agrees_with_the_prediction() -> None:
@@ -100,11 +100,11 @@ def test_links_of_false_places_agree_with_monte_carlo() -> None:
 
 
 def test_a_pair_is_not_judged_by_itself() -> None:
-    one = Support(np.array([1, 1, 1]), np.array([2, 2]), 0.1)
-    other = Support(np.array([1]), np.array([1, 1, 1, 4, 4, 4, 4]), 0.1)
-    every = ChanceSupport.of([one, other])
+    first = Support(np.array([1, 1, 1]), np.array([2, 2]), 0.1)
+    second = Support(np.array([1]), np.array([1, 1, 1, 4, 4, 4, 4]), 0.1)
+    every = ChanceSupport.of([first, second])
     assert every.true == 4.0 and every.count == 5.0
-    without = every.without(ChanceSupport.of([one]))
+    without = every.without(ChanceSupport.of([first]))
     assert without.true == 1.0 and without.count == 4.0
     assert without.crowded(1) == 1.0 and without.crowded(4) == pytest.approx((1.0 + 0.125) / 5.0)
     assert every.without(every).share == 0.0

@@ -40,7 +40,7 @@ def fleet(seed: int, false_share: float, links: int = 60) -> tuple[np.ndarray, n
     ids = sorted(truth)
     pairs = [(a, b) for a in ids for b in ids if a < b and a.map != b.map]
     right: dict[tuple[NodeId, NodeId], bool] = {}
-    found = []
+    collected = []
     for k in rng.permutation(len(pairs))[:links]:
         a, b = pairs[k]
         sigma = rng.uniform(0.02, 0.1)
@@ -50,9 +50,9 @@ def fleet(seed: int, false_share: float, links: int = 60) -> tuple[np.ndarray, n
             relative = relative @ Pose2(*rng.uniform([-4, -4, -3], [4, 4, 3]))
         mean = relative @ Pose2(*rng.normal(0, [sigma, sigma, sigma / 2]))
         evidence = {"inliers": float(rng.integers(12, 60)), "share": 0.6}
-        found.append(Link(a, b, PoseGaussian.from_sigmas(mean, sigma, sigma / 2), evidence=evidence))
-    merged = merge_maps(maps, found)
-    said = dict(link_probabilities(merged))
+        collected.append(Link(a, b, PoseGaussian.from_sigmas(mean, sigma, sigma / 2), evidence=evidence))
+    merged = merge_maps(maps, collected)
+    text = dict(link_probabilities(merged))
     odds = prior_odds(merged)
     for refusal in merged.refused:
         if refusal.link is not None and refusal.edge is None:
@@ -61,21 +61,21 @@ def fleet(seed: int, false_share: float, links: int = 60) -> tuple[np.ndarray, n
             if component == merged.component_of(refusal.b) and component is not None:
                 (point,) = standpoints([refusal.link], merged.graphs[component], kept=False)
                 factor = point.log_factor
-            said[refusal.pair] = probability(factor, odds)
-    return np.array([said[pair] for pair in right]), np.array(list(right.values()))
+            text[refusal.pair] = probability(factor, odds)
+    return np.array([text[pair] for pair in right]), np.array(list(right.values()))
 
 
 @pytest.mark.parametrize("false_share", [0.2, 0.8])
 def test_probabilities_are_those_that_links_have(false_share: float) -> None:
     both = [fleet(seed, false_share) for seed in (1, 2, 3)]
-    said, right = (np.concatenate(column) for column in zip(*both, strict=True))
+    lines, right = (np.concatenate(column) for column in zip(*both, strict=True))
     share = right.mean()
     # Against the base rate as the probability of each (Brier's score).
-    assert ((said - right) ** 2).mean() < 0.5 * share * (1.0 - share)
-    assert abs(said.mean() - share) < 0.1
-    sure = (said > 0.99) | (said < 0.01)
+    assert ((lines - right) ** 2).mean() < 0.5 * share * (1.0 - share)
+    assert abs(lines.mean() - share) < 0.1
+    sure = (lines > 0.99) | (lines < 0.01)
     assert sure.mean() > 0.5
-    assert ((said > 0.5) == right)[sure].mean() > 0.98
+    assert ((lines > 0.5) == right)[sure].mean() > 0.98
 
 
 def test_they_are_never_certain_and_grow_with_the_evidence() -> None:

@@ -66,17 +66,17 @@ class Two:
 @pytest.mark.parametrize("false_ones", [0, 4, 12])
 def test_planted_false_links_are_refused(false_ones: int) -> None:
     for seed in range(5):
-        two = Two(seed)
-        true = [two.true_link(k, k) for k in range(0, 12, 2)]
+        second = Two(seed)
+        true = [second.true_link(k, k) for k in range(0, 12, 2)]
         false = []
         for _ in range(false_ones):
-            i = int(two.rng.integers(12))
-            false.append(two.false_link(i, (i + int(two.rng.integers(3, 9))) % 12))
-        found = sort_links([*true, *false], two.a, two.b)
-        kept = {one.pair for one in found.kept}
-        assert not kept & ({one.pair for one in false} - {one.pair for one in true})
-        assert len(kept & {one.pair for one in true}) >= 5
-        assert all(one.reason for one in found.refused)
+            i = int(second.rng.integers(12))
+            false.append(second.false_link(i, (i + int(second.rng.integers(3, 9))) % 12))
+        sorted_links = sort_links([*true, *false], second.a, second.b)
+        kept = {first.pair for first in sorted_links.kept}
+        assert not kept & ({first.pair for first in false} - {first.pair for first in true})
+        assert len(kept & {first.pair for first in true}) >= 5
+        assert all(first.reason for first in sorted_links.refused)
 
 
 def test_loop_misclosures_are_calibrated() -> None:
@@ -91,70 +91,74 @@ def test_loop_misclosures_are_calibrated() -> None:
 
 def test_an_aliased_room_is_refused_when_the_right_one_has_more_support() -> None:
     """Links between rooms that look alike agree with each other and are wrong."""
-    two = Two(3)
-    aliased = two.alike_room()
+    second = Two(3)
+    aliased = second.alike_room()
     # They really close loops with each other: only better support can show that they are wrong.
-    assert (loop_distances2(aliased, two.a, two.b, ConsistencySettings()) < 11.34).mean() > 0.7
-    right = [two.true_link(k, k) for k in range(0, 12, 2)]
-    found = sort_links([*aliased, *right], two.a, two.b)
-    kept = {one.pair for one in found.kept}
-    assert len(kept) >= 5 and kept <= {one.pair for one in right}
-    assert {one.pair for one in aliased} <= {one.pair for one in found.refused if "contradicts" in one.reason}
+    assert (loop_distances2(aliased, second.a, second.b, ConsistencySettings()) < 11.34).mean() > 0.7
+    right = [second.true_link(k, k) for k in range(0, 12, 2)]
+    sorted_links = sort_links([*aliased, *right], second.a, second.b)
+    kept = {first.pair for first in sorted_links.kept}
+    assert len(kept) >= 5 and kept <= {first.pair for first in right}
+    assert {first.pair for first in aliased} <= {
+        first.pair for first in sorted_links.refused if "contradicts" in first.reason
+    }
 
 
 def test_two_sets_with_equal_support_are_both_refused() -> None:
-    two = Two(4)
-    aliased = two.alike_room()
-    right = [two.true_link(k, k) for k in range(3)]
-    found = sort_links([*aliased, *right], two.a, two.b)
-    assert not found.kept
-    assert len(found.refused) == 6 and all("ambiguous" in one.reason for one in found.refused)
+    second = Two(4)
+    aliased = second.alike_room()
+    right = [second.true_link(k, k) for k in range(3)]
+    sorted_links = sort_links([*aliased, *right], second.a, second.b)
+    assert not sorted_links.kept
+    assert len(sorted_links.refused) == 6 and all(
+        "ambiguous" in first.reason for first in sorted_links.refused
+    )
 
 
 def test_one_place_with_many_links_is_rejected_if_another_contradicts_it() -> None:
     """A corner like another gave five links, the corridor that both came by four of half the weight."""
-    two = Two(8, n=16)
+    second = Two(8, n=16)
     shift = Pose2(-8.0, 0.0, 0.0)
     corner = [(0, 10), (0, 11), (1, 10), (1, 11), (1, 12)]
     alike = [
-        link(two.a, i, two.b, j, two.tour_a[i].inverse() @ shift @ two.tour_b[j], two.rng, 30)
+        link(second.a, i, second.b, j, second.tour_a[i].inverse() @ shift @ second.tour_b[j], second.rng, 30)
         for i, j in corner
     ]
-    true = [two.true_link(i, j, 15) for i, j in ((7, 7), (7, 8), (8, 7), (8, 8))]
-    assert len(sort_links(alike, two.a, two.b).kept) == 5
-    found = sort_links([*alike, *true], two.a, two.b)
-    assert not found.kept and len(found.rivals) == 2
-    assert all("with 1.0 and 1.0 independent places" in one.reason for one in found.refused)
+    true = [second.true_link(i, j, 15) for i, j in ((7, 7), (7, 8), (8, 7), (8, 8))]
+    assert len(sort_links(alike, second.a, second.b).kept) == 5
+    sorted_links = sort_links([*alike, *true], second.a, second.b)
+    assert not sorted_links.kept and len(sorted_links.rivals) == 2
+    assert all("with 1.0 and 1.0 independent places" in first.reason for first in sorted_links.refused)
     # One contradicting link is no other set; and two further places decide between the two.
-    assert len(sort_links([*alike, true[0]], two.a, two.b).kept) == 5
-    more = [two.true_link(k, k, 50) for k in (0, 1, 14, 15)]
-    kept = {one.pair for one in sort_links([*alike, *true, *more], two.a, two.b).kept}
-    assert kept == {one.pair for one in [*true, *more]}
+    assert len(sort_links([*alike, true[0]], second.a, second.b).kept) == 5
+    more = [second.true_link(k, k, 50) for k in (0, 1, 14, 15)]
+    kept = {first.pair for first in sort_links([*alike, *true, *more], second.a, second.b).kept}
+    assert kept == {first.pair for first in [*true, *more]}
 
 
 def test_a_single_link_is_too_little_unless_overwhelming() -> None:
     two = Two(5)
-    found = sort_links([two.true_link(2, 2)], two.a, two.b)
-    assert not found.kept and "no 2 links that share no node agree" in found.refused[0].reason
+    sorted_links = sort_links([two.true_link(2, 2)], two.a, two.b)
+    assert not sorted_links.kept and "no 2 links that share no node agree" in sorted_links.refused[0].reason
     assert len(sort_links([two.true_link(2, 2, inliers=60)], two.a, two.b).kept) == 1
 
 
 def test_links_at_one_node_count_as_one_place() -> None:
     two = Two(6)
-    found = sort_links([two.true_link(2, 2), two.true_link(2, 3)], two.a, two.b)
-    assert not found.kept
+    sorted_links = sort_links([two.true_link(2, 2), two.true_link(2, 3)], two.a, two.b)
+    assert not sorted_links.kept
     assert independent_links([two.true_link(2, 2), two.true_link(2, 3)], 9) == 1
     assert independent_links([two.true_link(2, 2), two.true_link(2, 3), two.true_link(3, 2)], 9) == 2
 
 
 def test_loops_within_a_map_must_agree_with_its_own_way() -> None:
-    two = Two(7)
-    a, tour = two.a, two.tour_a
-    true = [link(a, i, a, j, tour[i].inverse() @ tour[j], two.rng) for i, j in ((0, 9), (2, 11), (1, 7))]
-    false = link(a, 3, a, 10, Pose2(0.2, 0.1, 0.0), two.rng, inliers=90)
-    found = sort_links([*true, false], a, a)
-    assert {one.pair for one in found.kept} == {one.pair for one in true}
-    assert "own way" in found.refused[0].reason
+    second = Two(7)
+    a, tour = second.a, second.tour_a
+    true = [link(a, i, a, j, tour[i].inverse() @ tour[j], second.rng) for i, j in ((0, 9), (2, 11), (1, 7))]
+    false = link(a, 3, a, 10, Pose2(0.2, 0.1, 0.0), second.rng, inliers=90)
+    sorted_links = sort_links([*true, false], a, a)
+    assert {first.pair for first in sorted_links.kept} == {first.pair for first in true}
+    assert "own way" in sorted_links.refused[0].reason
 
 
 @settings(max_examples=60, deadline=None)

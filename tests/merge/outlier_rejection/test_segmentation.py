@@ -182,7 +182,7 @@ def test_drives_bring_the_map_nearer_to_the_truth_as_loops_do() -> None:
 def test_an_edge_recognised_and_driven_counts_once(driven_first: bool) -> None:
     aisles = Aisles(1)
     put = [aisles.drive, aisles.loop] if driven_first else [aisles.loop, aisles.drive]
-    both = {one(2, 26) for one in put}
+    both = {item(2, 26) for item in put}
     [piece] = fragments_of({A: aisles.map})
     assert not piece.refused and sum(m.robust for m in piece.measurements) == 1
     assert both <= set(merge_maps({A: aisles.map}, []).union().edges)
@@ -224,11 +224,11 @@ def test_no_set_of_loops_tears_a_map_apart_or_makes_it_depend_on_order(
     assert kept + len(named) == len(made)
     again = fragments_of({A: HybridMap(backwards(aisles.map))})
     assert [p.name for p in again] == [p.name for p in pieces]
-    for one, two in zip(pieces, again, strict=True):
-        assert np.array_equal(one.graph.means, two.graph.means)
-        assert [(r.edge, r.reason) for r in one.refused] == [(r.edge, r.reason) for r in two.refused]
+    for first, second in zip(pieces, again, strict=True):
+        assert np.array_equal(first.graph.means, second.graph.means)
+        assert [(r.edge, r.reason) for r in first.refused] == [(r.edge, r.reason) for r in second.refused]
 
 
-def backwards(one: HybridMap) -> list[NodePut | EdgePut]:
-    nodes, edges = list(one.nodes.values())[::-1], list(one.edges.values())[::-1]
+def backwards(hybrid_map: HybridMap) -> list[NodePut | EdgePut]:
+    nodes, edges = list(hybrid_map.nodes.values())[::-1], list(hybrid_map.edges.values())[::-1]
     return [*map(NodePut, nodes), *map(EdgePut, edges)]

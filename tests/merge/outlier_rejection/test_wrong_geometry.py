@@ -15,7 +15,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection import wrong_geometry
-from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch, looked_through
+from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch, seen_through
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.settings import ConsistencySettings
 
@@ -48,7 +48,7 @@ def test_a_view_through_a_wall_is_detected(ahead: float, first: str, second: str
     one, other = (facing_a_wall(MapId("a", 1), k, 3.0, Pose2(), 500) for k in (1, 2))
     there = Pose2(ahead, 0.0, 0.0)
     for node, view, moved, expected in ((one, other, there.inverse(), first), (other, one, there, second)):
-        compared, through = looked_through(node, view, moved, 0.01, 0.001)
+        compared, through = seen_through(node, view, moved, 0.01, 0.001)
         assert compared >= 50 if expected != "hidden" else compared == 0
         assert through == (compared if expected == "refuted" else 0)
 
@@ -67,10 +67,10 @@ def corridor(agent: str, scale: float = 1.0, gap: float = 0.0, count: int = 18) 
     return out
 
 
-def links_of(one: HybridMap, other: HybridMap) -> list[Link]:
+def links_of(hybrid_map: HybridMap, other: HybridMap) -> list[Link]:
     """True links between all views whose distances from the wall are alike."""
     out = []
-    for a in one.nodes.values():
+    for a in hybrid_map.nodes.values():
         for b in other.nodes.values():
             between = float(a.landmarks.depths[0] - b.landmarks.depths[0])
             if abs(between) < 0.8:
@@ -110,5 +110,5 @@ def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch: pytest.
         return real(links, *rest)
 
     monkeypatch.setattr(wrong_geometry, "link_sets", fails)
-    found = WrongGeometrySearch(ConsistencySettings()).wrong(maps, links.__getitem__, links.keys())
-    assert found.keys() == {ids[2]}
+    result = WrongGeometrySearch(ConsistencySettings()).wrong(maps, links.__getitem__, links.keys())
+    assert result.keys() == {ids[2]}

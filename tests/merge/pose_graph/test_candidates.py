@@ -16,11 +16,11 @@ def test_overlap_against_a_double_loop() -> None:
     world = room(0, 0, 5, 4, 600, rng)
     a = take_node(world, NodeId("a", 1, 1), Pose2(2, 2, 0), HERE, rng)
     b = take_node(world, NodeId("b", 1, 1), Pose2(2.3, 2, 0.1), HERE, rng)
-    one, two = decode(a.landmarks.codes), decode(b.landmarks.codes)
-    best_a, best_b = np.zeros(len(one)), np.zeros(len(two))
-    for i in range(len(one)):
-        for j in range(len(two)):
-            weight = 1 - float(((one[i] - two[j]) ** 2).sum()) / 0.25
+    first, second = decode(a.landmarks.codes), decode(b.landmarks.codes)
+    best_a, best_b = np.zeros(len(first)), np.zeros(len(second))
+    for i in range(len(first)):
+        for j in range(len(second)):
+            weight = 1 - float(((first[i] - second[j]) ** 2).sum()) / 0.25
             best_a[i], best_b[j] = max(best_a[i], weight), max(best_b[j], weight)
     table = overlaps([b, a])
     expected = min(best_a.sum(), best_b.sum())

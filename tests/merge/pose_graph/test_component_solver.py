@@ -44,9 +44,9 @@ def test_links_that_come_and_go_leave_the_batch_optimum(seed: int) -> None:
         for graph in graphs:
             own = solver.by_node[graph.anchor].graph.pose(graph.anchor)
             assert graph.pose(graph.anchor).distance(own) < 1e-9
-            found = batch(fragments, some, graph)
-            assert found.nodes == graph.nodes
-            off = np.hypot(*(found.means - graph.means)[:, :2].T)
+            result = batch(fragments, some, graph)
+            assert result.nodes == graph.nodes
+            off = np.hypot(*(result.means - graph.means)[:, :2].T)
             assert off.max() < 2e-4
 
 
@@ -80,12 +80,12 @@ def test_it_goes_on_from_an_earlier_solution(monkeypatch: pytest.MonkeyPatch) ->
     near = second.solve([*held[:-1], *new])
     whole = second.solve([*held[:-1], *new], whole=True)
     assert len(near) == len(whole) == len(graphs)
-    for one, two in zip(near, whole, strict=True):
-        assert isinstance(one, Component) and isinstance(two, Component)
-        assert one.unsettled > 0 and two.unsettled == 0
-        assert np.abs(one.means - two.means)[:, :2].max() < 0.01
-        found = batch(fragments, [*held[:-1], *new], two)
-        assert np.abs(found.means - two.means)[:, :2].max() < 2e-4
+    for a, b in zip(near, whole, strict=True):
+        assert isinstance(a, Component) and isinstance(b, Component)
+        assert a.unsettled > 0 and b.unsettled == 0
+        assert np.abs(a.means - b.means)[:, :2].max() < 0.01
+        result = batch(fragments, [*held[:-1], *new], b)
+        assert np.abs(result.means - b.means)[:, :2].max() < 2e-4
 
 
 def test_covariances_of_a_large_component_are_those_of_the_whole_or_larger(
@@ -98,16 +98,15 @@ def test_covariances_of_a_large_component_are_those_of_the_whole_or_larger(
     exact = graph.relative(starts, ends)
     monkeypatch.setattr(component, "EXACT", 0)
     monkeypatch.setattr(component, "MOST_EXACT", 0)
-    found = graph.relative(starts, ends)
-    assert np.allclose(found.covariances, exact.covariances, rtol=1e-4, atol=1e-9), "all are around"
+    relative = graph.relative(starts, ends)
+    assert np.allclose(relative.covariances, exact.covariances, rtol=1e-4, atol=1e-9), "all are around"
     # With few nodes around a pair the rest of the graph is left out.
     monkeypatch.setattr(component, "NEARBY", 20)
     monkeypatch.setattr(component, "ROWS_AT_ONCE", 2)
-    found = graph.relative(starts, ends)
-    assert np.allclose(found.means, exact.means)
+    relative = graph.relative(starts, ends)
+    assert np.allclose(relative.means, exact.means)
     larger = [
-        np.linalg.eigvalsh(one - two)[0]
-        for one, two in zip(found.covariances, exact.covariances, strict=True)
+        np.linalg.eigvalsh(a - b)[0] for a, b in zip(relative.covariances, exact.covariances, strict=True)
     ]
     assert min(larger) > -1e-9
-    assert np.abs(found.covariances - exact.covariances).max() > 1e-6
+    assert np.abs(relative.covariances - exact.covariances).max() > 1e-6

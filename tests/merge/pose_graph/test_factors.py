@@ -37,8 +37,8 @@ def drawn(seed: int, noise: float) -> tuple[Array, list[Measurement]]:
             root = 0.1 * rng.normal(0.0, 1.0, (3, 3))
             off = matrix(rng.normal(0.0, noise, 3))
             between = vector(np.linalg.inv(matrix(means[a])) @ matrix(means[b]) @ off)
-            said = PoseGaussian(Pose2.from_vector(between), root @ root.T + 0.01 * np.eye(3))
-            measurements.append(Measurement(NodeId("a", 1, a), NodeId("a", 1, b), said, bool((a + b) % 2)))
+            text = PoseGaussian(Pose2.from_vector(between), root @ root.T + 0.01 * np.eye(3))
+            measurements.append(Measurement(NodeId("a", 1, a), NodeId("a", 1, b), text, bool((a + b) % 2)))
     return means, measurements
 
 
@@ -54,8 +54,8 @@ def residual(m: Measurement, a: Array, b: Array) -> Array:
 @pytest.mark.parametrize("seed", range(3))
 def test_strains_are_those_of_the_group(seed: int) -> None:
     means, measurements = drawn(seed, 0.3)
-    found = factors_of(measurements).strains(means)
-    for m, strain in zip(measurements, found, strict=True):
+    result = factors_of(measurements).strains(means)
+    for m, strain in zip(measurements, result, strict=True):
         off = residual(m, means[m.a.number], means[m.b.number])
         information = np.linalg.inv(m.covariance)
         assert strain == pytest.approx(off @ information @ off)
@@ -65,7 +65,7 @@ def test_strains_are_those_of_the_group(seed: int) -> None:
 def test_information_is_that_of_finite_differences(seed: int) -> None:
     """To first order in the residuals, so they are small here."""
     means, measurements = drawn(seed, 1e-5)
-    found = factors_of(measurements).information(means).toarray()
+    result = factors_of(measurements).information(means).toarray()
     expected = np.zeros((3 * NODES, 3 * NODES))
     for m in measurements:
         i, j, step = m.a.number, m.b.number, 1e-5
@@ -80,7 +80,7 @@ def test_information_is_that_of_finite_differences(seed: int) -> None:
                 poses[1][ends] = vector(matrix(means[row]) @ back)
                 slopes[:, 3 * row + k] = (residual(m, *poses[0]) - residual(m, *poses[1])) / (2 * step)
         expected += slopes.T @ weight @ slopes
-    assert np.allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+    assert np.allclose(result, expected, atol=2e-3 * np.abs(expected).max())
 
 
 def test_neighbours_are_found_ring_by_ring() -> None:

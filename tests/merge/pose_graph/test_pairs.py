@@ -24,12 +24,12 @@ def test_it_agrees_with_a_fresh_choice(seed: int) -> None:
         what = rng.random()
         node = nodes[int(rng.integers(len(nodes)))]
         if what < 0.5:
-            found = {n: float(rng.uniform(2, 9)) for n in there - {node} if rng.random() < 0.4}
+            result = {n: float(rng.uniform(2, 9)) for n in there - {node} if rng.random() < 0.4}
             table.forget(node)
-            table.put(node, found)
+            table.put(node, result)
             there.add(node)
             overlaps = {pair: value for pair, value in overlaps.items() if node not in pair}
-            overlaps |= {(min(node, n), max(node, n)): value for n, value in found.items()}
+            overlaps |= {(min(node, n), max(node, n)): value for n, value in result.items()}
         elif what < 0.6:
             table.forget(node)
             there.discard(node)

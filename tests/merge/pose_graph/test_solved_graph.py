@@ -65,8 +65,8 @@ def test_optimum_and_covariances_against_scipy() -> None:
         means, covariances = scipy_optimum(true, measurements)
         assert np.allclose(graph.means[:, :2], means[:, :2], atol=1e-4)
         assert np.allclose(np.sin(graph.means[:, 2] - means[:, 2]), 0, atol=1e-4)
-        found = np.stack([graph.poses()[i].covariance for i in IDS])
-        assert np.allclose(found, covariances, rtol=0.08, atol=2e-5)
+        result = np.stack([graph.poses()[i].covariance for i in IDS])
+        assert np.allclose(result, covariances, rtol=0.08, atol=2e-5)
 
 
 def test_a_tree_is_solved_by_composition() -> None:
@@ -96,9 +96,9 @@ def test_relative_covariance_against_sampling_the_joint() -> None:
             for d in samples[:4000]
         ]
     )
-    found = graph.relative([IDS[i]], [IDS[j]])
-    assert np.allclose(np.cov(deviations.T), found.covariances[0], rtol=0.12, atol=2e-4)
-    assert np.allclose(found.means[0][:2], (a.inverse() @ b).vector[:2])
+    result = graph.relative([IDS[i]], [IDS[j]])
+    assert np.allclose(np.cov(deviations.T), result.covariances[0], rtol=0.12, atol=2e-4)
+    assert np.allclose(result.means[0][:2], (a.inverse() @ b).vector[:2])
 
 
 def test_covariances_are_calibrated() -> None:
@@ -113,10 +113,10 @@ def test_covariances_are_calibrated() -> None:
 def test_order_does_not_matter_and_unconnected_nodes_are_left_out() -> None:
     true, measurements = random_graph(8)
     apart = Measurement(NodeId("z", 1, 1), NodeId("z", 1, 2), measurements[0].a_from_b)
-    one = solve_graph(IDS[0], true[0], [*measurements, apart])
-    two = solve_graph(IDS[0], true[0], [apart, *measurements[::-1]])
-    assert one.nodes == two.nodes == tuple(IDS)
-    assert np.array_equal(one.means, two.means)
+    first = solve_graph(IDS[0], true[0], [*measurements, apart])
+    second = solve_graph(IDS[0], true[0], [apart, *measurements[::-1]])
+    assert first.nodes == second.nodes == tuple(IDS)
+    assert np.array_equal(first.means, second.means)
     alone = solve_graph(IDS[3], true[3], [])
     assert alone.nodes == (IDS[3],)
     assert np.allclose(alone.means[0], true[3].vector)
@@ -127,11 +127,11 @@ def test_marginals_some_at_a_time_are_those_of_all_at_once(monkeypatch: pytest.M
     graph = solve_graph(IDS[0], true[0], measurements)
     joint = graph.covariance(graph.nodes)
     monkeypatch.setattr(solved_graph, "AT_ONCE", 3)
-    found = graph.poses()
-    assert list(found) == IDS
+    result = graph.poses()
+    assert list(result) == IDS
     for k, node in enumerate(IDS):
-        assert np.allclose(found[node].covariance, joint[k, :, k, :], rtol=1e-9, atol=1e-14)
-        assert np.array_equal(found[node].mean.vector, graph.means[k])
+        assert np.allclose(result[node].covariance, joint[k, :, k, :], rtol=1e-9, atol=1e-14)
+        assert np.array_equal(result[node].mean.vector, graph.means[k])
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -1,0 +1,96 @@
+"""Code and pages use the words of docs/glossary.md, and none that only their authors would know."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = (
+    "agent", "benchmarks", "docs", "examples", "hybridmap", "mapserver", "mapweave", "merge", "registration",
+    "sim", "storage", "synthetic", "vision", "wire",
+)  # fmt: skip
+SUFFIXES = {".py", ".md", ".js", ".html", ".toml"}
+
+PLAIN = {
+    "anew": "again",
+    "afresh": "again",
+    "anybody": "any robot, any client, a person",
+    "chronicle": "map history",
+    "credence": "link probability",
+    "everybody": "all robots, all receivers",
+    "hearsay": "fleet coverage",
+    "heed": "apply",
+    "heeds": "applies",
+    "herald": "pose broadcast",
+    "lately": "recently",
+    "living": "active",
+    "nobody": "no robot, no server, unknown",
+    "ruling": "manual constraint",
+    "rulings": "manual constraints",
+    "somebody": "a person",
+    "stories": "consistent sets",
+    "story": "consistent set",
+    "told": "sent, reported, given",
+    "trail": "trajectory",
+    "trails": "trajectories",
+    "upkeep": "merge worker",
+    "wake": "trajectory segment",
+    "wakes": "trajectory segments",
+    "whoever": "the caller, any client",
+    "whom": "which robot",
+    "witness": "place, independent link",
+    "witnesses": "places, independent links",
+}
+"""Words of a private language, and what the field says instead."""
+PHRASES = {
+    r"stands? for": "replaces, supersedes",
+    r"in vain": "without success",
+    r"the one whose": "the robot, node, link ... whose",
+    r"of whom": "of which",
+}
+
+APART = re.compile(r"told apart")
+"""To distinguish: plain English."""
+EXCEPTIONS: dict[str, tuple[str, ...]] = {
+    # Keys of the map file, of messages and of JSON answers, and the values that carry them.
+    "ruling": ("docs/", "hybridmap/", "mapserver/", "mapweave/", "merge/", "storage/", "wire/"),
+    "rulings": ("docs/", "hybridmap/", "mapserver/", "mapweave/", "merge/", "storage/", "wire/"),
+    "wake": ("docs/", "hybridmap/", "merge/", "registration/", "wire/"),
+    "wakes": ("docs/", "wire/"),
+    "witness": ("benchmarks/rules/", "docs/", "hybridmap/", "mapserver/", "mapweave/", "merge/"),
+    "witnesses": ("benchmarks/rules/", "docs/", "hybridmap/", "mapserver/", "mapweave/", "merge/"),
+    # Ids of elements of the page.
+    "told": ("mapserver/http/static/", "docs/arduino.md"),
+    # A living room.
+    "living": ("docs/worlds.md", "sim/worlds/examples/"),
+}
+"""Words by the files that may use them, with the reason."""
+
+
+def pages() -> list[Path]:
+    """Every text file of the project that people read."""
+    inside = [p for folder in FOLDERS for p in (ROOT / folder).rglob("*") if p.suffix in SUFFIXES]
+    decisions = ROOT / "docs" / "decisions"
+    return [
+        *ROOT.glob("*.md"),
+        *(p for p in inside if "__pycache__" not in p.parts and decisions not in p.parents),
+    ]
+
+
+def test_code_and_pages_use_the_words_of_the_field() -> None:
+    word = re.compile(r"(?<![A-Za-z])(?:" + "|".join(PLAIN) + r")(?![A-Za-z])", re.IGNORECASE)
+    phrase = re.compile(r"\b(?:" + "|".join(PHRASES) + r")\b", re.IGNORECASE)
+    collected = []
+    for path in pages():
+        name = path.relative_to(ROOT).as_posix()
+        if path == Path(__file__):
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            # Names in camel case count word by word.
+            plain = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", APART.sub("", line))
+            hits = {m.group().lower() for m in (*word.finditer(plain), *phrase.finditer(line))}
+            collected += [
+                f"{name}:{number}: {hit}"
+                for hit in sorted(hits)
+                if not name.startswith(EXCEPTIONS.get(hit, ("\0",)))
+            ]
+    assert not collected, "see PLAIN for other words:\n" + "\n".join(collected)
