@@ -4,36 +4,21 @@ from __future__ import annotations
 
 import heapq
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.observation import RobotDescription
+from mapweave.agent.settings import OccupancyGridSettings
 from mapweave.hybridmap.pose import Array, Pose2
 
-OCCUPANCY_GRID_HIT = 0.9
+HIT = 0.9
 """Log-odds that a cell gains when a ranger ends in it."""
 MISS = 0.35
-"""Log-odds that it loses when a ranger passes through."""
+"""Log-odds that a cell loses when a ranger passes through it."""
 MOST = 3.0
 """Log-odds are kept within plus and minus this, so that a thing that moved away is forgotten."""
-
-
-@dataclass(frozen=True)
-class OccupancyGridSettings:
-    """The grid.
-
-    Attributes:
-        cell: side of a cell, m.
-        side: side of the whole grid, m; its middle is where the map began.
-        clearance: kept between the footprint's edge and anything seen, m.
-    """
-
-    cell: float = 0.1
-    side: float = 48.0
-    clearance: float = 0.10
 
 
 RAYS = 48
@@ -95,7 +80,7 @@ class OccupancyGrid:
         hits = proximity < self._description.ranger_reach - 0.05
         ended = np.unique(self.cells(origin + directions[hits] * ends[hits, None]), axis=0)
         self._odds[free[:, 0], free[:, 1]] -= MISS
-        self._odds[ended[:, 0], ended[:, 1]] += OCCUPANCY_GRID_HIT + MISS
+        self._odds[ended[:, 0], ended[:, 1]] += HIT + MISS
         # The robot's own footprint is free.
         own = self.cells(origin + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
         self._odds[own[:, 0], own[:, 1]] = -MOST

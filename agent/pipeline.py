@@ -12,22 +12,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from mapweave.agent.drive_statistics import DriveStatistics
-from mapweave.agent.exploration.carried_mapping import CarriedMapping, CarriedMappingSettings
+from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.random_exploration import RandomExploration
-from mapweave.agent.exploration.settings import ExplorerSettings
 from mapweave.agent.global_localization.resumption import Resumption
-from mapweave.agent.global_localization.settings import ResumptionSettings
-from mapweave.agent.mapping.mapper import Mapper, MapperSettings
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
-from mapweave.agent.navigation.navigator import Navigator, NavigatorSettings
+from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.agent.occupancy_grid import OccupancyGrid, OccupancyGridSettings
+from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.ranger_monitor import RangerMonitor
 from mapweave.agent.servo.proximity import guard
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -38,19 +37,6 @@ from mapweave.vision.sift import Sift
 
 IDENTITY = Pose2()
 NOTHING_DRIVEN = DriveStatistics()
-
-
-@dataclass(frozen=True)
-class PipelineSettings:
-    """Settings of the parts."""
-
-    mapper: MapperSettings = field(default_factory=MapperSettings)
-    explorer: ExplorerSettings = field(default_factory=ExplorerSettings)
-    passenger: CarriedMappingSettings = field(default_factory=CarriedMappingSettings)
-    navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
-    resumption: ResumptionSettings = field(default_factory=ResumptionSettings)
-    floor: OccupancyGridSettings = field(default_factory=OccupancyGridSettings)
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -114,7 +100,7 @@ class Pipeline:
         self,
         map_id: MapId,
         description: RobotDescription,
-        settings: PipelineSettings | None = None,
+        settings: AgentSettings | None = None,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
     ) -> None:
@@ -131,13 +117,13 @@ class Pipeline:
         """
         jit.load()  # a robot that drives must not wait for a compiler
         self._map_id = map_id
-        self._settings = settings or PipelineSettings()
+        self._settings = settings or AgentSettings()
         self._description = description
         lens = Lens(description.camera, description.distortion)
         self._lens = lens
-        self._sift = Sift(lens, self._settings.mapper.sift)
-        self._mapper = Mapper(map_id, description, self._settings.mapper, contents, next_number)
-        self._floor = OccupancyGrid(description, self._settings.floor)
+        self._sift = Sift(lens, self._settings.sift)
+        self._mapper = Mapper(map_id, description, self._settings, contents, next_number)
+        self._floor = OccupancyGrid(description, self._settings.occupancy_grid)
         self._rangers = RangerMonitor(description)
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
@@ -177,12 +163,12 @@ class Pipeline:
             case Explore() if self._explorer is None:
                 self._explorer = self._new_explorer()
             case Carried() if self._passenger is None:
-                self._passenger = CarriedMapping(self._mapper, self._settings.passenger)
+                self._passenger = CarriedMapping(self._mapper)
             case GoTo(goal):
                 self._mapper.lose()
                 self._restart()
                 self._navigator = Navigator(
-                    self._description, self._lens, self._sift, self.map, goal, self._settings.navigator,
+                    self._description, self._lens, self._sift, self.map, goal, self._settings,
                     self._settings.seed,
                 )  # fmt: skip
 
@@ -220,8 +206,8 @@ class Pipeline:
 
     def _new_explorer(self) -> Explorer:
         settings, parts = self._settings, (self._map_id, self._description, self._mapper, self._floor)
-        kind = RandomExploration if settings.explorer.wander else Explorer
-        return kind(*parts, settings.explorer, settings.seed)
+        kind = RandomExploration if settings.exploration.random else Explorer
+        return kind(*parts, settings.exploration, settings.seed)
 
     def _keep_up(self, observation: Observation) -> None:
         """Pass the observation to the mapper; it may detect that the robot was carried off."""
@@ -246,9 +232,7 @@ class Pipeline:
         """Find the robot on its own map; then map on from there."""
         if self._resumption is None:
             drives, settings = isinstance(self._mission, Explore), self._settings
-            self._resumption = Resumption(
-                self._description, self._sift, self.map, drives, settings.resumption, settings.seed
-            )
+            self._resumption = Resumption(self._description, self._sift, self.map, drives, settings.seed)
         command = self._resumption.step(observation, bool(self._blind))
         recognized, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot
         if recognized is None:
@@ -266,8 +250,8 @@ class Pipeline:
             if self._explorer is not None:
                 self._explorer.restart()
             return
-        # The map may begin anywhere, and earlier estimates are void.
-        self._floor = OccupancyGrid(self._description, self._settings.floor)
+        # The map may begin anywhere, and all that was found out on the way to it is void.
+        self._floor = OccupancyGrid(self._description, self._settings.occupancy_grid)
         if self._explorer is not None:
             self._explorer = self._new_explorer()
 

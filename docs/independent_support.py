@@ -20,11 +20,12 @@ from matplotlib.patches import Ellipse
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, sort_links
+from mapweave.merge.outlier_rejection.pairwise_consistency import sort_links
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
 
 A, B, FALSE, TRUE = "#1f4e79", "#8a4b08", "#c0392b", "#1e8449"
 HEARD = ChanceSupport(40.0, np.array([30.0, 8.0, 4.0, 2.0]))

@@ -20,24 +20,11 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Node
 from mapweave.hybridmap.pose import Array, Pose2
 
-FARTHEST = 2.5
-"""M, between two nodes."""
-WIDEST = math.radians(45.0)
-"""Rad, between their headings."""
-LEAST = 7
-"""Common landmarks that stay in view: as many as the detection of the next node needs; the servo itself needs
-four."""
-STOPS = 9
-"""Poses on the way at which is counted."""
+# What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`.
 
 
 RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
 """Edges by which two nodes show the same landmarks, without a drive from one to the other."""
-
-
-@dataclass(frozen=True)
-class ReachabilitySettings:
-    """What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,20 +42,27 @@ class Reachability:
     reason: str
 
 
-def reachability_of(
-    edge: Edge, a: Node, b: Node, settings: ReachabilitySettings | None = None
-) -> Reachability:
+FARTHEST = 2.5
+"""Largest distance of two nodes between which the servo drives, m."""
+WIDEST = math.radians(45.0)
+"""Largest turn between their headings, rad."""
+LEAST = 7
+"""Common landmarks that stay in view: as many as a look for the next node asks for; the servo itself holds
+on to four."""
+STOPS = 9
+"""Poses on the way at which landmarks in view are counted."""
+
+
+def reachability_of(edge: Edge, a: Node, b: Node) -> Reachability:
     """Whether the servo could drive an edge, in either direction: the same landmarks are in view both ways.
 
     Args:
         edge: between the two.
         a: node at the edge's a.
         b: node at its b.
-        settings: what the servo manages.
     """
     if edge.kind not in RECOGNISED:
         return Reachability(True, -1, f"{edge.kind} by a robot: it can be driven")
-    settings or ReachabilitySettings()
     between = edge.a_from_b.mean
     count = int(least_in_view(left(edge.shared, a, b), a, b, between, STOPS))
     distance, turn = between.distance(Pose2()), abs(between.heading)
@@ -86,7 +80,7 @@ def reachability_of(
     return Reachability(True, count, f"can be driven: {count} landmarks stay in view")
 
 
-def closed_edges(hybrid_map: HybridMap, settings: ReachabilitySettings | None = None) -> set[EdgeId]:
+def closed_edges(hybrid_map: HybridMap) -> set[EdgeId]:
     """Edges of a map that the servo could not drive."""
     nodes = hybrid_map.nodes
     return {
@@ -95,7 +89,7 @@ def closed_edges(hybrid_map: HybridMap, settings: ReachabilitySettings | None = 
         if edge.kind in RECOGNISED
         and edge.a in nodes
         and edge.b in nodes
-        and not reachability_of(edge, nodes[edge.a], nodes[edge.b], settings).drivable
+        and not reachability_of(edge, nodes[edge.a], nodes[edge.b]).drivable
     }
 
 

@@ -9,19 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.node import Edge, EdgeId, Node
-from mapweave.hybridmap.reachability import Reachability, ReachabilitySettings, left, reachability_of
+from mapweave.hybridmap.reachability import Reachability, left, reachability_of
 
 
 class ReachabilityCache:
     """Keeps the reachability of edges from merged map to merged map."""
 
-    def __init__(self, settings: ReachabilitySettings | None = None) -> None:
-        """Start with nothing known.
-
-        Args:
-            settings: what the servo manages.
-        """
-        self._settings = settings or ReachabilitySettings()
+    def __init__(self) -> None:
+        """Start with nothing known."""
         self._cache: dict[EdgeId, tuple[tuple[object, ...], Reachability]] = {}
 
     def reach(self, edge: Edge, a: Node, b: Node, faded: Sequence[NDArray[np.bool_] | None]) -> Reachability:
@@ -37,7 +32,7 @@ class ReachabilityCache:
         cached = self._cache.get(edge.id)
         if cached is None or any(old is not new for old, new in zip(cached[0], behind, strict=True)):
             visible_edge = replace(edge, shared=left(edge.shared, a, b, faded))
-            cached = behind, reachability_of(visible_edge, a, b, self._settings)
+            cached = behind, reachability_of(visible_edge, a, b)
             self._cache[edge.id] = cached
         return cached[1]
 

@@ -9,9 +9,11 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from mapweave.hybridmap.errors import Busy, SettingsError
+from msgspec import Meta
+
+from mapweave.hybridmap.errors import Busy
 
 LATENESS = 0.5
 """Tolerance of an appointment, s: a message takes time both ways."""
@@ -23,40 +25,32 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class AdmissionSettings:
-    """How questions are shared out.
+    """How a map server shares out the questions that take long.
 
     Attributes:
-        workers: questions that are worked on at once.
+        workers: questions that are worked on at once; 0 for one a core, four at the most.
         in_time: a question that would have its answer later than this, as far as is known, is refused, unless
             a worker is free, s.
-        too_late: one whose turn comes so late that its answer would take so many times as long is refused
-            as well: the others behind it are answered in time then.
+        too_late: a question whose turn comes so late that its answer would take so many times as long is
+            refused as well: the others behind it are answered in time then.
         first_guess: how long a question takes, before any was answered, s.
         smoothing: weight of the newest question in the mean time that one takes.
-        longest_pause: nobody is sent away for longer, s.
     """
 
-    workers: int = min(os.cpu_count() or 1, 4)
-    in_time: float = 0.7
-    too_late: float = 1.25
-    first_guess: float = 0.1
-    smoothing: float = 0.2
-    longest_pause: float = 10.0
+    workers: Annotated[int, Meta(ge=0, le=64)] = 0
+    in_time: Annotated[float, Meta(gt=0.0)] = 0.7
+    too_late: Annotated[float, Meta(ge=1.0)] = 1.25
+    first_guess: Annotated[float, Meta(gt=0.0)] = 0.1
+    smoothing: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.2
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot work.
+    @property
+    def threads(self) -> int:
+        """Workers on this machine."""
+        return self.workers or min(os.cpu_count() or 1, 4)
 
-        Raises:
-            SettingsError: a number out of range.
-        """
-        if not 1 <= self.workers <= 64:
-            raise SettingsError(f"{self.workers} workers; use 1 to 64")
-        if not (self.in_time > 0.0 and self.first_guess > 0.0 and self.longest_pause > 0.0):
-            raise SettingsError("in_time, first_guess and longest_pause must be positive")
-        if not self.too_late >= 1.0:
-            raise SettingsError(f"too_late {self.too_late:g} must be 1 or more")
-        if not 0.0 < self.smoothing <= 1.0:
-            raise SettingsError(f"smoothing {self.smoothing:g} must be above 0 and at most 1")
+
+LONGEST_PAUSE = 10.0
+"""Longest time after which a robot is told to ask again, s."""
 
 
 class AdmissionControl:
@@ -88,7 +82,7 @@ class AdmissionControl:
         self._seconds = self._settings.first_guess
         self._appointment = -math.inf
         self._booked: dict[int, float] = {}
-        workers = self._settings.workers
+        workers = self._settings.threads
         self._pool = executor or ThreadPoolExecutor(workers, thread_name_prefix="desk")
 
     def submit(self, work: Callable[[], _T], ticket: int | None = None, usual: bool = True) -> Future[_T]:
@@ -134,7 +128,7 @@ class AdmissionControl:
 
     def _wait(self) -> float:
         """How long a question that comes now would wait for a worker, s."""
-        workers = self._settings.workers
+        workers = self._settings.threads
         return max(self._open - workers + 1, 0) * self._seconds / workers
 
     def _keeps_appointment(self, ticket: int | None, now: float) -> bool:
@@ -150,7 +144,7 @@ class AdmissionControl:
     def _expected(self, now: float) -> float:
         """Time that appointments will take while a new question would wait, s."""
         soon = sum(due <= now + self._settings.in_time for due in self._booked.values())
-        return soon * self._seconds / self._settings.workers
+        return soon * self._seconds / self._settings.threads
 
     def _next_appointment(self, wait: float, ticket: int | None, again: bool) -> float:
         """In how many seconds to retry: when the queue is half empty, after all others.
@@ -158,11 +152,11 @@ class AdmissionControl:
         A ticket that was refused at its appointment need not go to the end again.
         """
         s, now = self._settings, self._clock()
-        due = now + max(wait - 0.5 * s.in_time, 0.0) + self._seconds / s.workers
+        due = now + max(wait - 0.5 * s.in_time, 0.0) + self._seconds / s.threads
         if not again:
-            due = self._appointment = max(due, self._appointment + self._seconds / s.workers)
-        due = min(due, now + s.longest_pause)
-        self._appointment = min(self._appointment, now + s.longest_pause)
+            due = self._appointment = max(due, self._appointment + self._seconds / s.threads)
+        due = min(due, now + LONGEST_PAUSE)
+        self._appointment = min(self._appointment, now + LONGEST_PAUSE)
         if ticket is not None and len(self._booked) < MOST_BOOKED:
             self._booked[ticket] = due
         return due - now

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Collection
-from dataclasses import dataclass
 
 from mapweave.hybridmap.node import NodeId
 
+FORGET = 120.0
+"""How long a blockage counts after it was reported last, s; infinite where only simulated time passes,
+which no server knows."""
+MOST = 256
+"""Blockages that are kept, those that were reported last."""
+
+
 Pair = tuple[NodeId, NodeId]
-
-
-@dataclass(frozen=True)
-class BlockageSettings:
-    """How long what a robot said counts for the others.
-
-    Attributes:
-        forget: after it was said last, s; infinite where only simulated time passes, which no server knows.
-        most: so many pairs are kept, those that were said last.
-    """
-
-    forget: float = 120.0
-    most: int = 256
 
 
 class Blockages:
@@ -32,9 +25,9 @@ class Blockages:
     only costs more: one robot's obstacle may have moved, and need not be in another's way.
     """
 
-    def __init__(self, settings: BlockageSettings | None = None) -> None:
-        """Start without blocks."""
-        self._settings = settings or BlockageSettings()
+    def __init__(self, forget: float = FORGET, most: int = MOST) -> None:
+        """Nothing is blocked."""
+        self._forget, self._most = forget, most
         self._reported: dict[Pair, float] = {}
         self._turn = threading.Lock()
 
@@ -50,12 +43,12 @@ class Blockages:
                 pair = (a, b) if a <= b else (b, a)
                 self._reported.pop(pair, None)
                 self._reported[pair] = now
-            while len(self._reported) > self._settings.most:
+            while len(self._reported) > self._most:
                 del self._reported[next(iter(self._reported))]
 
     def known(self, now: float) -> list[Pair]:
-        """The pairs that still count at a time of the server's clock, s."""
-        forget = self._settings.forget
+        """What still counts at a time of the server's clock, s."""
+        forget = self._forget
         with self._turn:
             self._reported = {pair: stamp for pair, stamp in self._reported.items() if now - stamp < forget}
             return list(self._reported)

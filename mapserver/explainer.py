@@ -22,7 +22,7 @@ from mapweave.mapserver.services import guarded
 from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.manual_constraints import check_manual_constraint
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.explanation_messages import (
     MAX_MAPS_TOLD,

@@ -14,12 +14,12 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import Edge, MapId
 from mapweave.merge.manual_constraints import apply_constraints
-from mapweave.merge.merging import MergeSettings
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, RefusedPair
 from mapweave.wire.codec import element_of
 

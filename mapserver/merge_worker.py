@@ -14,12 +14,12 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
-from mapweave.mapserver.merging.merger import Merger, MergerSettings
+from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.schedule import Job, Schedule
-from mapweave.merge.merging import MergeSettings
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import MergeSettings
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class MergeWorker:
         self._keeper = keeper
         self._history = history or MapHistory()
         self._share = share
-        self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
+        self._merger = Merger(index, merge)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False

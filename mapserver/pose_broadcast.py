@@ -23,26 +23,6 @@ from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 
-DISTANCE = 0.05
-"""A node that has moved less than this since it was last published is not published again, m."""
-TURN = math.radians(1.0)
-"""And is turned by less, rad."""
-
-
-@dataclass(frozen=True)
-class PoseBroadcastSettings:
-    """What is published, and how often.
-
-    Attributes:
-        every: s between two news of one agent, at least.
-        beat: s after which it is told the number of the last news again, so that lost ones are missed.
-        most: nodes in one message.
-    """
-
-    every: float = 2.0
-    beat: float = 15.0
-    most: int = 2048
-
 
 @dataclass
 class _Published:
@@ -53,6 +33,18 @@ class _Published:
     last: float = -math.inf
 
 
+EVERY = 2.0
+"""Shortest time between two messages to one agent, s."""
+BEAT = 15.0
+"""After this time the number of the last message is sent again, so that lost ones are missed, s."""
+MOST = 2048
+"""Nodes in one message."""
+DISTANCE = 0.05
+"""A node that has moved less than this since its agent was told is not sent again, m."""
+TURN = math.radians(1.0)
+"""A node that has turned less than this since its agent was told is not sent again, rad."""
+
+
 class PoseBroadcast:
     """Publishes news on request, and answers questions with all published poses."""
 
@@ -61,7 +53,6 @@ class PoseBroadcast:
         bus: Bus,
         keys: Keys,
         name: str,
-        settings: PoseBroadcastSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin to answer.
@@ -70,12 +61,10 @@ class PoseBroadcast:
             bus: the connection; stays the caller's.
             keys: of the fleet.
             name: of the server in the fleet.
-            settings: what is published, and how often.
             clock: only grows, s.
         """
         self._clock = clock
         self._bus, self._keys, self._name = bus, keys, name
-        self._settings = settings or PoseBroadcastSettings()
         self._run = secrets.randbits(64)
         self._lock = threading.Lock()
         self._published: dict[str, _Published] = {}
@@ -95,14 +84,14 @@ class PoseBroadcast:
             now: monotonic, s.
         """
         now = self._clock() if now is None else now
-        if now - self._checked_at < self._settings.every:
+        if now - self._checked_at < EVERY:
             return
         self._checked_at = now
         with self._lock:
             if merged.graphs != self._graphs:
                 self._publish_news(merged, now)
             for agent, published in self._published.items():
-                if now - published.last >= self._settings.beat:
+                if now - published.last >= BEAT:
                     self._send(agent, PoseNews(self._run, published.sequence, published.sequence), now)
 
     def _publish_news(self, merged: MergedMap, now: float) -> None:
@@ -125,8 +114,8 @@ class PoseBroadcast:
             published = self._published.setdefault(agent, _Published())
             rest, left = iter(places.items()), iter(lost)
             while True:
-                some = dict(islice(rest, self._settings.most))
-                less = tuple(islice(left, self._settings.most))
+                some = dict(islice(rest, MOST))
+                less = tuple(islice(left, MOST))
                 if not some and not less:
                     break
                 published.sequence += 1
@@ -139,7 +128,7 @@ class PoseBroadcast:
 
     def _moved(self, graphs: Iterable[PoseGraph]) -> Iterator[tuple[NodeId, MergedPose]]:
         """Nodes that have moved noticeably since they were published."""
-        _s, nothing = self._settings, _Published()
+        nothing = _Published()
         for graph in graphs:
             for node, (x, y, heading) in zip(graph.nodes, graph.means.tolist(), strict=True):
                 before = self._published.get(node.agent, nothing).places.get(node)

@@ -126,7 +126,7 @@ def _gaps(
     roads, out = router.roads, []
     for a, b in pairwise(way.nodes):
         between = [roads.union.edges[key] for key in roads.union.graph.get_edge_data(a, b)]
-        best = min(between, key=lambda e: (edge_cost(e, poses, True, router.settings.route), e.id))
+        best = min(between, key=lambda e: (edge_cost(e, poses, True, router.costs), e.id))
         words = hindrances.words(frozenset((a, b)))
         if words or all(edge.id in roads.closed for edge in between):
             hop = _hop(router, best, a, b, poses, 0.0)
@@ -139,7 +139,7 @@ def _hop(router: Router, edge: Edge, a: NodeId, b: NodeId, poses: Mapping[NodeId
     implied = edge.id.agent in IMPLIED
     kind = edge.id.agent if implied else str(edge.kind)
     words = WORDS[kind] if implied or edge.kind not in RECOGNISED else reach_words(router.merged, edge)
-    cost = edge_cost(edge, poses, True, router.settings.route) + more
+    cost = edge_cost(edge, poses, True, router.costs) + more
     return Hop(a, b, kind, between.distance(Pose2()), between.heading, cost, words)
 
 

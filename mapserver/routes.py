@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -38,35 +37,24 @@ ENTRIES = 12
 """Nodes that are tried as the beginning of a route."""
 
 
-@dataclass(frozen=True)
-class RouterSettings:
-    """How routes are chosen.
-
-    Attributes:
-        route: what a way costs.
-    """
-
-    route: RouteSettings = field(default_factory=RouteSettings)
-
-
 class Router:
     """Finds routes from node to node. It belongs to one merged map; make another for the next."""
 
     def __init__(
         self,
         merged: MergedMap,
-        settings: RouterSettings | None = None,
+        costs: RouteSettings | None = None,
         reaches: ReachabilityCache | None = None,
     ) -> None:
         """Take a merged map. Nothing is made of it before the first question.
 
         Args:
             merged: the map.
-            settings: how routes are chosen.
+            costs: what a way costs.
             reaches: cache of reachability from earlier maps; it is filled.
         """
         self.merged = merged
-        self.settings = settings or RouterSettings()
+        self.costs = costs or RouteSettings()
         self._reaches = reaches or ReachabilityCache()
         self._turn = threading.Lock()
         self._made: Roadmap | None = None
@@ -142,7 +130,7 @@ class Router:
         """The ways over nodes with these poses; see `route` and mapweave.hybridmap.route.Ways."""
         return Ways(
             self.roads.union, poses=poses, penalties=self._penalties(wary), blocked=blocked,
-            closed=self.roads.closed, settings=self.settings.route, toll=toll,
+            closed=self.roads.closed, settings=self.costs, toll=toll,
         )  # fmt: skip
 
     def _cheapest(
@@ -200,7 +188,7 @@ class Router:
 
     def _saved(self, pose: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
         """By how much it is cheaper to get to a node for a robot that is on an edge to it, m."""
-        _s, roads = self.settings, self.roads
+        roads = self.roads
         target = roads.poses[node]
         goal = np.array([target.x, target.y])
         at = np.array([pose.x, pose.y])

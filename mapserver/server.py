@@ -28,17 +28,11 @@ from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.retrieval.index_keeper import EVERY, PlaceIndexKeeper
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
-from mapweave.merge.merging import MergeSettings
+from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus
 from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
-
-STATUS_EVERY = 0.5
-"""Seconds between two status messages."""
-MERGE_SHARE = 0.4
-"""At most this share of the time is spent making the merged map anew."""
-
 
 log = logging.getLogger(__name__)
 
@@ -48,12 +42,18 @@ class ServerSettings:
     """How the server shares its time.
 
     Attributes:
-        desk: how questions that take long are shared out.
+        admission_control: how questions that take long are shared out.
         merge: how maps are merged.
     """
 
-    desk: AdmissionSettings = field(default_factory=AdmissionSettings)
+    admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
+
+
+STATUS_EVERY = 0.5
+"""Time between two status messages, s."""
+MERGE_SHARE = 0.4
+"""At most this share of the time is spent making the merged map anew."""
 
 
 class MapServer:
@@ -95,7 +95,9 @@ class MapServer:
         self._upkeep = MergeWorker(clock, MERGE_SHARE, self._keeper.index, s.merge, findings, self._chronicle)
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
-        self._desk = AdmissionControl(s.desk, clock.monotonic, clock.executor(s.desk.workers))
+        self._desk = AdmissionControl(
+            s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
+        )
         self._blockages = Blockages()
 
     def __enter__(self) -> MapServer:

@@ -18,6 +18,7 @@ from mapweave.commands import (
     robots,
     router,
     server,
+    settings,
     sim,
 )
 from mapweave.extras import MissingExtra, extra_of
@@ -57,7 +58,9 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (demo, server, router, sim, agent, robots, map_file, replay, info, relocalize, evaluate):
+    for command in (
+        demo, server, router, sim, agent, robots, map_file, replay, info, relocalize, evaluate, settings,
+    ):  # fmt: skip
         command.add_to(commands)
     return top
 

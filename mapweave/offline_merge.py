@@ -12,9 +12,9 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.map_files import maps_of
-from mapweave.mapserver.merging.merger import Merger, MergerSettings
-from mapweave.merge.merging import MergeSettings
+from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.codec import encode_body
 
@@ -107,7 +107,7 @@ def merge_parts(
     Raises:
         InvalidValue: a map cannot be merged; writing the others would lose it.
     """
-    merger = Merger(settings=MergerSettings(merging=settings or MergeSettings()))
+    merger = Merger(settings=settings)
     merger.rule(constraints)
     changes = [
         (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()

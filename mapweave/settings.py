@@ -1,28 +1,27 @@
-"""Settings: TOML into the parts' own dataclasses. Defaults work; a wrong name or value says so at once."""
+"""Settings: a TOML file into the parts' own dataclasses. Defaults work; errors in one line."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mapweave.agent.drivers.settings import RobotSettings
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.settings import AgentSettings
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
+from mapweave.merge.settings import MergeSettings
 from mapweave.storage.settings_file import build, read_toml
 
-if TYPE_CHECKING:
-    from mapweave.merge.merging import MergeSettings
 
-
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class NetworkSettings:
     """How to reach the fleet.
 
     Attributes:
         fleet: name that robots, server and simulator share.
-        endpoints: Zenoh endpoints of the router, tried in order.
+        endpoints: Zenoh endpoints of the router, tried in order. The server listens at them.
         server: name of the map server that must have a change before the agent may forget it.
     """
 
@@ -31,23 +30,23 @@ class NetworkSettings:
     server: str = "s0"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Settings:
     """All settings of a process; each role reads what it needs.
 
     Attributes:
         network: how to reach the fleet.
-        robot: driver, camera and geometry of an agent's robot.
-        pipeline: of an agent.
-        desk: how a map server shares out the questions that take long.
-        merge: how maps are merged, as it stands in the file; see `merge_settings`.
+        agent: of a robot's program.
+        admission_control: how a map server shares out the questions that take long.
+        merge: how maps are merged.
+        robot: driver, camera and geometry of an agent's robot as in the file; see `robot_settings`.
     """
 
-    network: NetworkSettings = dataclasses.field(default_factory=NetworkSettings)
-    robot: RobotSettings = dataclasses.field(default_factory=RobotSettings)
-    pipeline: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
-    desk: AdmissionSettings = dataclasses.field(default_factory=AdmissionSettings)
-    merge: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    agent: AgentSettings = field(default_factory=AgentSettings)
+    admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
+    merge: MergeSettings = field(default_factory=MergeSettings)
+    robot: Mapping[str, Any] = field(default_factory=dict)
 
 
 def load_settings(path: Path | None) -> Settings:
@@ -58,19 +57,20 @@ def load_settings(path: Path | None) -> Settings:
     """
     if path is None:
         return Settings()
-    return build(Settings, read_toml(path), str(path))
+    try:
+        return build(Settings, read_toml(path), str(path))
+    except InvalidValue as error:
+        raise SettingsError(f"{path}: {error}") from None
 
 
-def merge_settings(settings: Settings, path: Path | None) -> MergeSettings:
-    """How maps are merged, for those who merge them: a robot has none of the libraries that this needs.
+def robot_settings(settings: Settings, path: Path | None) -> RobotSettings:
+    """The `[robot]` table, for an agent.
 
     Args:
         settings: read from the file.
-        path: of the file; for the error's text.
+        path: of the file; for the text of errors.
 
     Raises:
         SettingsError: names or values are wrong.
     """
-    from mapweave.merge.merging import MergeSettings
-
-    return build(MergeSettings, settings.merge, f"{path}: merge")
+    return build(RobotSettings, settings.robot, f"{path}: robot")

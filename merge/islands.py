@@ -15,11 +15,12 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.manual_constraints import apply_constraints
-from mapweave.merge.merging import MergeSettings, decide
+from mapweave.merge.merging import decide
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
+from mapweave.merge.settings import MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
 
 EXACT = 600

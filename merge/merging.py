@@ -14,19 +14,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.refutation import Refutation
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.outlier_rejection.agglomerative_joining import agglomerate
 from mapweave.merge.outlier_rejection.closing_links import optimise
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.outlier_rejection.readmission import readmitted
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
@@ -34,22 +31,8 @@ from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
-
-
-@dataclass(frozen=True)
-class MergeSettings:
-    """How maps are merged.
-
-    Attributes:
-        consistency: when links are believed.
-        exclusion: when two robots would have been in one place.
-        strain: chi-square with 3 degrees of freedom above which an optimised link is refused.
-    """
-
-    consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
-    exclusion: ExclusionSettings = field(default_factory=ExclusionSettings)
-    strain: float = 25.0
 
 
 def merge_maps(

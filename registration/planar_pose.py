@@ -21,14 +21,8 @@ from mapweave.registration.planar_ambiguity import mirrored
 from mapweave.registration.projection import Stack
 from mapweave.registration.sightings import Sightings
 
-HYPOTHESES = 100
-"""Poses tried from three bearings, and as many from two points with depth."""
-FINALISTS = 2
-"""Best hypotheses that are refined."""
-PLANAR_POSE_ROUNDS = 8
-"""Of Gauss-Newton at most."""
-APART = 0.3
-"""Two poses nearer to each other than this are the same, m."""
+GAUSS_NEWTON_STEPS = 8
+"""Gauss-Newton steps, at most."""
 
 
 __all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
@@ -100,6 +94,12 @@ def solve_planar_pose(
     return replace(solved, inliers=inliers)
 
 
+HYPOTHESES = 100
+"""Poses tried from three bearings, and as many from two points with depth."""
+FINALISTS = 2
+"""Best hypotheses that are refined."""
+
+
 def solve_sightings(
     parts: Sequence[Sightings],
     *,
@@ -129,10 +129,14 @@ def solve_sightings(
     if not kept:
         return None
     best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
-    fix = refine(stack, best, settings.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
+    fix = refine(stack, best, settings.scale_sigma, prior, rounds=GAUSS_NEWTON_STEPS)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
     return _weighed(fix, parts, stack, settings, prior)
+
+
+APART = 0.3
+"""Two poses nearer to each other than this are the same, m."""
 
 
 def _weighed(
@@ -147,13 +151,13 @@ def _weighed(
     if int(inliers.sum()) < s.least_inliers:
         return fix
     mean = fix.node_from_robot.mean
-    mirror = improve(stack, mirrored(mean, stack.points[inliers, :2]), prior, rounds=PLANAR_POSE_ROUNDS)
+    mirror = improve(stack, mirrored(mean, stack.points[inliers, :2]), prior, rounds=GAUSS_NEWTON_STEPS)
     if mirror is None or mirror[0].distance(mean) < APART:
         return fix
     score, mirror_score = _scores(parts, np.stack([mean.vector, mirror[0].vector])).tolist()
     if mirror_score <= score:
         return replace(fix, rival=max(mirror_score, 0.0) / score if score > 0.0 else 1.0)
-    better = refine(stack, mirror[0], s.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
+    better = refine(stack, mirror[0], s.scale_sigma, prior, rounds=GAUSS_NEWTON_STEPS)
     if better is None or int(better.inliers.sum()) < s.least_inliers:
         return replace(fix, rival=1.0)
     return replace(better, rival=max(score, 0.0) / mirror_score)

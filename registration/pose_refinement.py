@@ -14,7 +14,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.registration.gauss_newton import refine, stack_sightings
-from mapweave.registration.planar_pose import PLANAR_POSE_ROUNDS, PlanarPoseSettings
+from mapweave.registration.planar_pose import GAUSS_NEWTON_STEPS, PlanarPoseSettings
 from mapweave.registration.recognition import Recognition, of_unknown_scale
 from mapweave.registration.sightings import Sightings
 
@@ -64,7 +64,7 @@ def refine_pose(node: Node, view: View, recognition: Recognition, pose: PlanarPo
         covariances = landmarks.covariances_in_robot(node.camera, sigma, scale_share, tilt_sigma)
         sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
         fix = refine(
-            stack_sightings([sightings]), best.mean, pose.scale_sigma, None, PLANAR_POSE_ROUNDS, SHIFT_SIGMA
+            stack_sightings([sightings]), best.mean, pose.scale_sigma, None, GAUSS_NEWTON_STEPS, SHIFT_SIGMA
         )
         if fix is None or int(fix.inliers.sum()) < pose.least_inliers:
             break

@@ -34,14 +34,10 @@ class RecognitionSettings:
         matching: how features are matched.
         pose: how the pose is found.
         least_inliers: landmarks that agree.
-        least_share: of the matches that could have been inliers.
         least_cells: cells of the 6 x 4 grid with an inlier, in either image.
         least_seen: of the landmarks that should be in the image by the pose found, on the side where it
             is more. A poster that hangs in two rooms explains few of what else should be there.
-        least_depths: of the landmarks that fit by their pixels and have a depth on both sides, how many
-            agree in depth too.
         least_evidence: how much likelier the inliers are than wrong matches, nats.
-        most_mean_square: largest mean squared normalised residual; 1 is expected.
         most_position_share: largest standard deviation of the position as a share of the median depth of
             the inliers.
         most_heading_sigma: rad.
@@ -52,12 +48,9 @@ class RecognitionSettings:
     matching: MatchSettings = field(default_factory=MatchSettings)
     pose: PlanarPoseSettings = field(default_factory=PlanarPoseSettings)
     least_inliers: int = 10
-    least_share: float = 0.35
     least_cells: int = 5
     least_seen: float = 0.12
-    least_depths: float = 0.5
     least_evidence: float = 40.0
-    most_mean_square: float = 3.0
     most_position_share: float = 0.06
     most_heading_sigma: float = math.radians(4.0)
     most_rival: float = 0.8
@@ -276,25 +269,34 @@ def _sightings(
     )
 
 
+LEAST_SHARE = 0.35
+"""Share of the matches that could have been inliers which must be inliers."""
+LEAST_DEPTHS = 0.5
+"""Share of the landmarks that fit by their pixels and have a depth on both sides which must agree in depth
+too."""
+MOST_MEAN_SQUARE = 3.0
+"""Largest mean squared normalised residual; 1 is expected."""
+
+
 def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
     """Why a pose is not good enough, in words; empty if it is."""
     e = evidence
     inliers = int(e["inliers"])
     if inliers < s.least_inliers:
         return f"{inliers} landmarks agree on a pose; {s.least_inliers} are needed"
-    if e["share"] < s.least_share:
+    if e["share"] < LEAST_SHARE:
         return f"only {e['share']:.0%} of the matches agree on one pose"
     if e["cells"] < s.least_cells:
         return f"the {inliers} landmarks that agree lie in {int(e['cells'])} of {math.prod(GRID)} image cells"
     if e["seen"] < s.least_seen:
         return f"only {e['seen']:.0%} of the landmarks that should be in the image are"
-    if e["depths"] < s.least_depths:
+    if e["depths"] < LEAST_DEPTHS:
         return f"only {e['depths']:.0%} of the landmarks that fit lie at the same depth"
     if e["log_evidence"] < s.least_evidence:
         return f"the {inliers} landmarks that agree are hardly better than chance"
     if e["rival"] > s.most_rival:
         return f"a pose on the other side of what is seen explains {e['rival']:.0%} as much"
-    if e["mean_square"] > s.most_mean_square:
+    if e["mean_square"] > MOST_MEAN_SQUARE:
         return f"the residuals are {math.sqrt(e['mean_square']):.1f} times what they should be"
     if e["sigma_xy"] > s.most_position_share * e["depth"]:
         return f"the position is uncertain by {e['sigma_xy']:.2f} m at landmarks {e['depth']:.1f} m away"

@@ -37,14 +37,10 @@ class SelectionSettings:
     """How many landmarks a node keeps, and which.
 
     Attributes:
-        most_bytes: what a node may cost on the wire, all but its wake included.
-        crowd: landmarks nearer to each other than about this share of the image's width crowd each other.
-        alike: distance of two decoded descriptors beyond which they cannot be taken for each other.
+        most_bytes: what a node may cost on the wire, all but its wake included, bytes; at least 660.
     """
 
     most_bytes: int = 3000
-    crowd: float = 0.08
-    alike: float = 0.5
 
     def __post_init__(self) -> None:
         """Refuse what leaves no room for a node.
@@ -54,8 +50,6 @@ class SelectionSettings:
         """
         if self.most_bytes < 2 * FIXED_BYTES:
             raise InvalidValue(f"most_bytes: a node needs {2 * FIXED_BYTES} at least, not {self.most_bytes}")
-        if not (self.crowd > 0 and self.alike > 0):
-            raise InvalidValue("crowd and alike must be positive")
 
 
 def worth(seen: NDArray[Any], rank: NDArray[Any]) -> Array:
@@ -67,6 +61,12 @@ def worth(seen: NDArray[Any], rank: NDArray[Any]) -> Array:
     """
     likely: Array = (DOUBT + seen) * np.sqrt(1.5 - rank)
     return likely
+
+
+CROWD = 0.08
+"""Landmarks nearer to each other than about this share of the image's width crowd each other."""
+ALIKE = 0.5
+"""Distance of two decoded descriptors beyond which they cannot be taken for each other."""
 
 
 def choose(
@@ -84,7 +84,7 @@ def choose(
         (K,) int64, indices; as many as fit.
     """
     s = settings or SelectionSettings()
-    order = _ranked(landmarks.pixels / camera.width, likely * distinctness(landmarks, s.alike), s.crowd)
+    order = _ranked(landmarks.pixels / camera.width, likely * distinctness(landmarks, ALIKE), CROWD)
     fits = _bytes_of_first(landmarks.take(order), camera) <= s.most_bytes
     return order[: int(fits.sum())]
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import enum
+import math
+import re
 import sys
 import tomllib
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+
+import msgspec
 
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.storage.atomic_file import read_whole
@@ -42,66 +45,77 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     """Make a dataclass from a table; what is missing keeps its default.
 
     Args:
-        cls: a frozen dataclass whose fields are numbers, texts, flags, one of several texts (`StrEnum`),
-            tuples, such dataclasses, or tables that are taken as they are (`Mapping`).
+        cls: a frozen dataclass whose fields are what `msgspec.convert` knows: numbers, texts, flags, one of
+            several texts (`StrEnum`), tuples, such dataclasses, or tables that are taken as they are
+            (`Mapping`). Ranges are `msgspec.Meta`.
         values: the table.
-        where: for the error's text, for example `robot.toml: pipeline`.
+        where: for the error's text, for example `robot.toml`.
 
     Raises:
-        SettingsError: a name that does not exist or is missing, or a value of the wrong kind.
+        SettingsError: a name that does not exist or is missing, or a value of the wrong kind or out of range.
+        InvalidValue: values that a dataclass itself refuses, in its own words.
     """
-    hints = typing.get_type_hints(cls)
-    names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
-    given: dict[str, Any] = {}
-    for name, value in values.items():
-        if name not in names:
-            close = difflib.get_close_matches(name, names, 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(names)}"
-            raise SettingsError(f"{where}: no setting {name!r}; {hint}")
-        given[name] = _convert(hints[name], value, f"{where}: {name}")
-    for item in dataclasses.fields(cls):  # type: ignore[arg-type]
-        optional = item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING
-        if item.name not in given and not optional:
-            raise SettingsError(f"{where}: {item.name} is missing")
+    for problem in _problems(cls, values, ""):
+        raise SettingsError(f"{where}: {problem}")
     try:
-        return cls(**given)
-    except (ValueError, SettingsError) as error:
+        return msgspec.convert(values, cls)
+    except msgspec.ValidationError as error:
+        raise SettingsError(f"{where}: {_told(str(error), values)}") from None
+    except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from None
 
 
-def _convert(kind: Any, value: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        if isinstance(value, kind):
-            return value
-        if not isinstance(value, Mapping):
-            raise SettingsError(f"{where}: must be a table")
-        return build(kind, value, where)
-    origin = typing.get_origin(kind)
-    if origin in (types.UnionType, typing.Union):
-        inner = [k for k in typing.get_args(kind) if k is not type(None)]
-        return _convert(inner[0], value, where)
-    if origin is Mapping:
-        if not isinstance(value, Mapping):
-            raise SettingsError(f"{where}: must be a table")
-        return dict(value)
-    if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
-        if value not in list(kind):
-            raise SettingsError(f"{where}: {value!r} is none of {', '.join(kind)}")
-        return kind(value)
-    if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise SettingsError(f"{where}: must be a list")
-        kinds = typing.get_args(kind)
-        if kinds[-1] is Ellipsis:
-            kinds = (kinds[0],) * len(value)
-        if len(value) != len(kinds):
-            raise SettingsError(f"{where}: must be a list of {len(kinds)}")
-        return tuple(_convert(item_kind, v, where) for item_kind, v in zip(kinds, value, strict=True))
-    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        # A comparison with "not a number" is false; an integer of TOML may be larger than any float.
-        if not -sys.float_info.max <= value <= sys.float_info.max:
-            raise SettingsError(f"{where}: {value!r} is no float")
-        return float(value)
-    if kind in (int, str, bool) and isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
-        return value
-    raise SettingsError(f"{where}: {value!r} is no {getattr(kind, '__name__', kind)}")
+def _problems(kind: Any, value: Any, path: str) -> Iterator[str]:
+    """What `msgspec.convert` lets pass: names that a dataclass does not have, numbers that are no floats."""
+    kinds = list(_dataclasses(kind))
+    if isinstance(value, Mapping) and kinds:
+        hints = typing.get_type_hints(kinds[0], include_extras=True)
+        for name, inner in value.items():
+            if name not in hints:
+                close = difflib.get_close_matches(str(name), hints, 1)
+                hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(hints)}"
+                yield f"{path}: no setting {name!r}; {hint}" if path else f"no setting {name!r}; {hint}"
+            else:
+                yield from _problems(hints[name], inner, f"{path}.{name}" if path else name)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from _problems(kind, inner, path)
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield f"{path}: {value!r} is no float"
+    elif isinstance(value, int) and abs(value) > sys.float_info.max:
+        yield f"{path}: the number has too many digits"
+
+
+def _dataclasses(kind: Any) -> Iterator[Any]:
+    """The dataclasses that a type hint names, by itself or within a union, a tuple or an annotation."""
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        yield kind
+    elif typing.get_origin(kind) in (types.UnionType, typing.Union, tuple, typing.Annotated):
+        for inner in typing.get_args(kind):
+            yield from _dataclasses(inner)
+
+
+def _told(error: str, values: Mapping[str, Any]) -> str:
+    """The error of msgspec as `path: what is wrong; what is there`.
+
+    Args:
+        error: for example ``Expected `float` > 0.0 - at `$.agent.navigation.speed` ``.
+        values: the table.
+    """
+    what, _, place = error.partition(" - at `$")
+    path = place.rstrip("`").lstrip(".")
+    there: Any = values
+    for name, number in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
+        there = there[int(number)] if number else there[name]
+    missing = re.fullmatch(r"Object missing required field `(\w+)`", what)
+    if missing:
+        what = f"{missing[1]} is missing"
+    else:
+        what = (
+            f"{what[:1].lower()}{what[1:]}".replace("`", "")
+            .replace("object", "table")
+            .replace("array", "list")
+        )
+        if not isinstance(there, Mapping | list):
+            what = f"{what}; it is {there!r}"
+    return f"{path}: {what}" if path else what

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.ekf.mapping_filter import MappingFilter
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.pose import Array
 from synthetic.mapping_run import AXLE, WHEEL_NOISE, MappingRun
 

@@ -11,18 +11,15 @@ from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.merging import MergeSettings, merge_maps
+from mapweave.merge.merging import merge_maps
 from mapweave.merge.outlier_rejection.max_clique import best_clique
-from mapweave.merge.outlier_rejection.pairwise_consistency import (
-    ConsistencySettings,
-    group_links,
-    loop_distances2,
-)
+from mapweave.merge.outlier_rejection.pairwise_consistency import EXACT, group_links, loop_distances2
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import fragment_by_node
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.settings import ConsistencySettings, MergeSettings
 from synthetic.fleet import SyntheticFleet
 from synthetic.gnc import inliers
 
@@ -69,7 +66,7 @@ def largest_sets(maps: Maps, links: Sequence[Link]) -> list[Link]:
     out: list[Link] = []
     for (first, second), group in group_links(links, by_node).items():
         agree = loop_distances2(group, by_node[first], by_node[second], s) < s.gate
-        best = best_clique(agree, np.ones(len(group), np.int64), s.exact)
+        best = best_clique(agree, np.ones(len(group), np.int64), EXACT)
         out += [group[k].canonical() for k in best if len(best) >= s.least_links]
     return out
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
@@ -15,16 +17,6 @@ from mapweave.hybridmap.node import CODE_BYTES
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import View
 from mapweave.vision.lens import Lens
-
-CONTRAST = 0.02
-"""SIFT's contrast threshold; lower finds more and weaker features."""
-CELLS = 4
-"""The image is cut into cells x cells; each may give at most `crowding` times its even share."""
-CROWDING = 2.5
-"""See cells."""
-BORDER_PX = 6.0
-"""Features nearer to the image's border are left out, they cannot be tracked."""
-
 
 TEXTURE_BLOCK_PX = 11
 """Side of the square in which texture is measured, about that of a tracked patch."""
@@ -36,15 +28,9 @@ class SiftSettings:
 
     Attributes:
         most: features kept of one image.
-        least_texture: the image's mean squared gradient around a feature, in its weakest direction,
-            (grey/px)^2. On an edge it is that of noise alone: such a feature slides along the edge when it
-            is tracked (aperture problem), unnoticed by a forward-backward check.
-        least_roundness: the same in the weakest direction as a share of that in the strongest.
     """
 
-    most: int = 150
-    least_texture: float = 1.5
-    least_roundness: float = 0.04
+    most: Annotated[int, Meta(ge=8)] = 150
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +56,22 @@ class Features:
     def view(self, camera: Camera) -> View:
         """The same as a question to the map."""
         return View(self.pixels.astype(np.float32), self.codes, camera)
+
+
+LEAST_TEXTURE = 1.5
+"""The image's mean squared gradient around a feature, in its weakest direction, (grey/px)^2. On an edge it
+is that of noise alone: such a feature slides along the edge when it is tracked (aperture problem),
+unnoticed by a forward-backward check."""
+LEAST_ROUNDNESS = 0.04
+"""The same mean squared gradient in the weakest direction, as a share of that in the strongest."""
+CONTRAST = 0.02
+"""SIFT's contrast threshold; lower finds more and weaker features."""
+CELLS = 4
+"""The image is cut into CELLS x CELLS cells;"""
+CROWDING = 2.5
+"""each may give at most this many times its even share of the features."""
+BORDER_PX = 6.0
+"""Features nearer to the image's border are left out, as they cannot be tracked, px."""
 
 
 class Sift:
@@ -111,7 +113,7 @@ class Sift:
         strengths = cv2.cornerEigenValsAndVecs(smooth, TEXTURE_BLOCK_PX, ksize=3)[..., :2] / 4.0
         at = np.array([k.pt for k in keypoints]).round().astype(int)
         strong, weak = strengths[at[:, 1], at[:, 0]].T
-        enough = (weak >= self._settings.least_texture) & (weak >= self._settings.least_roundness * strong)
+        enough = (weak >= LEAST_TEXTURE) & (weak >= LEAST_ROUNDNESS * strong)
         return [k for k, good in zip(keypoints, enough.tolist(), strict=True) if good]
 
     def _spread(self, keypoints: list[cv2.KeyPoint], width: int, height: int) -> list[cv2.KeyPoint]:

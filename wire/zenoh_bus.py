@@ -20,7 +20,7 @@ import zenoh
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire import exit_closing
 from mapweave.wire.bus import Closing, Reply, Request, Sample
-from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.bus_settings import QUEUE_LIMIT, RETRY_FIRST, RETRY_LONGEST, BusSettings
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.keyexpr import check_key, check_pattern
 from mapweave.wire.zenoh_config import session_values
@@ -51,7 +51,7 @@ class ZenohBus:
         self._connecting = threading.Thread(target=self._connect, name="zenoh-connect", daemon=True)
         if self._settings.mode == "router":
             self._session = _open_router(self._settings)
-        self._owner = Owner(Dispatcher(f"zenoh-{self._settings.mode}", self._settings.queue_limit))
+        self._owner = Owner(Dispatcher(f"zenoh-{self._settings.mode}", QUEUE_LIMIT))
         exit_closing.remember(self)
         if self._session is None:
             self._connecting.start()
@@ -177,7 +177,7 @@ class ZenohBus:
     def _connect(self) -> None:
         """Try until there is a router, then declare what was asked for in the meantime."""
         config = _config(self._settings)
-        wait = self._settings.retry_first
+        wait = RETRY_FIRST
         told = False
         while not self._closed.is_set():
             try:
@@ -188,7 +188,7 @@ class ZenohBus:
                     log.debug("zenoh says: %s", error)
                     told = True
                 self._closed.wait(wait)
-                wait = min(2 * wait, self._settings.retry_longest)
+                wait = min(2 * wait, RETRY_LONGEST)
                 continue
             with self._owner.lock:
                 if not self._closed.is_set():

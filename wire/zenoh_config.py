@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.bus_settings import LEASE, RETRY_FIRST, RETRY_LONGEST, ROUTER_QUEUE, BusSettings
 
 ACCEPT_PENDING = 1000
 """Connections of which a router does not know yet who they are."""
@@ -13,8 +13,8 @@ ACCEPT_TIMEOUT = 2.0
 def session_values(settings: BusSettings) -> dict[str, object]:
     """Zenoh's configuration, by path."""
     retry = {
-        "period_init_ms": round(settings.retry_first * 1e3),
-        "period_max_ms": round(settings.retry_longest * 1e3),
+        "period_init_ms": round(RETRY_FIRST * 1e3),
+        "period_max_ms": round(RETRY_LONGEST * 1e3),
         "period_increase_factor": 2,
     }
     return {
@@ -29,7 +29,7 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         # With Zenoh's own 100 and 10 s, a hundred idle connections keep everybody else out for 10 s.
         "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT * 1e3),
-        "transport/link/tx/lease": round(settings.lease * 1e3),
-        "transport/link/tx/queue/size/data": settings.router_queue if settings.mode == "router" else 2,
+        "transport/link/tx/lease": round(LEASE * 1e3),
+        "transport/link/tx/queue/size/data": ROUTER_QUEUE if settings.mode == "router" else 2,
         "transport/shared_memory/enabled": False,
     }

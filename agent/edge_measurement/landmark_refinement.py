@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,25 +13,6 @@ from mapweave.hybridmap.node import Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.quantization import snap
 
-DOUBT = 3.3
-"""A depth that differs from the mapped one by more than this many sigma is not taken over: the track may have
-moved to another feature."""
-
-
-@dataclass(frozen=True)
-class LandmarkRefinementSettings:
-    """When a node is written again.
-
-    Attributes:
-        share: a landmark is refined if its depth's sigma has fallen below this share of the mapped one.
-        least: a node is written again if so many of its landmarks are refined: it costs some 3 kB.
-        floor: least sigma of a depth: m, and share of the depth; as in mapping.
-    """
-
-    share: float = 0.7
-    least: int = 5
-    floor: tuple[float, float] = (0.01, 0.015)
-
 
 class LandmarkRefinement:
     """Watches a drive and refines the landmarks of the robot's own nodes.
@@ -39,10 +20,9 @@ class LandmarkRefinement:
     Each node is written again once a drive at most: when the robot leaves it, or has arrived.
     """
 
-    def __init__(self, own_map: HybridMap, settings: LandmarkRefinementSettings | None = None) -> None:
+    def __init__(self, own_map: HybridMap) -> None:
         """Take the robot's own map; nodes of others are theirs to mend."""
         self._map = own_map
-        self._settings = settings or LandmarkRefinementSettings()
         self._localizer: NodeLocalizer | None = None
         self._refined_nodes: set[NodeId] = set()
 
@@ -64,7 +44,7 @@ class LandmarkRefinement:
             or len(node.landmarks) != len(localizer.node.landmarks)
         ):
             return None
-        landmarks = refined(node.landmarks, *localizer.depths(), self._settings)
+        landmarks = refined(node.landmarks, *localizer.depths())
         if landmarks is None:
             return None
         self._refined_nodes.add(node.id)
@@ -72,9 +52,18 @@ class LandmarkRefinement:
         return replace(node, landmarks=snap(landmarks, node.camera))
 
 
-def refined(
-    mapped: Landmarks, depths: Array, sigmas: Array, s: LandmarkRefinementSettings
-) -> Landmarks | None:
+SHARE = 0.7
+"""A landmark is known better if its depth's sigma has fallen below this share of what it was."""
+LEAST = 5
+"""A node is told anew if so many of its landmarks are known better: it costs some 3 kB."""
+FLOOR = (0.01, 0.015)
+"""What a depth is never better than: m, and share of the depth; as when it was mapped."""
+DOUBT = 3.3
+"""A depth that is off from the mapped one by more than this many sigma of that is no better one: what was
+followed may be something else."""
+
+
+def refined(mapped: Landmarks, depths: Array, sigmas: Array) -> Landmarks | None:
     """Take over the depths that are known better; None if they are too few.
 
     Args:
@@ -83,11 +72,11 @@ def refined(
         sigmas: (N,) m, of independent errors.
         s: when a depth is refined.
     """
-    sigmas_with_floor = np.hypot(sigmas, s.floor[0] + s.floor[1] * depths)
+    sigmas_with_floor = np.hypot(sigmas, FLOOR[0] + FLOOR[1] * depths)
     with np.errstate(invalid="ignore"):
-        better = sigmas_with_floor < s.share * mapped.depth_sigmas
+        better = sigmas_with_floor < SHARE * mapped.depth_sigmas
         better &= np.abs(depths - mapped.depths) < DOUBT * mapped.depth_sigmas
-    if np.count_nonzero(better) < s.least:
+    if np.count_nonzero(better) < LEAST:
         return None
     new = [np.where(better, measured, old).astype(np.float32) for measured, old in
            ((depths, mapped.depths), (sigmas_with_floor, mapped.depth_sigmas))]  # fmt: skip

@@ -16,34 +16,7 @@ from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
-SETTLED = 3
-"""Images through which a node's landmarks must have been followed: fewer than lie between two detections of
-the next node."""
-TRAVERSE_GAP = 0.5
-"""Largest blind way between the landmarks of two nodes, see `Fix.blind`, m."""
-REACH = 0.45
-"""This near to a node the robot has passed it, m. It is twice the distance at which the follower counts
-a node as passed."""
-DETOUR = 1.3
-"""A way longer than the straight line by more than this factor, and `reach` at either end, is not measured:
-it leads around something."""
-
-
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
-
-
-@dataclass(frozen=True)
-class TraverseSettings:
-    """When a drive from node to node is a measurement.
-
-    Attributes:
-        floor: error of a settled pose beyond its covariance, m and rad: tracks have a common error for a
-            while, and the landmarks of a node were mapped by the same wheels.
-        widest: largest standard deviation of a traverse that is reported, m.
-    """
-
-    floor: tuple[float, float] = (0.005, 0.005)
-    widest: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +36,24 @@ class Traverse:
     landmarks: int
 
 
+FLOOR = (0.005, 0.005)
+"""Error of a settled pose that its covariance does not tell of, m and rad: tracks err alike for a while,
+and the landmarks of a node were mapped by the same wheels."""
+WIDEST = 0.1
+"""A traverse known no better than this is not worth telling, m."""
+SETTLED = 3
+"""Images through which a node's landmarks must have been followed: fewer than lie between two looks for the
+next node."""
+MOST_BLIND = 0.5
+"""What may lie between the landmarks of two nodes, as `Fix.blind` counts it, m."""
+REACH = 0.45
+"""This near to a node the robot has passed it, m. It is twice the distance within which the follower takes
+a node for passed."""
+DETOUR = 1.3
+"""A traverse on a way longer than the straight line by more than this factor, and REACH at either end, is
+not worth telling: something stands in between."""
+
+
 class TraverseRecorder:
     """Watches the robot's fixes and reports when it has driven from one node to another.
 
@@ -70,10 +61,9 @@ class TraverseRecorder:
     without landmarks, nor from where the robot was lost.
     """
 
-    def __init__(self, description: RobotDescription, settings: TraverseSettings | None = None) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Start with no node passed."""
         self._description = description
-        self._settings = settings or TraverseSettings()
         self._watched: NodeLocalizer | None = None
         self._images = 0
         self._forget()
@@ -104,7 +94,7 @@ class TraverseRecorder:
         self._node_from_robot, self._gap = self._node_from_robot @ step, self._gap + blind
         self._way += abs(observation.odometry.forward)
         if not self._settled(fix):
-            if self._gap > TRAVERSE_GAP:
+            if self._gap > MOST_BLIND:
                 self._forget()
             return None
         assert fix.localizer is not None, "landmarks are visible"
@@ -139,13 +129,12 @@ class TraverseRecorder:
         self._fewest, self._way = self._visible, 0.0
         if start is None or start == self._node:
             return None
-        s = self._settings
         widest = float(np.sqrt(np.linalg.eigvalsh(between.covariance[:2, :2])[-1]))
         straight = DETOUR * between.mean.distance(Pose2()) + 2.0 * REACH
-        return Traverse(start, self._node, between, fewest) if widest < s.widest and way < straight else None
+        return Traverse(start, self._node, between, fewest) if widest < WIDEST and way < straight else None
 
     def _with_floor(self, pose: PoseGaussian) -> PoseGaussian:
-        """A pose of the filter with the error floor added."""
-        xy, heading = self._settings.floor
+        """A pose of the filter with the uncertainty that the filter cannot know."""
+        xy, heading = FLOOR
         more: Array = np.diag([xy**2, xy**2, heading**2])
         return PoseGaussian(pose.mean, pose.covariance + more)

@@ -5,18 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from mapweave.agent.ekf.motion import WheelNoise
-from mapweave.agent.ekf.settings import FilterSettings
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Array
+
+SLIP = (0.1, 0.2)
+"""Sigma of (forward m, turn rad) of a step whose wheels the landmarks refute."""
+DISTRUST = 10
+"""Steps after one whose wheels the landmarks refute in which wheels that claim to stand are not trusted."""
 
 
 class AdaptiveOdometryNoise:
     """The wheels' noise: nominal, or as large as images have shown it to be."""
 
-    def __init__(self, noise: WheelNoise, settings: FilterSettings) -> None:
-        """Begin with trust."""
+    def __init__(self, noise: WheelNoise, side_slip: float) -> None:
+        """Begin with trust.
+
+        Args:
+            noise: of the wheels, as it is said.
+            side_slip: standard deviation of a step's slip aside, as a share of the wheels' way.
+        """
         self._noise = noise
-        self._settings = settings
+        self._side_slip = side_slip
         self._steps_left = 0
 
     @property
@@ -30,22 +39,22 @@ class AdaptiveOdometryNoise:
             return self._noise.root(odometry)
         # Slip and lost encoders last for more than one step.
         self._steps_left -= 1
-        return self._noise.refuted_root(odometry, 1.0, self._settings.slip[0])
+        return self._noise.refuted_root(odometry, 1.0, SLIP[0])
 
     def side_slip(self, odometry: Odometry) -> float:
         """Standard deviation of a step's slip aside, m."""
         way = abs(odometry.forward) + self._noise.axle * abs(odometry.turn)
-        return self._settings.side_slip * way
+        return self._side_slip * way
 
     def refuted(self, odometry: Odometry, surprise: float) -> Array:
         """The root for a step that its image refutes by so many sigmas; the next ones get more noise, too."""
         self.increase()
-        return self._noise.refuted_root(odometry, surprise, self._settings.slip[0])
+        return self._noise.refuted_root(odometry, surprise, SLIP[0])
 
     def slipped(self) -> Array:
         """The root for a step in which the wheels carry no information."""
-        return np.diag(self._settings.slip)
+        return np.diag(SLIP)
 
     def increase(self) -> None:
         """From now on, for a while."""
-        self._steps_left = self._settings.distrust
+        self._steps_left = DISTRUST

@@ -5,22 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from mapweave.agent.ekf.settings import FilterSettings
+from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH
 from mapweave.agent.ekf.update_report import Health
 from mapweave.hybridmap.pose import Array, Pose2
+
+PATIENCE = 2
+"""Steps without an image after which the filter says so."""
+PARALLAX_PX = 5.0
+"""Depths cannot be told before landmarks have moved by this much in the image, px."""
 
 
 class FilterHealth:
     """Keeps the health by the last image, its age, and how far the robot has moved for parallax."""
 
-    def __init__(self, settings: FilterSettings, focal: float) -> None:
+    def __init__(self, focal: float) -> None:
         """Begin at the anchor, healthy.
 
         Args:
-            settings: of the filter.
             focal: horizontal, px.
         """
-        self._settings = settings
         self._focal = focal
         self._last = (Health.GOOD, "")
         self._steps_unseen = 0
@@ -52,13 +55,13 @@ class FilterHealth:
         Args:
             converged: whether the depth of any landmark is known; only asked for if there was no parallax.
         """
-        unseen, settings = self._steps_unseen, self._settings
-        if unseen >= settings.patience:
+        unseen = self._steps_unseen
+        if unseen >= PATIENCE:
             return Health.NO_IMAGE, f"no image for {unseen} steps"
         if self._last[0] is not Health.GOOD:
             return self._last
-        parallax = self._baseline * self._focal / settings.prior_depth
-        if parallax < settings.parallax_px and not converged():
+        parallax = self._baseline * self._focal / PRIOR_DEPTH
+        if parallax < PARALLAX_PX and not converged():
             way = 1e3 * self._baseline
             return (
                 Health.NO_PARALLAX,

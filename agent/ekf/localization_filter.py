@@ -14,18 +14,14 @@ from mapweave.agent.ekf.iterated import Measurement, iterated_update
 from mapweave.agent.ekf.landmark_estimates import Ids, NodeLandmarks
 from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState, turning
 from mapweave.agent.ekf.motion import WheelNoise, move_pose
-from mapweave.agent.ekf.settings import LocalizationSettings
 from mapweave.agent.ekf.update_report import Health, UpdateReport
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.planar_pose import PlanarPoseSettings, solve_planar_pose
 
-PIXEL_SIGMA = 0.7
-"""Standard deviation of a tracked pixel, px."""
-GATE_PROBABILITY = 0.999
-"""Share of true measurements that each gate lets pass."""
 ITERATIONS = 4
 """Linearisations of one update at most; a second is made only if the first did not hold."""
 LINEAR_PX = 0.1
@@ -41,20 +37,18 @@ LEAST_FIXED = 4
 LEAST_REFOUND = 6
 """Landmarks that a static fix needs to replace a pose that was refuted."""
 LEAST_AGREEING = 3
-"""Fewer accepted landmarks than this are no good update."""
+"""An update with fewer accepted landmarks is bad."""
 LEAST_AGREEING_SHARE = 0.35
-"""Nor is a smaller share of those seen."""
+"""An update that accepts a smaller share of the landmarks seen is bad."""
 PATIENCE = 3
-"""So many bad updates in a row make the filter unhealthy."""
+"""Bad updates in a row that make the filter unhealthy."""
 WIDEST_SIGMA = 0.5
-"""So does a position less certain than this, m."""
-WIDEST_SLOPE = 4.0
-"""Landmarks further aside of the node than this |a| cannot be anchored at it."""
+"""A position less certain than this makes the filter unhealthy, m."""
 NEAREST = 0.05
-"""Nor can those nearer to the node's optical centre, m."""
+"""Landmarks nearer than this to the node's optical centre cannot be anchored at it, m."""
 
 
-__all__ = ["LocalizationFilter", "LocalizationSettings", "NodeLandmarks"]
+__all__ = ["LocalizationFilter", "NodeLandmarks"]
 
 
 class LocalizationFilter:
@@ -78,7 +72,8 @@ class LocalizationFilter:
         points_in_node: Array,
         covariances: Array,
         scale_share: float = 0.0,
-        settings: LocalizationSettings | None = None,
+        settings: FilterSettings | None = None,
+        side_slip: float = 0.0,
     ) -> None:
         """Start from a pose, however uncertain, and a node's landmarks.
 
@@ -93,14 +88,16 @@ class LocalizationFilter:
             scale_share: common relative error of the points and the prior's position, on top of that; the
                 wheels measure it.
             settings: see there.
+            side_slip: standard deviation of a step's slip aside, as a share of the wheels' way.
 
         Raises:
             InvalidValue: shapes that do not belong together, or an id twice.
         """
-        self.settings = settings or LocalizationSettings()
+        self._settings = settings or FilterSettings()
+        self._side_slip = side_slip
         self.ids: Ids = np.zeros(0, np.int64)
         self._camera = camera
-        self._wheels = WheelNoise(axle, wheel_noise, self.settings.wheel_floor)
+        self._wheels = WheelNoise(axle, wheel_noise, self._settings.wheel_floor)
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._state = LocalizationState.of_prior(prior)
@@ -113,7 +110,7 @@ class LocalizationFilter:
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels. The landmarks do not move in the node's frame."""
         pose_vector, by_pose, by_input = move_pose(self._state.pose_vector, odometry)
-        aside = self.settings.side_slip * (abs(odometry.forward) + self._wheels.axle * abs(odometry.turn))
+        aside = self._side_slip * (abs(odometry.forward) + self._wheels.axle * abs(odometry.turn))
         noise = np.column_stack([by_input[:, :2] @ self._wheels.root(odometry), aside * by_input[:, 2]])
         p = self._state.covariance.copy()
         p[:3, 3:] = by_pose @ p[:3, 3:]
@@ -129,7 +126,7 @@ class LocalizationFilter:
             ids: (N,) what is seen; ids that the filter does not hold are ignored.
             pixels: (N, 2) px, undistorted; rows with NaN are ignored.
         """
-        _s, mount = self.settings, self._camera.mount_forward
+        mount = self._camera.mount_forward
         slots, rows = self._slots(ids)
         seen = np.isfinite(pixels[rows]).all(axis=1)
         slots, rows = slots[seen], rows[seen]
@@ -143,8 +140,8 @@ class LocalizationFilter:
         if not len(slots):
             return self._judge(UpdateReport.blind(ids, "no landmark of the node is in view"))
         slopes = (pixels[rows] - self._centre) / self._focal
-        variances, linear = (PIXEL_SIGMA / self._focal) ** 2, LINEAR_PX / self._camera.fx
-        gate = pixel_gate(GATE_PROBABILITY)
+        variances, linear = (self._settings.pixel_sigma / self._focal) ** 2, LINEAR_PX / self._camera.fx
+        gate = pixel_gate(self._settings.gate_probability)
         measurement = Measurement(slots, slopes, variances, gate, ITERATIONS, linear)
         fit = iterated_update(self._state, start, measurement, mount)
         if fit is None:
@@ -249,7 +246,7 @@ class LocalizationFilter:
         The fix is a point of linearisation only, so that no pixel is used twice. A refuted pose loses
         its certainty; the landmarks keep theirs.
         """
-        _s, state = self.settings, self._state
+        state = self._state
         refuted = self._bad >= PATIENCE
         if not (refuted or state.covariance[2, 2] > LOOSE_HEADING**2):
             return state.pose_vector
@@ -261,7 +258,7 @@ class LocalizationFilter:
             self._camera,
             rng=self._rng,
             point_covariances=covariances[slots],
-            settings=PlanarPoseSettings(pixel_sigma=PIXEL_SIGMA, least_inliers=least),
+            settings=PlanarPoseSettings(pixel_sigma=self._settings.pixel_sigma, least_inliers=least),
         )
         if fix is None:
             return state.pose_vector
@@ -296,7 +293,7 @@ class LocalizationFilter:
 
     def _anchorable(self, rays: Array) -> NDArray[np.bool_]:
         near = rays[:, 2] * NEAREST > 1.0
-        aside = ~(np.abs(rays[:, 0]) <= WIDEST_SLOPE)
+        aside = ~(np.abs(rays[:, 0]) <= self._settings.widest_slope)
         return np.asarray((rays[:, 2] > 0) & ~near & ~aside, np.bool_)
 
     def _keep(self, mask: NDArray[np.bool_]) -> None:

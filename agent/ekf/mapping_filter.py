@@ -17,17 +17,28 @@ from mapweave.agent.ekf.filter_health import FilterHealth
 from mapweave.agent.ekf.gating import MEDIAN, Judgement, pixel_gate, remove_outliers, select_inliers
 from mapweave.agent.ekf.innovations import Examined, innovation_covariance, whiten
 from mapweave.agent.ekf.landmark_estimates import Ids, LandmarkEstimates
-from mapweave.agent.ekf.mapping_state import MappingState, Step
+from mapweave.agent.ekf.mapping_state import LEAST_AGREEING, PRIOR_DEPTH, PRIOR_SPREAD, MappingState, Step
 from mapweave.agent.ekf.measurement_model import ImageMeasurement, Pinhole, slots_of
 from mapweave.agent.ekf.motion import WheelNoise, move_pose, transform_rays
 from mapweave.agent.ekf.pitch_correction import pitch_offset
 from mapweave.agent.ekf.pixel_noise import PixelNoise
-from mapweave.agent.ekf.settings import FilterSettings
 from mapweave.agent.ekf.update_report import Health, UpdateReport
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, PoseGaussian
+
+LEAST_AGREEING_SHARE = 0.4
+"""An update that accepts a smaller share of the landmarks seen is not healthy."""
+CONVERGED_SIGMA = 0.05
+"""Depth sigma under which a landmark has converged, m."""
+CONVERGED_SHARE = 0.05
+"""Depth sigma under which a landmark has converged, as a share of the depth; the larger of the two
+counts."""
+NEAREST = 0.05
+"""Landmarks nearer than this to the optical centre are let go, m."""
+
 
 __all__ = ["FilterSettings", "LandmarkEstimates", "MappingFilter"]
 
@@ -47,7 +58,12 @@ class MappingFilter:
     """
 
     def __init__(
-        self, camera: Camera, axle: float, wheel_noise: float, settings: FilterSettings | None = None
+        self,
+        camera: Camera,
+        axle: float,
+        wheel_noise: float,
+        settings: FilterSettings | None = None,
+        side_slip: float = 0.0,
     ) -> None:
         """Start at the anchor, with certainty, knowing no landmark.
 
@@ -56,6 +72,7 @@ class MappingFilter:
             axle: distance between the wheels, m.
             wheel_noise: standard deviation of a wheel's way as a share of the way.
             settings: see there.
+            side_slip: standard deviation of a step's slip aside, as a share of the wheels' way.
         """
         self.settings = settings or FilterSettings()
         self.ids: Ids = np.zeros(0, np.int64)
@@ -63,23 +80,22 @@ class MappingFilter:
         self._camera = camera
         self._pinhole = Pinhole(camera)
         self._wheels = AdaptiveOdometryNoise(
-            WheelNoise(axle, wheel_noise, self.settings.wheel_floor), self.settings
+            WheelNoise(axle, wheel_noise, self.settings.wheel_floor), side_slip
         )
         self._gate = pixel_gate(self.settings.gate_probability)
         self._noise = PixelNoise(self.settings.pixel_sigma, self._pinhole.focal, self.settings.adaptation)
-        self._pose_variances = np.square(np.array(self.settings.pose_noise, np.float64))
         self._settled = MappingState.at_anchor()
         self._step: Step | None = None
-        self._watch = FilterHealth(self.settings, camera.fx)
+        self._watch = FilterHealth(camera.fx)
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels; landmarks that come behind the camera or far aside are removed."""
         state, mount, s = self.state, self._camera.mount_forward, self.settings
         pose_vector, _, _ = move_pose(state.pose_vector, odometry)
         rays, scale = transform_rays(state.rays, odometry, mount)
-        stays = (scale > 1e-3) & (rays[:, 2] * s.nearest <= 1.0) & (np.abs(rays[:, 0]) <= s.widest_slope)
+        stays = (scale > 1e-3) & (rays[:, 2] * NEAREST <= 1.0) & (np.abs(rays[:, 0]) <= s.widest_slope)
         root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
-        taken = Step(state, odometry, root, aside, self._pose_variances, mount, odometry, pose_vector, rays)
+        taken = Step(state, odometry, root, aside, mount, odometry, pose_vector, rays)
         if not stays.all():
             self.lost += int(np.count_nonzero(~stays))
             self.ids = self.ids[stays]
@@ -115,8 +131,8 @@ class MappingFilter:
         variances = np.empty((n, 3))
         variances[:, :2] = (self.settings.pixel_sigma / self._pinhole.focal) ** 2
         if inverse_depths is None or sigmas is None:
-            rays[:, 2] = 1.0 / self.settings.prior_depth
-            variances[:, 2] = (self.settings.prior_spread / self.settings.prior_depth) ** 2
+            rays[:, 2] = 1.0 / PRIOR_DEPTH
+            variances[:, 2] = (PRIOR_SPREAD / PRIOR_DEPTH) ** 2
         else:
             rays[:, 2] = inverse_depths
             variances[:, 2] = np.square(sigmas)
@@ -211,7 +227,7 @@ class MappingFilter:
     def converged(self) -> NDArray[np.bool_]:
         """(n,) landmarks whose depth is known well enough, in metres."""
         now = self.landmarks()
-        limit = np.maximum(self.settings.converged_sigma, self.settings.converged_share * now.depths)
+        limit = np.maximum(CONVERGED_SIGMA, CONVERGED_SHARE * now.depths)
         return np.asarray(np.isfinite(now.depths) & (now.depth_sigmas <= limit), np.bool_)
 
     @property
@@ -229,12 +245,12 @@ class MappingFilter:
 
     def _judge(self, measurement: ImageMeasurement, examined: Examined) -> Judgement:
         """Which measured landmarks to accept, and what they say about the wheels and the pixels."""
-        s, slots = self.settings, measurement.slots
+        slots = measurement.slots
         innovations, whitening, worst, median = examined
         inliers = np.ones(len(slots), np.bool_)
         if not worst <= self._gate:
             inliers, whitening, median = remove_outliers(innovations, self._spread(slots), self._gate)
-        agreeing, least = len(whitening) // 2, s.least_agreeing_share * len(slots)
+        agreeing, least = len(whitening) // 2, LEAST_AGREEING_SHARE * len(slots)
         if agreeing < least:
             if self._step is not None:
                 # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
@@ -243,7 +259,7 @@ class MappingFilter:
                     innovations, self._spread(slots), self._gate
                 )
                 still_agreeing = len(still_whitening) // 2
-                if still_agreeing >= max(s.least_agreeing, least):
+                if still_agreeing >= max(LEAST_AGREEING, least):
                     self._wheels.increase()
                     reason = f"the wheels are refuted by {still_agreeing} of {len(slots)} landmarks"
                     return Judgement(innovations, still_inliers, still_whitening, Health.SLIP, reason)
@@ -253,8 +269,8 @@ class MappingFilter:
             return Judgement.of_none(innovations, Health.DISAGREEMENT, reason)
         if len(slots) >= MANY:
             self._noise.learn(median / MEDIAN)
-        elif agreeing < s.least_agreeing:
-            reason = f"{agreeing} of {len(slots)} landmarks in view agree, {s.least_agreeing} are needed"
+        elif agreeing < LEAST_AGREEING:
+            reason = f"{agreeing} of {len(slots)} landmarks in view agree, {LEAST_AGREEING} are needed"
             return Judgement(innovations, inliers, whitening, Health.FEW, reason)
         return Judgement(innovations, inliers, whitening)
 

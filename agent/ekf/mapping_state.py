@@ -12,6 +12,14 @@ from mapweave.agent.ekf.motion import move_pose, move_rays, propagate
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
+PRIOR_DEPTH = 2.5
+"""Depth at which a landmark is expected when nothing is known, m."""
+PRIOR_SPREAD = 1.2
+"""Sigma of the prior inverse depth, in units of 1 / PRIOR_DEPTH: it reaches from 0.3 PRIOR_DEPTH (two
+sigma) to infinity (one sigma)."""
+LEAST_AGREEING = 3
+"""With fewer accepted landmarks than this an update is not healthy."""
+
 
 @dataclass(frozen=True, eq=False)
 class MappingState:
@@ -102,7 +110,6 @@ class Step:
         measured: by the wheels.
         wheel_root: (2, 2) root of the covariance S of (u1, u2).
         side_slip: sigma of u3, m.
-        pose_variances: (3,) process noise of the pose, the diagonal of Q.
         mount_forward: of the optical centre ahead of the axle, m.
         at: where the step is linearised: as measured, or a better guess.
         pose_vector: (3,) expected after the step.
@@ -113,7 +120,6 @@ class Step:
     measured: Odometry
     wheel_root: Array
     side_slip: float
-    pose_variances: Array
     mount_forward: float
     at: Odometry
     pose_vector: Array
@@ -129,7 +135,7 @@ class Step:
         """The same step linearised elsewhere, or with more odometry noise."""
         step = Step(
             self.before, self.measured, self.wheel_root if wheel_root is None else wheel_root,
-            self.side_slip, self.pose_variances, self.mount_forward, at or self.at,
+            self.side_slip, self.mount_forward, at or self.at,
             self.pose_vector, self.rays,
         )  # fmt: skip
         # What is expected is another now as well.
@@ -190,7 +196,7 @@ class Step:
         by_input = np.concatenate([pose_by_input, moved.by_input.reshape(-1, 3)])
         input_root = np.zeros((3, 3))
         input_root[:2, :2], input_root[2, 2] = self.wheel_root, self.side_slip
-        covariance = propagate(before.covariance, by_state, by_input, input_root, self.pose_variances)
+        covariance = propagate(before.covariance, by_state, by_input, input_root)
         further = np.array([self.measured.forward - at.forward, self.measured.turn - at.turn])
         shift = by_input[:, :2] @ further
         self.pose_vector, self.rays = pose_vector + shift[:3], moved.rays + shift[3:].reshape(-1, 3)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from mapweave.agent.ekf.innovations import Examined, examine
 from mapweave.agent.ekf.landmark_estimates import Ids
-from mapweave.agent.ekf.mapping_state import MappingState, Step
-from mapweave.agent.ekf.settings import FilterSettings
+from mapweave.agent.ekf.mapping_state import LEAST_AGREEING, MappingState, Step
 from mapweave.agent.ekf.update_report import Health, UpdateReport
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 
@@ -94,7 +94,7 @@ class ImageMeasurement(NamedTuple):
         Returns:
             The step, linearised where it seems to have gone, and what came out.
         """
-        if step is not None and settings.relinearisations and len(self.slots) >= settings.least_agreeing:
+        if step is not None and settings.relinearisations and len(self.slots) >= LEAST_AGREEING:
             return step.glanced(self.slots, self.slopes, variances, settings.slip_sigmas)
         expected = settled if step is None else step.state
         return step, examine(expected.rays, expected.covariance, self.slots, self.slopes, variances)

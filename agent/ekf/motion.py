@@ -157,17 +157,14 @@ def move_rays(rays: Array, odometry: Odometry, mount_forward: float, aside: floa
     return RayMotion(after, by_ray, by_input, scale)
 
 
-def propagate(
-    covariance: Array, by_state: Array, by_input: Array, input_root: Array, variances: Array
-) -> Array:
-    """A P A^T + B S B^T + Q of a motion whose A is block diagonal, symmetric to the last bit.
+def propagate(covariance: Array, by_state: Array, by_input: Array, input_root: Array) -> Array:
+    """A P A^T + B S B^T of a motion whose A is block diagonal, symmetric to the last bit.
 
     Args:
         covariance: (3 + 3n, 3 + 3n) P before, of [pose, (a, b, w) of each landmark].
         by_state: (1 + n, 3, 3) blocks of A: of the pose, then of each landmark.
         by_input: (3 + 3n, 3) B, by (u1, u2, u3).
         input_root: (3, 3) root of the covariance S of these.
-        variances: (3,) of the pose, the diagonal of Q.
     """
     blocks, size = len(by_state), len(covariance)
     # Blocks times rows, never the dense product; P is symmetric, so that (A P)^T = P A^T.
@@ -178,7 +175,6 @@ def propagate(
     root = by_input @ input_root
     # A product with its own transpose is symmetric to the last bit.
     out += root @ root.T
-    out.ravel()[: 3 * size + 3 : size + 1] += variances
     return out
 
 

@@ -8,28 +8,29 @@ from collections.abc import Generator, Iterator
 import numpy as np
 
 from mapweave.agent.clearance import clearance
-from mapweave.agent.exploration.settings import ExplorerSettings, Phase
+from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.agent.servo.image_drive import ImageDrive, ImageDriveSettings
+from mapweave.agent.servo.image_drive import ImageDrive
+from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
 DRIVE = 0.6
 """How far it drives back and forth to map a view, m."""
 LEAST_DRIVE = 0.2
-"""With less room than this the view is mapped as well as it can be while turning."""
+"""With less room than this the view is mapped as well as it can be while turning, m."""
 LEAST_FEATURES = 10
 """A view with fewer features is not worth a drive."""
 LEFT = 4
 """The turn ends when at most this many of the view's features are left (paper: four)."""
 LEAST_TURN = 0.45
-"""But not before this angle, rad."""
+"""The turn to the next view does not end before this angle, rad."""
 MOST_TURN = 1.0
-"""Nor after this, rad."""
+"""The turn to the next view ends at this angle, rad."""
 TRAVEL_STEP = 0.8
-"""A new node at least this often on the way, m."""
+"""Longest way between two nodes on the way to the next place, m."""
 PATIENCE = 4.0
-"""Seconds without progress before a way is given up."""
+"""Time without getting on before a way is given up, s."""
 
 
 class ExplorationBehaviours:
@@ -47,7 +48,7 @@ class ExplorationBehaviours:
         self._description = description
         self._mapper = mapper
         self._settings = settings
-        self._drive = ImageDrive(description, ImageDriveSettings(speed=settings.drive_speed))
+        self._drive = ImageDrive(description, settings.drive_speed)
         self._observation: Observation | None = None
 
     def see(self, observation: Observation) -> None:

@@ -9,12 +9,19 @@ import numpy as np
 
 from mapweave.agent.exploration.behaviours import ExplorationBehaviours
 from mapweave.agent.exploration.fleet_coverage import FleetCoverage
-from mapweave.agent.exploration.settings import REACH, SPACING, ExplorerSettings, Phase
-from mapweave.agent.exploration.viewpoint_selection import next_viewpoint, seen_around, views_of
+from mapweave.agent.exploration.phase import Phase
+from mapweave.agent.exploration.viewpoint_selection import (
+    REACH,
+    SPACING,
+    next_viewpoint,
+    seen_around,
+    views_of,
+)
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Answer, Question
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Array
 
@@ -143,7 +150,7 @@ class Explorer:
 
     def _ask(self) -> None:
         """Ask what others have mapped around here. Nothing waits for the answer."""
-        if self._settings.ask:
+        if self._settings.ask_fleet:
             self._questions.append(self._fleet_coverage.question(self._moves.position))
 
     def _either_side(self) -> float:

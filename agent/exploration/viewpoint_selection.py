@@ -7,19 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.exploration.settings import REACH, SPACING, ExplorerSettings
 from mapweave.agent.occupancy_grid import DistanceField, OccupancyGrid
+from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.pose import Array
 
 VIEW_RADIUS = 1.6
-"""Radius around a place within which its floor is known, m; also around places of others."""
-VIEW = 3.0
-"""A full turn shows floor up to this far, m."""
-SCAN_TIME = 60.0
-"""Duration of a full turn, about, s."""
-LEAST_AREA = 1.0
-"""New floor that is worth a full turn, m^2."""
+"""What lies around a place, and what others know around theirs, is judged within this radius, m."""
 
 
 DIRECTIONS = 36
@@ -50,6 +44,12 @@ def seen_around(views: Array, position: Array, reach: float) -> float:
     directions = np.arange(DIRECTIONS) * math.tau / DIRECTIONS
     off = np.abs(np.angle(np.exp(1j * (directions[:, None] - nearby[:, 2]))))
     return float((off <= nearby[:, 3]).any(axis=1).mean())
+
+
+SPACING = 1.7
+"""Places are at least this far from each other, m."""
+REACH = 7.0
+"""The longest way to a next place, m."""
 
 
 def next_viewpoint(
@@ -83,6 +83,14 @@ def next_viewpoint(
             if path:
                 return path
     return []
+
+
+VIEW = 3.0
+"""A full turn shows floor up to this far, m."""
+SCAN_TIME = 60.0
+"""How long a full turn takes, about, s."""
+LEAST_AREA = 1.0
+"""New floor that is worth a full turn, m^2."""
 
 
 def _new_area(

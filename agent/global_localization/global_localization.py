@@ -2,7 +2,7 @@
 
 The sources of candidates are passed in: the robot's own map, and the fleet's if it has a fleet. A robot with
 a goal and a robot that is to map on use the same search: the first needs one recognition, the second two that
-agree; see `GlobalLocalizationSettings`.
+agree; see `SearchPolicy`.
 """
 
 from __future__ import annotations
@@ -12,28 +12,12 @@ from collections.abc import Generator
 
 from mapweave.agent.global_localization.candidates import APART, Candidate, Candidates, FleetMap, OwnMap
 from mapweave.agent.global_localization.pose_consistency import PoseHypothesis, consistent
-from mapweave.agent.global_localization.settings import GlobalLocalizationSettings
+from mapweave.agent.global_localization.search_policy import SearchPolicy
 from mapweave.agent.localization.place_recognition import exact_enough
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Sift
-
-SURE = (0.06, 0.03)
-"""Largest standard deviations of an accepted recognition, m and rad."""
-LENIENCY = 1.0
-"""After each full turn without success this many times `sure` more."""
-VIEWS_NEEDED = 1
-"""Recognitions that must agree, 1 or 2; 2 counts the own map's alone."""
-TURNS = (1, 1)
-"""Full turns at the first place, and at each further one; a single one where anything is recognised."""
-PLACES = 0
-"""How many places it searches from; 0 for no limit."""
-CARRIED_PAUSE = 0.5
-"""Seconds between two views of a robot that a person moves."""
-CARRIED_VIEWS = 120
-"""Views without success after which such a robot counts as lost."""
-
 
 STILL = 0.2
 """Seconds that the robot stands still before a view."""
@@ -81,8 +65,8 @@ class GlobalLocalization:
         sift: Sift,
         motion: MotionPrimitives,
         own_map: OwnMap,
+        policy: SearchPolicy,
         fleet: FleetMap | None = None,
-        settings: GlobalLocalizationSettings | None = None,
     ) -> None:
         """Take the means.
 
@@ -90,9 +74,9 @@ class GlobalLocalization:
             description: of the robot.
             sift: finds features.
             motion: moves the robot.
-            own_map: the robot's own map.
-            fleet: the fleet's map; None for a robot that uses only its own map.
-            settings: of the search.
+            own_map: what the robot knows itself.
+            policy: how hard it tries, and what it believes.
+            fleet: what others know; None for a robot that counts on its own map alone.
         """
         self.detail = ""
         self._description = description
@@ -100,7 +84,7 @@ class GlobalLocalization:
         self._motion = motion
         self._own = own_map
         self._fleet = fleet
-        self._settings = settings or GlobalLocalizationSettings()
+        self._policy = policy
         self._hypotheses: list[PoseHypothesis] = []
         self._hint: tuple[int, Pose2] | None = None
         self._confirm_at: Pose2 | None = None
@@ -108,13 +92,13 @@ class GlobalLocalization:
         self._attempts = self._views = 0
 
     def search(self, expected: Pose2 | None = None) -> Search:
-        """Search here, then elsewhere; None if all places of the settings were searched without success.
+        """Search here, then elsewhere; None if all places of the policy were searched without success.
 
         Args:
             expected: `map_from_robot` in the own map by the wheels, if the robot has only just lost all
                 landmarks: then it first turns to the headings of nearby nodes.
         """
-        _s, motion = self._settings, self._motion
+        policy, motion = self._policy, self._motion
         self.detail, self._ambiguous = "looking", ""
         for heading in self._familiar_headings(expected):
             yield from motion.turn(wrap_angle(heading - motion.odom_from_robot.heading), TURN_RATE)
@@ -125,28 +109,30 @@ class GlobalLocalization:
         place, begin = 1, motion.turned
         while True:
             self._attempts, self._views, self._hint = 0, 0, None
-            candidate = yield from self._look_around(TURNS[0] if place == 1 else TURNS[1], begin)
+            candidate = yield from self._look_around(
+                policy.turns[0] if place == 1 else policy.turns[1], begin
+            )
             if candidate is not None:
                 return candidate
             if self._views < LEAST_VIEWS * self._attempts:
                 # With a covered lens, or in the dark, driving elsewhere does not help.
                 continue
-            last = place == PLACES
+            last = place == policy.places
             moved = False if last else (yield from self._move())
-            if last or not (moved or PLACES == 0):
+            if last or not (moved or policy.places == 0):
                 break
             place += 1
         self._give_up(f"at {place} place{'s' if place > 1 else ''}")
         return None
 
     def wait(self) -> Search:
-        """Take views while a person moves the robot; None after `CARRIED_VIEWS` views without success."""
-        while self._views < CARRIED_VIEWS:
+        """Take views while a person moves the robot; None after `carried_views` views without success."""
+        while self._views < self._policy.carried_views:
             candidate = yield from self.look()
             if candidate is not None:
                 return candidate
             self.detail = f"waiting to recognise a place of its own map: {self.detail}"
-            yield from self._motion.stand(CARRIED_PAUSE)
+            yield from self._motion.stand(self._policy.carried_pause)
         self._give_up(f"in {self._views} images")
         return None
 
@@ -170,7 +156,7 @@ class GlobalLocalization:
         own = self._own.candidates(view, image, features)
         self._take_hint(own)
         self._ambiguous = own.ambiguous or self._ambiguous
-        if VIEWS_NEEDED > 1:
+        if self._policy.views_needed > 1:
             return self._second_of_two(own)
         fleet = None if self._fleet is None else (yield from self._fleet.candidates(view))
         return self._single(own, fleet, leniency)
@@ -179,7 +165,7 @@ class GlobalLocalization:
 
     def _single(self, own: Candidates, fleet: Candidates | None, leniency: float) -> Candidate | None:
         """The place that one view shows, by the own map and by the fleet's, which must not contradict it."""
-        sure = SURE
+        sure = self._policy.sure
         self.detail = own.reason if fleet is None else fleet.reason
         if fleet is not None and fleet.ambiguous:
             self._ambiguous = fleet.ambiguous
@@ -202,20 +188,19 @@ class GlobalLocalization:
 
     def _second_of_two(self, own: Candidates) -> Candidate | None:
         """The place that a view shows if an earlier view of other things agrees with it."""
-        s = self._settings
         if own.ambiguous or not own.places:
             self.detail = own.ambiguous or own.reason
             return None
         best = own.places[0]
-        exact = exact_enough(best.node_from_robot, SURE)
-        if not exact_enough(best.node_from_robot, SURE, VAGUE):
+        exact = exact_enough(best.node_from_robot, self._policy.sure)
+        if not exact_enough(best.node_from_robot, self._policy.sure, VAGUE):
             self.detail = f"node {best.node} is in view, but too far off"
             return None
         self.detail = f"{own.reason}; another view must, too"
         motion = self._motion
         map_from_robot = self._own.map.nodes[best.node].map_from_robot.mean @ best.node_from_robot.mean
         hypothesis = PoseHypothesis(map_from_robot, motion.odom_from_robot, motion.way, motion.turned, exact)
-        agreeing = [earlier for earlier in self._hypotheses if consistent(earlier, hypothesis, s.consistency)]
+        agreeing = [earlier for earlier in self._hypotheses if consistent(earlier, hypothesis)]
         self._hypotheses.append(hypothesis)
         if exact and agreeing:
             return best
@@ -245,7 +230,7 @@ class GlobalLocalization:
         for _ in range(math.ceil(turns * math.tau / TURN_STEP)):
             yield from motion.stand(STILL)
             turns_so_far = (motion.turned - begin) / math.tau
-            candidate = yield from self.look(1.0 + LENIENCY * turns_so_far)
+            candidate = yield from self.look(1.0 + self._policy.leniency * turns_so_far)
             if candidate is not None:
                 return candidate
             if motion.turned - start >= (turns if self._hint is None else 1) * math.tau:

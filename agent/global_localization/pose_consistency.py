@@ -16,23 +16,6 @@ from mapweave.hybridmap.pose import Pose2
 
 
 @dataclass(frozen=True)
-class ConsistencySettings:
-    """When two recognitions agree.
-
-    Attributes:
-        turn: a view shows other things than another if the robot has turned by this in between, rad,
-        way: or has driven this far, m.
-        within: they agree within this, m and rad,
-        drift: and this share of the way and of the turn in between: wheels are never quite round.
-    """
-
-    turn: float = 0.9
-    way: float = 1.5
-    within: tuple[float, float] = (0.2, 0.1)
-    drift: float = 0.03
-
-
-@dataclass(frozen=True)
 class PoseHypothesis:
     """The robot's pose by a recognised node.
 
@@ -51,14 +34,23 @@ class PoseHypothesis:
     exact: bool
 
 
-def consistent(earlier: PoseHypothesis, now: PoseHypothesis, settings: ConsistencySettings) -> bool:
-    """Whether two recognitions are of different views and give the same pose."""
+OTHER_VIEW = (1.5, 0.9)
+"""A view shows other things than another if the robot has driven or turned by this in between, m and rad."""
+WITHIN = (0.2, 0.1)
+"""Two recognitions agree if they are no further apart than this, m and rad, and DRIFT."""
+DRIFT = 0.03
+"""Share of the way and of the turn in between by which two recognitions may differ: wheels are never quite
+round."""
+
+
+def consistent(earlier: PoseHypothesis, now: PoseHypothesis) -> bool:
+    """Whether two recognitions come of different views and put the robot at the same place."""
     moved = earlier.odom_from_robot.inverse() @ now.odom_from_robot
-    if abs(moved.heading) < settings.turn and math.hypot(moved.x, moved.y) < settings.way:
+    if abs(moved.heading) < OTHER_VIEW[1] and math.hypot(moved.x, moved.y) < OTHER_VIEW[0]:
         return False
     miss = (earlier.map_from_robot @ moved).inverse() @ now.map_from_robot
     way, turned = now.way - earlier.way, now.turned - earlier.turned
     return (
-        math.hypot(miss.x, miss.y) <= settings.within[0] + settings.drift * way
-        and abs(miss.heading) <= settings.within[1] + settings.drift * turned
+        math.hypot(miss.x, miss.y) <= WITHIN[0] + DRIFT * way
+        and abs(miss.heading) <= WITHIN[1] + DRIFT * turned
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapweave.agent.global_localization.candidates import OwnMap, RecognizedNode
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
-from mapweave.agent.global_localization.settings import GlobalLocalizationSettings, ResumptionSettings
+from mapweave.agent.global_localization.search_policy import TO_MAP, SearchPolicy
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -35,8 +35,8 @@ class Resumption:
         sift: Sift,
         own_map: HybridMap,
         drives: bool,
-        settings: GlobalLocalizationSettings | None = None,
         seed: int = 0,
+        policy: SearchPolicy | None = None,
     ) -> None:
         """Start the search.
 
@@ -45,16 +45,16 @@ class Resumption:
             sift: features of an image.
             own_map: with at least one node.
             drives: whether it may turn and drive by itself.
-            settings: of the search.
             seed: of the recognition's random samples.
+            policy: how hard it tries; `TO_MAP` without.
         """
         self.found: RecognizedNode | None = None
         self.lost = False
         self.seen: deque[tuple[Pose2, Array]] = deque(maxlen=REMEMBERED)
         self._motion = MotionPrimitives(description)
         self._localization = GlobalLocalization(
-            description, sift, self._motion, OwnMap(own_map, np.random.default_rng(seed)), None,
-            settings or ResumptionSettings(),
+            description, sift, self._motion, OwnMap(own_map, np.random.default_rng(seed)),
+            policy or TO_MAP,
         )  # fmt: skip
         self._behaviour = self._find(drives)
 

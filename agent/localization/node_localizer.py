@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.ekf.localization_filter import LocalizationFilter, LocalizationSettings
+from mapweave.agent.ekf.localization_filter import LocalizationFilter
 from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.node_tracks import NodeTracks
-from mapweave.agent.vision.tracker import TrackerSettings
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.registration.recognition import Recognition
@@ -21,19 +19,6 @@ LEAST = 4
 """Landmarks that must be tracked (paper, section 6: n >= 4)."""
 STRIKES = 3
 """A track that the filter rejects this often in a row is dropped."""
-
-
-@dataclass(frozen=True)
-class NodeLocalizerSettings:
-    """When a node's landmarks count as visible.
-
-    Attributes:
-        tracker: tracks of the node's landmarks.
-        filter: the localization EKF.
-    """
-
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
-    filter: LocalizationSettings = field(default_factory=LocalizationSettings)
 
 
 class NodeLocalizer:
@@ -51,11 +36,11 @@ class NodeLocalizer:
         image: NDArray[np.uint8],
         features: Features,
         recognition: Recognition,
-        settings: NodeLocalizerSettings | None = None,
+        settings: AgentSettings | None = None,
     ) -> None:
         """Start from a recognition of the node in an image's features."""
         self.node = node
-        self._settings = s = settings or NodeLocalizerSettings()
+        self._settings = s = settings or AgentSettings()
         self._description = description
         self._tracks = NodeTracks(lens, image, features, recognition.pairs, s.tracker, STRIKES)
         self._depths, self._depth_sigmas = np.full((2, len(node.landmarks)), np.nan)
@@ -138,7 +123,8 @@ class NodeLocalizer:
             node.points_in_robot[landmarks],
             node.landmarks.covariances_in_robot(node.camera, scale_share=scale_share)[landmarks],
             scale_share,
-            settings=replace(self._settings.filter, side_slip=description.side_slip),
+            settings=self._settings.filter,
+            side_slip=description.side_slip,
         )
 
     def _expected(self) -> Array:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from mapweave.hybridmap.descriptor import decode
@@ -14,39 +12,30 @@ from mapweave.hybridmap.query import View
 from mapweave.registration.recognition import Recognition, recognise
 
 
-@dataclass(frozen=True)
-class PlaceRecognitionSettings:
-    """When places are verified.
-
-    Attributes:
-        tries: nodes that are verified, by descending votes.
-        least_inliers: landmarks that must agree: a single node decides here, and the map is small.
-        votes: a node with fewer votes is not tried.
-    """
-
-    tries: int = 5
-    votes: int = 6
-    least_inliers: int = 24
-
-
 def recognise_place(
     hybrid_map: HybridMap,
     view: View,
     rng: np.random.Generator,
-    settings: PlaceRecognitionSettings | None = None,
 ) -> tuple[Node, Recognition] | None:
     """The node of a robot's own map that a view shows best, and how it was recognised; or None.
 
     See `recall_all`.
     """
-    return next(iter(recognise_places(hybrid_map, view, rng, settings)), None)
+    return next(iter(recognise_places(hybrid_map, view, rng)), None)
+
+
+TRIES = 5
+"""Nodes that are verified, by descending votes."""
+VOTES = 6
+"""A node with fewer votes is not tried."""
+LEAST_INLIERS = 24
+"""Landmarks that must agree: one node speaks alone here, and the map is small."""
 
 
 def recognise_places(
     hybrid_map: HybridMap,
     view: View,
     rng: np.random.Generator,
-    settings: PlaceRecognitionSettings | None = None,
 ) -> list[tuple[Node, Recognition]]:
     """Find the nodes of a robot's own map that a view shows (paper, section 5: the kidnapped robot).
 
@@ -57,12 +46,10 @@ def recognise_places(
         hybrid_map: the robot's own map.
         view: what it sees now.
         rng: for the verification's random samples.
-        settings: how many to try.
 
     Returns:
         The nodes and how each was recognised, most inliers first.
     """
-    settings = settings or PlaceRecognitionSettings()
     nodes = [n for n in hybrid_map.nodes.values() if len(n.landmarks)]
     if not nodes or not len(view):
         return []
@@ -71,11 +58,11 @@ def recognise_places(
     nearest = (decode(view.codes) @ descriptors.T - 0.5 * (descriptors**2).sum(axis=1)).argmax(axis=1)
     votes = np.bincount(owner[nearest], minlength=len(nodes))
     recalled: list[tuple[Node, Recognition]] = []
-    for index in np.argsort(-votes, kind="stable")[: settings.tries]:
-        if votes[index] < settings.votes:
+    for index in np.argsort(-votes, kind="stable")[:TRIES]:
+        if votes[index] < VOTES:
             break
         recognition = recognise(nodes[index], view, None, rng)
-        if recognition is not None and recognition.inliers >= settings.least_inliers:
+        if recognition is not None and recognition.inliers >= LEAST_INLIERS:
             recalled.append((nodes[index], recognition))
     return sorted(recalled, key=lambda pair: -pair[1].inliers)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,20 +32,20 @@ LEAST_LANDMARKS = 6
 DEPTH_SHARE = 0.25
 """A landmark is kept if its depth's sigma is below this share of the depth."""
 DEPTH_FLOOR = (0.01, 0.015)
-"""What a depth is never better than: m, and share of the depth."""
+"""Smallest standard deviation of a depth: m, and share of the depth."""
 MOST_CHI2 = 4.0
 """A triangulated track fits if its mean squared residual is below this; 1 is expected."""
 EDGE_FLOOR = (0.002, 0.004)
-"""What an edge's pose is never better than, m and rad: tracks err alike for a while, which the filter, for
-which pixels err independently, does not know."""
+"""Smallest standard deviation of an edge's pose, m and rad: tracks err alike for a while, which the filter,
+for which pixels err independently, does not know."""
 EDGE_SHARE = (0.005, 0.01)
-"""Likewise as a share of the way and of the turn: wheels are never quite round."""
+"""What is added to that, as a share of the way and of the turn: wheels are never quite round."""
 LOOP_REACH = 1.2
 """Nodes of the own map nearer than this are tried for a loop closure, m."""
 LOOP_TURN = 0.7
-"""And turned by less than this, rad."""
+"""Nodes turned by less than this are tried for a loop closure, rad."""
 LOOP_TRIES = 4
-"""At most this many, nearest first."""
+"""Nodes that are tried for loop closures of a new node, nearest first."""
 LOOP_SIGMA = 0.12
 """A loop closure known no better than this is left to the server, m."""
 LOOP_GATE = 25.0
@@ -57,17 +57,6 @@ LOOP_FLOOR = (0.05, 0.03)
 
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
-
-
-@dataclass(frozen=True)
-class KeyframeBuilderSettings:
-    """How nodes and edges are made.
-
-    Attributes:
-        selection: what a node may cost on the wire, and which landmarks it keeps if they cost more.
-    """
-
-    selection: SelectionSettings = field(default_factory=SelectionSettings)
 
 
 class KeyframeBuilder:
@@ -82,7 +71,7 @@ class KeyframeBuilder:
         self,
         map_id: MapId,
         description: RobotDescription,
-        settings: KeyframeBuilderSettings,
+        selection: SelectionSettings,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
     ) -> None:
@@ -91,7 +80,7 @@ class KeyframeBuilder:
         Args:
             map_id: of the map.
             description: of the robot.
-            settings: how.
+            selection: which landmarks a node keeps.
             contents: of a map that was begun.
             next_number: the first that no node or edge has ever had.
         """
@@ -100,7 +89,7 @@ class KeyframeBuilder:
         self._map_id = map_id
         self._description = description
         self._camera = description.camera
-        self._settings = settings
+        self._selection = selection
         self._last: AnchoredKeyframe | None = None
         self._next_number = next_number
         self._new: list[ChangeBody] = []
@@ -204,7 +193,7 @@ class KeyframeBuilder:
 
     def _landmarks(self, view: View, tracking: Tracking) -> tuple[Landmarks, NDArray[np.int64]]:
         """The view's features with depth in the view: by the filter, else triangulated; and their tracks."""
-        s, camera = self._settings, self._camera
+        camera = self._camera
         depths, sigmas = np.full(len(view.tracks), np.nan), np.full(len(view.tracks), np.nan)
         poses, pixels = tracking.history.sightings(view.tracks)
         if len(poses) >= 2 and len(view.tracks):
@@ -232,7 +221,7 @@ class KeyframeBuilder:
         )  # fmt: skip
         seen = np.isfinite(pixels[:, good, 0]).mean(axis=0) if len(poses) else np.ones(len(good))
         likely = worth(seen, good / max(len(view.tracks), 1))
-        kept = choose(landmarks, likely, camera, s.selection)[:MOST_LANDMARKS]
+        kept = choose(landmarks, likely, camera, self._selection)[:MOST_LANDMARKS]
         # Rounded now, the robot works with the same numbers as everybody who gets the node.
         landmarks, order = settle(landmarks.take(kept), camera)
         return landmarks, view.tracks[good[kept[order]]]
@@ -267,7 +256,7 @@ class KeyframeBuilder:
 
     def _close_loops(self, node: Node) -> list[Edge]:
         """Recognise places of the own map (paper, section 5): each gives a new edge."""
-        _s, near = self._settings, []
+        near = []
         for other in self.map.nodes.values():
             between = other.map_from_robot.mean.inverse() @ node.map_from_robot.mean
             reach = float(np.hypot(between.x, between.y))

@@ -9,43 +9,17 @@ elsewhere it was at most 8 %, or 30 % where the same wall was still ahead.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import Enum, auto
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
-
-LEAST = 8
-"""Points that should be in the image; with fewer nothing is said."""
-SHARE = 0.45
-"""If fewer of them than this share are found, it shows something else."""
-BORDER_PX = 12.0
-"""Points expected nearer to the border may well have left."""
-ASTRAY_PX = 20.0
-"""A point found further than this from where it is expected is another one."""
-LEAST_TEXTURE = 8.0
-"""Mean squared gradient around a corner in its weakest direction, (grey/px)^2."""
-LEAST_CORNERS = 6
-"""An image with fewer corners shows nothing."""
-MOST_CLIPPED = 0.5
-"""And so does one of which a larger share is black or white."""
-KIDNAP_DETECTOR_FEW = 30
-"""With fewer points than this in the image, all of it is compared besides."""
-COARSE = 8
-"""Side of the squares, px, over which images are averaged to be compared by and large."""
-ALIKE = 0.95
-"""They are the same if they then correlate by more than this."""
-LEAST_SPREAD = 8.0
-"""And vary by more than this, grey levels: all blank walls are alike."""
-SAME_LIGHT = 10.0
-"""And are equally bright on average, to within this, grey levels."""
-
 
 PATCH_PX = 11
 """Side of the square in which texture is measured, about that of a tracked patch."""
@@ -72,22 +46,40 @@ class FrameOverlap(Enum):
     """Nothing, where there should be something: it is dark, the lens is covered, or the camera dazzled."""
 
 
-@dataclass(frozen=True)
-class KidnapDetectorSettings:
-    """When an image does not continue another."""
+LEAST = 8
+"""Points that should be in the image; with fewer nothing is said."""
+SHARE = 0.45
+"""If a smaller share of the expected points is found, the image shows something else."""
+BORDER_PX = 12.0
+"""Points expected nearer to the border may well have left."""
+ASTRAY_PX = 20.0
+"""A point found further than this from where it is expected is another one."""
+LEAST_TEXTURE = 8.0
+"""Mean squared gradient around a corner in its weakest direction, (grey/px)^2."""
+LEAST_CORNERS = 6
+"""An image with fewer corners shows nothing."""
+MOST_CLIPPED = 0.5
+"""An image of which a larger share is black or white shows nothing."""
+FEW_POINTS = 30
+"""With fewer points than this in the image, all of it is compared besides."""
+COARSE = 8
+"""Side of the squares over which images are averaged before they are compared as a whole, px."""
+ALIKE = 0.95
+"""Averaged images are the same if they correlate by more than this,"""
+LEAST_SPREAD = 8.0
+"""vary by more than this, grey levels (all blank walls are alike),"""
+SAME_LIGHT = 10.0
+"""and are equally bright on average to within this, grey levels."""
 
 
 class KidnapDetector:
     """Compares two images by the points that are tracked, or by corners where these are too few."""
 
-    def __init__(
-        self, lens: Lens, camera: Camera, tracker: TrackerSettings, settings: KidnapDetectorSettings
-    ) -> None:
+    def __init__(self, lens: Lens, camera: Camera, tracker: TrackerSettings) -> None:
         """Take the camera and how its points are tracked."""
         self._lens = lens
         self._camera = camera
         self._tracker = tracker
-        self._settings = settings
 
     def compare(
         self,
@@ -117,7 +109,7 @@ class KidnapDetector:
             return FrameOverlap.SAME
         # A dozen tracks on smooth shapes can all be lost at once; then the whole image has its say.
         inside = int(self._camera.contains(expected, BORDER_PX).sum())
-        few = LEAST <= inside < KIDNAP_DETECTOR_FEW
+        few = LEAST <= inside < FEW_POINTS
         if few and self._alike(before, now, turn):
             return FrameOverlap.SAME
         clipped = float(((now <= BLACK) | (now >= WHITE)).mean())
@@ -134,7 +126,7 @@ class KidnapDetector:
 
     def _alike(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool:
         """Whether the images are the same by and large, where smooth shapes leave little to be tracked."""
-        _s, (height, width) = self._settings, before.shape
+        height, width = before.shape
         aside = round(self._camera.fx * math.tan(turn))
         if abs(aside) > width // 2:
             return False

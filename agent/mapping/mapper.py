@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.mapping.anchored_keyframe import HERE
-from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder, KeyframeBuilderSettings
+from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.mapping.tracking import Tracking
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
-from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder, TrajectoryRecorderSettings
+from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import View
 from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.track_quality import TrackQuality
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -23,28 +22,11 @@ from mapweave.hybridmap.node import MapId, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.recognition import Recognition
 from mapweave.vision.lens import Lens
-from mapweave.vision.sift import Features, Sift, SiftSettings
+from mapweave.vision.sift import Features, Sift
 
 DEPTHS_PER_HEIGHT = 8.0
 """Assumed depth of an unknown feature before there is any node, as a multiple of the camera's height (the
 paper's "assumed common height")."""
-
-
-@dataclass(frozen=True)
-class MapperSettings:
-    """How a map is made.
-
-    Attributes:
-        sift: features of a view.
-        tracking: of landmarks between views.
-        cartographer: nodes and edges.
-        wayside: what is kept of the way between nodes.
-    """
-
-    sift: SiftSettings = field(default_factory=SiftSettings)
-    tracking: TrackingSettings = field(default_factory=TrackingSettings)
-    cartographer: KeyframeBuilderSettings = field(default_factory=KeyframeBuilderSettings)
-    wayside: TrajectoryRecorderSettings = field(default_factory=TrajectoryRecorderSettings)
 
 
 class Mapper:
@@ -61,22 +43,20 @@ class Mapper:
         self,
         map_id: MapId,
         description: RobotDescription,
-        settings: MapperSettings | None = None,
+        settings: AgentSettings | None = None,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
     ) -> None:
         """Start an empty map where the robot stands, or take up one that was begun; see Cartographer."""
-        settings = settings or MapperSettings()
+        settings = settings or AgentSettings()
         self.typical_depth = DEPTHS_PER_HEIGHT * max(description.camera.mount_height, 0.05)
         self._description = description
         self._settings = settings
         self._lens = Lens(description.camera, description.distortion)
         self._sift = Sift(self._lens, settings.sift)
-        self._tracking = Tracking(description, self._lens, settings.tracking)
-        self._cartographer = KeyframeBuilder(
-            map_id, description, settings.cartographer, contents, next_number
-        )
-        self._wayside = TrajectoryRecorder(description, settings.wayside)
+        self._tracking = Tracking(description, self._lens, settings)
+        self._cartographer = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
+        self._wayside = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
 
@@ -191,7 +171,7 @@ class Mapper:
         With nodes it is astray and must `resume`; without any it may `begin` anew.
         """
         self._cartographer.lose(self._tracking.pose)
-        self._tracking = Tracking(self._description, self._lens, self._settings.tracking)
+        self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._leaves = None, []
 
     def resume(

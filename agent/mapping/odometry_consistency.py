@@ -8,28 +8,21 @@ somebody may carry a box through the view, which then seems to stand still while
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 APART = (0.15, 0.15)
-"""M and rad that they may be apart after any way ..."""
+"""How far filter and wheels may be apart after any way, m and rad,"""
 SHARE = 0.1
-"""... and, besides, as a share of the way and of the turns: no wheel is quite round."""
-
-
-@dataclass(frozen=True)
-class OdometryConsistencySettings:
-    """When wheels and image contradict each other."""
+"""and besides as a share of the way and of the turns: no wheel is quite round."""
 
 
 class OdometryConsistency:
     """Reckons by the wheels alone, beside the filter."""
 
-    def __init__(self, settings: OdometryConsistencySettings) -> None:
+    def __init__(self) -> None:
         """The two agree."""
-        self._settings = settings
         self.settle()
 
     def settle(self) -> None:

@@ -17,9 +17,9 @@ from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector
 from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.agent.mapping.prediction_offset import PredictionOffset
 from mapweave.agent.mapping.track_history import TrackHistory
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
 from mapweave.agent.mapping.view import View, associate, even_choice
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.occluded_tracks import OccludedTracks
 from mapweave.agent.vision.rejection_counter import RejectionCounter
 from mapweave.agent.vision.template import HALF_PX, Templates
@@ -28,28 +28,6 @@ from mapweave.agent.vision.tracker import BORDER_PX, Tracker
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
-
-MOST_FILTERED = 54
-"""Landmarks in the EKF, hidden ones and those that came in their stead included."""
-LEAST_FILTERED = 5
-"""With fewer landmarks in view the wheels are trusted alone."""
-ASSOCIATE_PX = 1.5
-"""A feature this near to a track is the same point."""
-STRIKES = 3
-"""A track that the filter refuses this often in a row is given up."""
-PRIOR_SPREAD = 0.6
-"""Sigma of a new landmark's inverse depth, as a share of the expected one ..."""
-PRIOR_NEAR = 0.45
-"""... but no less than this over the camera's height: a landmark may always be about as near as the floor.
-A robot before a bare wall would else take its nearness for a slip of the wheels."""
-DOUBT = 2.0
-"""Sigmas of triangulated depths are taken for so many times what they say."""
-MOST_CHI2 = 4.0
-"""And depths of tracks whose mean squared residual is above this, not at all; 1 is expected."""
-DROPPED = 3
-"""Images that may be missing, one after the other, before the robot should wait for the next."""
-STALE = (0.4, 0.5)
-"""M and rad; once the wheels have moved this much, nothing can be said of an image before."""
 
 
 class LostTracks(NamedTuple):
@@ -62,6 +40,31 @@ class LostTracks(NamedTuple):
 
     ids: NDArray[np.int64]
     templates: Templates
+
+
+LEAST_SPREAD = 0.2
+"""With landmarks that cover less than this share of the image's width the wheels are trusted alone."""
+MOST_FILTERED = 54
+"""Landmarks in the EKF, hidden ones and those that came in their stead included."""
+LEAST_FILTERED = 5
+"""With fewer landmarks in view the wheels are trusted alone."""
+ASSOCIATE_PX = 1.5
+"""A feature this near to a track is the same point."""
+STRIKES = 3
+"""A track that the filter refuses this often in a row is given up."""
+PRIOR_SPREAD = 0.6
+"""Sigma of a new landmark's inverse depth, as a share of the expected one."""
+PRIOR_NEAR = 0.45
+"""The same sigma is at least this over the camera's height: a landmark may always be about as near as the
+floor. A robot before a bare wall would else take its nearness for a slip of the wheels."""
+DOUBT = 2.0
+"""Factor by which sigmas of triangulated depths are enlarged."""
+MOST_CHI2 = 4.0
+"""Triangulated depths of tracks whose mean squared residual is above this are not used; 1 is expected."""
+DROPPED = 3
+"""Images that may be missing, one after the other, before the robot should wait for the next."""
+STALE = (0.4, 0.5)
+"""Once the wheels have moved this much, nothing can be said of an image before, m and rad."""
 
 
 class Tracking:
@@ -78,21 +81,23 @@ class Tracking:
         missing: how many images in a row did not come, or came a second time.
     """
 
-    def __init__(self, description: RobotDescription, lens: Lens, settings: TrackingSettings) -> None:
+    def __init__(self, description: RobotDescription, lens: Lens, settings: AgentSettings) -> None:
         """Start with nothing in view."""
         self.history = TrackHistory()
         self._camera, self._lens = description.camera, lens
-        self._settings = settings
+        self._settings = settings.tracking
+        self._pixel_sigma = settings.filter.pixel_sigma
+        self._anchored = settings.tracker.anchored
         self._tracker = Tracker(lens, settings.tracker)
-        self._hidden = OccludedTracks(settings.hidden)
+        self._hidden = OccludedTracks()
         self._unheld = PredictionOffset()
-        own = replace(settings.filter, side_slip=description.side_slip)
-        self._filter = MappingFilter(description.camera, description.axle, description.wheel_noise, own)
+        d = description
+        self._filter = MappingFilter(d.camera, d.axle, d.wheel_noise, settings.filter, d.side_slip)
         # Two images are compared by points that live for one step: nothing to hold them to.
         once = replace(settings.tracker, anchored=False)
-        self._continuity = KidnapDetector(lens, description.camera, once, settings.continuity)
+        self._continuity = KidnapDetector(lens, description.camera, once)
         self.strange = self.blank = self.missing = 0
-        self._dispute = OdometryConsistency(settings.dispute)
+        self._dispute = OdometryConsistency()
         self._believed: NDArray[np.uint8] | None = None
         self._since_believed = Pose2()
         self._misses_px: Array = np.zeros((0, 2))
@@ -250,7 +255,7 @@ class Tracking:
 
     def _seek_hidden(self, image: NDArray[np.uint8], lost: LostTracks) -> NDArray[np.int64]:
         """Hide landmarks just lost, find others again; returns the ids of all that are tracked or hidden."""
-        if self._settings.tracker.anchored:
+        if self._anchored:
             self._hidden.take(lost.ids, lost.templates)
         self._hidden.keep(np.isin(self._hidden.ids, self._filter.ids))
         if len(self._hidden.ids):
@@ -315,13 +320,12 @@ class Tracking:
         Tracks that were followed outside of it are triangulated against its trajectory. Its errors enter all
         of them alike, which their covariances do not know.
         """
-        s = self._settings
         inverse_depths = np.full(len(ids), 1.0 / self._expected_depth)
         nearest = PRIOR_NEAR / max(self._camera.mount_height, 0.05)
         sigmas = np.maximum(PRIOR_SPREAD * inverse_depths, nearest)
         poses, pixels = self.history.sightings(ids)
         if len(poses) >= 2:
-            solved = triangulate(poses, pixels, self._camera, s.filter.pixel_sigma, self.pose.mean.vector)
+            solved = triangulate(poses, pixels, self._camera, self._pixel_sigma, self.pose.mean.vector)
             better = DOUBT * np.sqrt(solved.ray_covariances[:, 2, 2])
             fits = (solved.chi2 < MOST_CHI2) & (better < sigmas)
             inverse_depths[fits], sigmas[fits] = solved.rays[fits, 2], better[fits]
@@ -367,6 +371,5 @@ class Tracking:
 
         A few points in one corner may all lie on the same edge, slide along it together and agree.
         """
-        s = self._settings
         spread = float(np.ptp(pixels[:, 0])) if len(pixels) else 0.0
-        return len(pixels) >= LEAST_FILTERED and spread >= s.least_spread * self._camera.width
+        return len(pixels) >= LEAST_FILTERED and spread >= LEAST_SPREAD * self._camera.width

@@ -2,35 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from mapweave.agent.observation import Observation, RobotDescription
-from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import FURTHEST, LONGEST, MOST, TrajectorySegment
 
-
-@dataclass(frozen=True)
-class TrajectoryRecorderSettings:
-    """What is kept.
-
-    Attributes:
-        period: a moment each, s; twice as long whenever a wake grows too long.
-    """
-
-    period: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse what is no time.
-
-        Raises:
-            InvalidValue: the period is not positive.
-        """
-        if not self.period > 0.0:
-            raise InvalidValue(f"wayside: a period of {self.period:g} s; it must be more than 0")
+PERIOD = 1.0
+"""Time between two kept moments, s; twice as long whenever a segment grows too long."""
 
 
 class TrajectoryRecorder:
@@ -39,10 +19,9 @@ class TrajectoryRecorder:
     Nobody can compare the times of a robot whose clock has no name: it keeps nothing.
     """
 
-    def __init__(self, description: RobotDescription, settings: TrajectoryRecorderSettings) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Nothing yet."""
         self._description = description
-        self._settings = settings
         self.clear(0)
 
     def clear(self, stamp_ns: int) -> None:
@@ -55,7 +34,7 @@ class TrajectoryRecorder:
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
         self._readings: list[Array] = []
-        self._period = self._settings.period
+        self._period = PERIOD
 
     def step(self, observation: Observation, anchor_from_robot: Pose2) -> None:
         """Keep this moment, if it is time."""

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.node import NodeId
 
 Pair = tuple[NodeId, NodeId]
 
 
-@dataclass(frozen=True)
-class BlockedEdgeSettings:
-    """How long a block is remembered.
-
-    Attributes:
-        forget: after the first time, s: people move on.
-        longest: each further time it is remembered twice as long, up to this, s: walls stay.
-    """
-
-    forget: float = 15.0
-    longest: float = 120.0
-
-
 class BlockedEdges:
     """Blocked pairs, in the order of their last block."""
 
-    def __init__(self, settings: BlockedEdgeSettings | None = None) -> None:
-        """Start without blocks."""
-        self._settings = settings or BlockedEdgeSettings()
+    def __init__(self, settings: NavigatorSettings | None = None) -> None:
+        """Nothing is in the way."""
+        self._settings = settings or NavigatorSettings()
         self._until: dict[Pair, float] = {}
         self._times: dict[Pair, int] = {}
 
@@ -42,7 +28,9 @@ class BlockedEdges:
         pair = (a, b) if a <= b else (b, a)
         times = self._times[pair] = self._times.get(pair, 0) + 1
         self._until.pop(pair, None)
-        self._until[pair] = now + min(self._settings.forget * 2.0 ** (times - 1), self._settings.longest)
+        self._until[pair] = now + min(
+            self._settings.blocked_first * 2.0 ** (times - 1), self._settings.blocked_longest
+        )
 
     def at(self, now: float) -> tuple[Pair, ...]:
         """Pairs that count as blocked at a time, s."""

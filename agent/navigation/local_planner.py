@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from mapweave.agent.navigation.grid_planner import GridPlanner
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.agent.occupancy_grid import OccupancyGrid, OccupancyGridSettings
-from mapweave.agent.servo.dynamic_window import DynamicWindow, DynamicWindowSettings
+from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.agent.servo.dynamic_window import DynamicWindow
 from mapweave.agent.servo.proximity import ranger_points
+from mapweave.agent.settings import NavigatorSettings, OccupancyGridSettings
 from mapweave.hybridmap.pose import Array, Pose2
 
+AROUND = OccupancyGridSettings(cell=0.05, side=6.4)
+"""The grid that moves along with the robot, which stands in its middle."""
 REPLAN_EVERY = 5
 """Ticks between two plans."""
 LEAST = 0.065
@@ -24,35 +26,18 @@ AHEAD = 0.6
 """Largest distance of the point of the way that it steers to, m."""
 
 
-@dataclass(frozen=True)
-class LocalPlannerSettings:
-    """How the robot drives between nodes.
-
-    Attributes:
-        speed: m/s.
-        turn_rate: rad/s.
-        floor: what it remembers, around where it is.
-        arcs: how it steers.
-    """
-
-    speed: float = 0.26
-    turn_rate: float = 0.6
-    floor: OccupancyGridSettings = field(default_factory=lambda: OccupancyGridSettings(cell=0.05, side=6.4))
-    arcs: DynamicWindowSettings = field(default_factory=DynamicWindowSettings)
-
-
 class LocalPlanner:
     """Keeps a local occupancy grid in the odometry frame.
 
     That frame drifts, but the grid is needed for a few metres only.
     """
 
-    def __init__(self, description: RobotDescription, settings: LocalPlannerSettings | None = None) -> None:
-        """Start with an unknown grid."""
-        self._settings = s = settings or LocalPlannerSettings()
+    def __init__(self, description: RobotDescription, settings: NavigatorSettings | None = None) -> None:
+        """Know nothing of the floor yet."""
+        self._settings = settings or NavigatorSettings()
         self._description = description
-        self._floor = OccupancyGrid(description, s.floor)
-        self._arcs = DynamicWindow(description, s.arcs)
+        self._floor = OccupancyGrid(description, AROUND)
+        self._arcs = DynamicWindow(description)
         self._odom_from_robot = Pose2()
         self._way: Array = np.zeros((0, 2))
         self._points: Array = np.zeros((0, 2))
@@ -90,11 +75,11 @@ class LocalPlanner:
 
     def _plan(self, start: Array, goal: Array) -> Array:
         """(N, 2) m in odom, points of the way around; none if the straight way is free."""
-        s, room = self._settings, self._floor.room()
+        room = self._floor.room()
         least, wished = (self._description.radius + extra for extra in (LEAST, WISHED))
         # The robot is in the middle of the grid; beyond its border everything is unknown.
-        goal = start + (goal - start) * min(1.0, 0.5 * s.floor.side / max(np.abs(goal - start).max(), 1e-9))
-        count = int(np.hypot(*(goal - start)) / (0.5 * s.floor.cell)) + 2
+        goal = start + (goal - start) * min(1.0, 0.5 * AROUND.side / max(np.abs(goal - start).max(), 1e-9))
+        count = int(np.hypot(*(goal - start)) / (0.5 * AROUND.cell)) + 2
         line = self._floor.cells(start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start))
         if (room[line[:, 0], line[:, 1]] >= 0.5 * (least + wished)).all():
             return np.zeros((0, 2))
@@ -107,7 +92,6 @@ class LocalPlanner:
         """(2,) m in odom: the furthest point of the way up to which a straight line stays near the way."""
         if not len(self._way):
             return goal
-        s = self._settings
         nearest = int(np.hypot(*(self._way - start).T).argmin())
         offsets = self._way[nearest:] - start
         chosen = 0
@@ -116,7 +100,7 @@ class LocalPlanner:
             if length > AHEAD:
                 break
             aside = offsets[:k] @ np.array([-offsets[k, 1], offsets[k, 0]]) / max(length, 1e-9)
-            if np.abs(aside).max() > s.floor.cell:
+            if np.abs(aside).max() > AROUND.cell:
                 break
             chosen = k
         return np.asarray(start + offsets[chosen])

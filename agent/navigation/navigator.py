@@ -4,27 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator
-from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
 from mapweave.agent.drive_statistics import DriveStatistics
-from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement, LandmarkRefinementSettings
-from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder, TraverseSettings
+from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
+from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.global_localization.candidates import Candidate, FleetMap, OwnMap
 from mapweave.agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
-from mapweave.agent.global_localization.settings import GlobalLocalizationSettings
+from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.localization.node_localizer import NodeLocalizer, NodeLocalizerSettings
+from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.mission import Answer, Question, WhichWay
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
-from mapweave.agent.navigation.blocked_edges import BlockedEdges, BlockedEdgeSettings
-from mapweave.agent.navigation.local_planner import LocalPlanner, LocalPlannerSettings
+from mapweave.agent.navigation.blocked_edges import BlockedEdges
+from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.onboard_router import onboard_route
-from mapweave.agent.navigation.route_follower import RouteFollower, RouteProgress
-from mapweave.agent.navigation.route_follower_settings import NEAR, RouteFollowerSettings
+from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteProgress
 from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -32,46 +31,8 @@ from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
-TIGHT = 0.07
-"""An obstacle nearer than this counts as in the way, m."""
-ANSWER_PATIENCE = 100
-"""Ticks that an answer may take before the question counts as lost."""
-PAUSE = 2.0
-"""Seconds that it waits at an obstacle, and before it asks again for a route."""
-TRUSTED = 1.0
-"""After a block the robot is still localized if it has driven less than this blindly, m."""
-
-
 HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
 NO_PROGRESS = "no progress, though nothing is near"
-
-
-@dataclass(frozen=True)
-class NavigatorSettings:
-    """How the robot navigates.
-
-    Attributes:
-        localization: while it is lost.
-        localizer: tracking and filtering of the landmarks of the place that it has found.
-        follower: along a route.
-        detour: between nodes.
-        blocks: how long it remembers where it could not get through.
-        surveyor: what it measures on its way.
-        refinement: what it learns of landmarks.
-        further: where it looks in vain on its way, it drives on by wheels and looks again after this, m: they
-            are off by a few percent, and to turn back to what it knows, and about again, takes longer.
-        looks: so often in a row; then it is lost.
-    """
-
-    localization: GlobalLocalizationSettings = field(default_factory=GlobalLocalizationSettings)
-    localizer: NodeLocalizerSettings = field(default_factory=NodeLocalizerSettings)
-    follower: RouteFollowerSettings = field(default_factory=RouteFollowerSettings)
-    detour: LocalPlannerSettings = field(default_factory=LocalPlannerSettings)
-    blocks: BlockedEdgeSettings = field(default_factory=BlockedEdgeSettings)
-    surveyor: TraverseSettings = field(default_factory=TraverseSettings)
-    refinement: LandmarkRefinementSettings = field(default_factory=LandmarkRefinementSettings)
-    further: float = 1.0
-    looks: int = 2
 
 
 class Stage(StrEnum):
@@ -82,6 +43,16 @@ class Stage(StrEnum):
     BLOCKED = "waiting at an obstacle"
     WAITING = "waiting for a route"
     ARRIVED = "parked at the goal"
+
+
+TIGHT = 0.07
+"""Something nearer than this counts as what is in the way, m."""
+ANSWER_PATIENCE = 100
+"""Ticks that an answer may take before the question counts as lost."""
+PAUSE = 2.0
+"""How long it waits before what is in its way, and before it asks again for a route, s."""
+TRUSTED = 1.0
+"""After a block it still knows where it is if it has driven less than this blindly, m."""
 
 
 class Navigator:
@@ -105,7 +76,7 @@ class Navigator:
         sift: Sift,
         own_map: HybridMap,
         goal: NodeId,
-        settings: NavigatorSettings | None = None,
+        settings: AgentSettings | None = None,
         seed: int = 0,
     ) -> None:
         """Start lost, with a goal."""
@@ -121,17 +92,17 @@ class Navigator:
         self._lens = lens
         self._sift = sift
         self._own_map = own_map
-        self._settings = s = settings or NavigatorSettings()
+        self._settings = s = settings or AgentSettings()
         self._rng = np.random.default_rng(seed)
-        self._local_planner = LocalPlanner(description, s.detour)
+        self._local_planner = LocalPlanner(description, s.navigation)
         self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
         self._localization = GlobalLocalization(
-            description, sift, self._motion, OwnMap(own_map, self._rng), FleetMap(self._motion),
-            s.localization,
+            description, sift, self._motion, OwnMap(own_map, self._rng), TO_NAVIGATE,
+            FleetMap(self._motion),
         )  # fmt: skip
-        self._blocks = BlockedEdges(s.blocks)
-        self._traverse_recorder = TraverseRecorder(description, s.surveyor)
-        self._refinement = LandmarkRefinement(own_map, s.refinement)
+        self._blocks = BlockedEdges(s.navigation)
+        self._traverse_recorder = TraverseRecorder(description)
+        self._refinement = LandmarkRefinement(own_map)
         self._expected: Pose2 | None = None
         self._failed_views = 0
         self._goal_hidden = False
@@ -197,7 +168,7 @@ class Navigator:
         else:
             localizer = NodeLocalizer(
                 self._description, self._lens, recognized.node, recognized.image, recognized.features,
-                recognized.recognition, self._settings.localizer,
+                recognized.recognition, self._settings,
             )  # fmt: skip
             self.fix = Fix.of(localizer)
 
@@ -226,7 +197,7 @@ class Navigator:
         """Follow a route until it is driven, or blocked, or the robot is lost."""
         follower = RouteFollower(
             self._description, self._lens, self._sift, route, fix, self._local_planner,
-            self._settings.follower, self._rng,
+            self._settings, self._rng,
         )  # fmt: skip
         self._following = True
         while True:
@@ -252,13 +223,13 @@ class Navigator:
                     # Twice: localize again, so that parking begins from another heading.
                     self.fix, self._expected, self._parking_retried = None, self._on_own_map(self.fix), False
             case RouteProgress.UNSURE if (
-                self._goal_hidden and follower.fix.blind < self._settings.follower.blind
+                self._goal_hidden and follower.fix.blind < self._settings.navigation.blind_distance
             ):
                 self.stage, self.detail = Stage.ARRIVED, HIDDEN
                 self.tally = self.tally.passed([0.0])
             case RouteProgress.UNSURE:
                 # By landmarks seen a moment ago it is at the goal, yet it sees none of the goal's landmarks.
-                self._goal_hidden = follower.fix.blind < self._settings.follower.blind
+                self._goal_hidden = follower.fix.blind < self._settings.navigation.blind_distance
                 yield from self._relocalize()
 
     def _report_block(self, a: NodeId, b: NodeId) -> Behaviour:
@@ -275,11 +246,11 @@ class Navigator:
         """No landmark was visible for a while: try one view, else drive on by odometry a little."""
         self._searching, self._localization.detail = True, self.detail
         yield from self._motion.stand(STILL)
-        before, s = self.fix, self._settings
+        before, s = self.fix, self._settings.navigation
         place = yield from self._localization.look(LENIENT)
         if place is None and before is not None and self._failed_views < s.looks:
             self._failed_views, self._searching = self._failed_views + 1, False
-            blind = max(s.follower.blind - s.further, 0.0)
+            blind = max(s.blind_distance - s.further, 0.0)
             self.fix = Fix(before.node, before.node_from_robot, None, blind)
             return
         if place is None:

@@ -13,41 +13,17 @@ from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.progress_monitor import ProgressMonitor
-from mapweave.agent.navigation.route_follower_settings import NEAR, RouteFollowerSettings
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.odometry_drive import OdometryDrive
 from mapweave.agent.servo.proximity import ranger_points
 from mapweave.agent.servo.servo_step import State
 from mapweave.agent.servo.supervisor import Servo
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from mapweave.hybridmap.query import RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
-
-PASSED = 0.22
-"""An intermediate node is passed within this distance, m."""
-DETECTION_TURN = 0.6
-"""A node is searched for in the image when the robot's heading is within this of the node's, rad."""
-DETECTION_REACH = 1.4
-"""And the robot within this distance of it, m."""
-DETECT_EVERY = 4
-"""Ticks between two detections of the next nodes."""
-SKIP = 2
-"""Nodes further along the route that are searched for as well."""
-GOAL_VIEWS = 4
-"""Detections at the goal, averaged, that decide whether the robot is there."""
-HIDDEN = 2.0
-"""Seconds at the goal without its landmarks visible, or recognised, after which it is not there, s."""
-PATIENCE = 6.0
-"""Seconds without progress before an edge counts as blocked."""
-STALLED = 3.0
-"""Seconds that the servo may take without getting nearer; then the robot drives around."""
-STALLED_PARKING = 10.0
-"""Likewise on the way to the goal's pose, which may take a manoeuvre."""
-BARRED = 5.0
-"""How long it drives around then, s."""
-
 
 MOST_CANDIDATES = 8
 """Nodes tried in one image: a route may put any number of them into one place."""
@@ -61,6 +37,32 @@ class RouteProgress(StrEnum):
     ARRIVED = "parked at the goal"
     UNSURE = "no landmark visible for a while"
     BLOCKED = "no progress"
+
+
+NEAR = 0.35
+"""Within this distance of the goal the last, blind turns are made if it is not in sight, m."""
+PASSED = 0.22
+"""An intermediate node is passed within this distance, m."""
+DETECTION_TURN = 0.6
+"""A node is searched for in the image when the robot's heading is within this of the node's, rad."""
+DETECTION_REACH = 1.4
+"""A node's landmarks are looked for when the robot is within this distance of it, m."""
+DETECT_EVERY = 4
+"""Ticks between two detections of the next nodes."""
+SKIP = 2
+"""Nodes further along the route that are searched for as well."""
+GOAL_VIEWS = 4
+"""Detections at the goal, averaged, that decide whether the robot is there."""
+HIDDEN = 2.0
+"""After this time at the goal without its landmarks visible, or recognised, the robot is not there, s."""
+PATIENCE = 6.0
+"""Time without getting on before an edge counts as blocked, s."""
+STALLED = 3.0
+"""Time that the servo may take without getting nearer before the robot drives around, s."""
+STALLED_PARKING = 10.0
+"""The same on the way to the goal's pose, which may take a manoeuvre, s."""
+BARRED = 5.0
+"""How long the robot then drives around without the servo, s."""
 
 
 class RouteFollower:
@@ -84,7 +86,7 @@ class RouteFollower:
         route: tuple[RouteLeg, ...],
         fix: Fix,
         detour: LocalPlanner,
-        settings: RouteFollowerSettings,
+        settings: AgentSettings,
         rng: np.random.Generator,
     ) -> None:
         """Start on a route.
@@ -103,13 +105,13 @@ class RouteFollower:
         self.detail = ""
         self.fix = fix
         self._description = description
-        self._detector = NodeDetector(description, lens, sift, settings.lookout, rng)
+        self._detector = NodeDetector(description, lens, sift, rng, settings)
         self._route = route
         self._start_from_leg = [Pose2()]
         for hop in route[1:]:
             self._start_from_leg.append(self._start_from_leg[-1] @ hop.previous_from_node.mean)
         self._local_planner = detour
-        self._settings = settings
+        self._settings = settings.navigation
         self._servo = Servo(description)
         self._servoing = -1
         self._blind_drive = OdometryDrive(description)
@@ -160,7 +162,7 @@ class RouteFollower:
         self.detail = f"{distance:.2f} m to node {node}, {self._last - self.leg} further"
         parking = self.leg == self._last
         self.progress = RouteProgress.DRIVING
-        if self.fix.blind > s.blind and not (parking and distance < NEAR):
+        if self.fix.blind > s.blind_distance and not (parking and distance < NEAR):
             self.progress = RouteProgress.UNSURE
             return Command()
         self._progressed.take(distance, self._description.tick)
@@ -213,8 +215,8 @@ class RouteFollower:
         return None if detection is None else detection[1]
 
     def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
-        """Whether the servo may drive: without progress it cannot pass an obstacle."""
-        _s, tick = self._settings, self._description.tick
+        """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
+        tick = self._description.tick
         self._servo_barred = max(self._servo_barred - tick, 0.0)
         if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):
             return False

@@ -25,10 +25,6 @@ from mapweave.wire.codec import wrap_body
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import MAX_ROWS, Ack, LogAnswer, LogRequest, Mark
 
-SETTLED_BEACONS = 20
-"""Of so many beacons, an older map that is complete sends one; a server that is new learns of it so."""
-
-
 log = logging.getLogger(__name__)
 
 
@@ -68,6 +64,10 @@ class ReplicationStatus:
     since_ack: float
     refused: int
     failure: str
+
+
+SETTLED_BEACONS = 20
+"""Of so many beacons, an older map that is complete sends one; a server that is new learns of it so."""
 
 
 class Replicator:

@@ -7,7 +7,6 @@ tried against accelerations, as the robot is slow and its stopping distance is c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,24 +25,18 @@ SPEEDS = (1.0, 0.6, 0.3, 0.0, -0.3)
 TURNS = (1.0, 0.7, 0.45, 0.25, 0.1)
 """Shares of the largest rate that are tried, to either side."""
 FACING = 0.25
-"""M/rad, what it is worth to face the way."""
+"""What it is worth to face the way, m/rad."""
 ROOM = 0.05
-"""M, what it costs to have no room at all beyond the margin."""
+"""What it costs to have no room at all beyond the margin, m."""
 BACKWARD = 0.08
-"""M, what it costs to drive back: the rangers see as well there, the camera does not."""
-
-
-@dataclass(frozen=True)
-class DynamicWindowSettings:
-    """How arcs are chosen."""
+"""What it costs to drive back, m: the rangers see as well there, the camera does not."""
 
 
 class DynamicWindow:
     """The fan of arcs of one robot."""
 
-    def __init__(self, description: RobotDescription, settings: DynamicWindowSettings | None = None) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Prepare for a robot's footprint."""
-        self._settings = settings or DynamicWindowSettings()
         self._radius = description.radius
 
     def toward(self, ahead: Array, points: Array, speed: float, rate: float) -> Command:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,44 +12,38 @@ from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.servo.leg_controller import clip
 
 ACCELERATION = 0.3
-"""M/s^2, of the speed profile at both ends."""
+"""Of the speed profile at both ends, m/s^2."""
 CENTRE_GAIN = 0.6
-"""1/s, turns toward the middle of the features."""
+"""Gain of turns toward the middle of the features, 1/s."""
 CENTRE_BAND = 0.06
-"""Rad, the middle may be this far off before it matters: the way stays almost straight."""
+"""The middle may be this far off before it matters, rad: the way stays almost straight."""
 HEADING_GAIN = 0.8
-"""1/s, holds the heading of the start."""
+"""Gain that holds the heading of the start, 1/s."""
 BORDER = 0.06
-"""Rad, features nearer to the border than this are about to be lost."""
+"""Features nearer to the border than this are about to be lost, rad."""
 MIN_VISIBLE = 6
 """The drive turns round before fewer features than this have room to the border."""
 SLOW = 0.35
-"""M, distance of an obstacle from the edge at which the drive slows."""
+"""Distance of an obstacle from the edge at which the drive slows, m."""
 STOP = 0.12
-"""M, distance at which it turns round."""
+"""Distance of an obstacle from the edge at which the drive turns round, m."""
 DEFLECT = 0.15
-"""Rad/s, largest deflection from an obstacle that is near on one side."""
+"""Largest deflection from an obstacle that is near on one side, rad/s."""
 CONE = 0.9
-"""Rad, rangers within this of the direction of travel matter."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImageDriveSettings:
-    """Settings of the exploration drive.
-
-    Attributes:
-        speed: m/s.
-    """
-
-    speed: float = 0.2
+"""Rangers within this of the direction of travel matter, rad."""
 
 
 class ImageDrive:
     """Drives a way forth and back again, steered by the features' bearings alone."""
 
-    def __init__(self, description: RobotDescription, settings: ImageDriveSettings | None = None) -> None:
-        """Prepare for a robot; `start` must come before each drive."""
-        self.settings = settings or ImageDriveSettings()
+    def __init__(self, description: RobotDescription, speed: float = 0.2) -> None:
+        """Prepare for a robot; `start` must come before each drive.
+
+        Args:
+            description: of the robot.
+            speed: m/s.
+        """
+        self._wanted = speed
         self._description = description
         self._rangers = np.asarray(description.ranger_bearings, dtype=np.float64)
         self.start(0.0)
@@ -99,12 +92,11 @@ class ImageDrive:
 
     def _speed(self, travelled: float, free: float) -> float:
         """m/s: ramps at both ends of the way, slower toward obstacles."""
-        settings = self.settings
         ends = (0.0, self._distance) if self._outward else (self._turned_at, 0.0)
         way = min(abs(travelled - ends[0]), abs(travelled - ends[1]))
         ramp = math.sqrt(2.0 * ACCELERATION * max(way, 0.0))
         share = clip(max(free - STOP, 0.0) / (SLOW - STOP), 1.0)
-        top = min(settings.speed, self._description.max_forward)
+        top = min(self._wanted, self._description.max_forward)
         return max(min(ramp, top), min(0.03, top)) * max(share, 0.15)
 
     def _turn(

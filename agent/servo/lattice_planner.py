@@ -20,7 +20,8 @@ from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 _FIRST_OCTANT = ((1, 0), (3, 1), (2, 1), (3, 2))
 FARTHEST = 5.0
 """m; the grid covers start and goal, and its size grows with the square of their distance. The servo is given
-nodes within 1.4 m (`RouteFollowerSettings.sight_reach`), and parks in `benchmarks.servo` from up to 2.5 m."""
+nodes within 1.4 m (DETECTION_REACH of the route follower), and parks in `benchmarks.servo` from up to
+2.5 m."""
 
 _BORDER = 3
 _BINS = 72

@@ -7,13 +7,9 @@ from dataclasses import dataclass
 
 from mapweave.agent.observation import Command
 from mapweave.agent.servo.laws import saturate
+from mapweave.agent.servo.margins import TURN_GAIN
 from mapweave.agent.servo.plan import Leg
-from mapweave.agent.servo.settings import TURN_GAIN, ServoSettings
 from mapweave.hybridmap.pose import Pose2, wrap_angle
-
-FORWARD_GAIN = 1.5
-"""1/s, slows legs toward their end."""
-
 
 _ALIGNED = 0.04
 """rad, a turn on the spot ends here."""
@@ -33,22 +29,24 @@ class Limits:
     turn: float
 
 
+FORWARD_GAIN = 1.5
+"""Gain that slows legs toward their end, 1/s."""
+
+
 class LegController:
     """Drives one leg, along the line from the pose where the robot starts to drive."""
 
-    def __init__(self, leg: Leg, last: bool, settings: ServoSettings, limits: Limits) -> None:
+    def __init__(self, leg: Leg, last: bool, limits: Limits) -> None:
         """Take a leg.
 
         Args:
             leg: to be driven.
             last: whether it ends at the goal, and so must end exactly.
-            settings: gains.
             limits: speed limits.
         """
         self.leg = leg
         self.turning = True
         self._last = last
-        self._settings = settings
         self._limits = limits
         self._heading = leg.heading
         self._aimed = False
@@ -60,7 +58,7 @@ class LegController:
 
     def command(self, pose: Pose2) -> Command | None:
         """What to do at `goal_from_robot`, or None when the leg is done."""
-        _settings, limits = self._settings, self._limits
+        limits = self._limits
         if not self._aimed:
             self._aim(pose)
         error = wrap_angle(self._heading - pose.heading)

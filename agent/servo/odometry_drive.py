@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,26 +15,19 @@ from mapweave.agent.servo.servo_step import ServoStep, State
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 POSITION_TOLERANCE = 0.02
-"""M, nearer than this the robot only turns."""
+"""Nearer than this the robot only turns, m."""
 HEADING_TOLERANCE = 0.02
-"""Rad, of the last turn."""
+"""Of the last turn, rad."""
 FORWARD_GAIN = 1.5
-"""1/s."""
+"""Gain that slows the drive toward its end, 1/s."""
 TURN_GAIN = 2.5
-"""1/s."""
+"""Gain of turns, 1/s."""
 CLEARANCE = 0.04
-"""M, room between the footprint and obstacle points that stops the drive."""
-BACKWARD = True
-"""Whether it may drive backward when that needs less turning."""
+"""Room between the footprint and obstacle points below which the drive stops, m."""
 CRUISE = 0.8
 """Share of the speed limits that is used."""
 PATIENCE_TICKS = 20
-"""How long an obstacle in the way is waited for before the drive is stuck."""
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryDriveSettings:
-    """Settings of the blind drive."""
+"""Ticks that an obstacle in the way is waited for before the drive is stuck."""
 
 
 class OdometryDrive:
@@ -44,9 +36,8 @@ class OdometryDrive:
     The pose it is given comes from odometry or a filter; it is corrected whenever that is.
     """
 
-    def __init__(self, description: RobotDescription, settings: OdometryDriveSettings | None = None) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Prepare for a robot; `start` must come before each drive."""
-        self.settings = settings or OdometryDriveSettings()
         self._description = description
         self._max_forward = max(description.max_forward, 1e-3) * CRUISE
         self._max_turn = max(description.max_turn, 1e-3) * CRUISE
@@ -57,11 +48,9 @@ class OdometryDrive:
         self._blocked = 0
         self._at_goal = False
         toward = math.atan2(-goal_from_robot.y, -goal_from_robot.x)
-        self._direction = 1.0
-        if BACKWARD:
-            ahead = _turning(goal_from_robot.heading, toward)
-            astern = _turning(goal_from_robot.heading, toward + math.pi)
-            self._direction = -1.0 if astern < ahead - 1e-6 else 1.0
+        ahead = _turning(goal_from_robot.heading, toward)
+        astern = _turning(goal_from_robot.heading, toward + math.pi)
+        self._direction = -1.0 if astern < ahead - 1e-6 else 1.0
         self._aligned = False
 
     def command(self, goal_from_robot: Pose2, obstacles: NDArray[Any]) -> ServoStep:
@@ -71,7 +60,7 @@ class OdometryDrive:
             goal_from_robot: where the robot is now, in the goal's robot frame.
             obstacles: (K, 2) m, in robot, points that the rangers hit now.
         """
-        _settings, pose = self.settings, goal_from_robot
+        pose = goal_from_robot
         rho = math.hypot(pose.x, pose.y)
         heading = wrap_angle(pose.heading)
         reach = POSITION_TOLERANCE * (2.0 if self._at_goal else 1.0)

@@ -112,6 +112,10 @@ class Price:
         return sum(leg.length for leg in legs) + self.turn * turned + self.leg * len(legs)
 
 
+PRICE = Price()
+"""A plan with a turn or a leg less is driven sooner and kept to better."""
+
+
 class Surroundings:
     """Which poses are allowed: enough landmarks in view, and clear of obstacles."""
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from mapweave.agent.servo.lattice_planner import lattice_plan
-from mapweave.agent.servo.plan import Plan, Surroundings
-from mapweave.agent.servo.settings import ServoSettings
+from mapweave.agent.servo.margins import margins
+from mapweave.agent.servo.plan import PRICE, Plan, Surroundings
 from mapweave.agent.servo.two_leg_planner import two_leg_plan
 from mapweave.hybridmap.pose import Pose2
 
@@ -19,20 +19,19 @@ _DETOUR_M = 0.6
 """if it is also this much longer, m."""
 
 
-def quick_plan(around: Surroundings, start: Pose2, settings: ServoSettings) -> Plan | None:
+def quick_plan(around: Surroundings, start: Pose2) -> Plan | None:
     """A plan of two legs with as wide a margin as there is one for: milliseconds.
 
     Args:
         around: constraints.
         start: pose in goal.
-        settings: margins and price.
 
     Returns:
         The plan, or None if two legs will not do.
     """
-    for margin in settings.margins():
+    for margin in margins():
         turned = turned_inside(around, start, margin)
-        plan = two_leg_plan(around, turned, margin, settings.price) if turned is not None else None
+        plan = two_leg_plan(around, turned, margin, PRICE) if turned is not None else None
         if plan is not None:
             return plan
     return None
@@ -43,26 +42,23 @@ def needs_thought(plan: Plan | None) -> bool:
     return plan is None or plan.length > _DETOUR * math.hypot(plan.start.x, plan.start.y) + _DETOUR_M
 
 
-def thorough_plan(around: Surroundings, start: Pose2, settings: ServoSettings) -> Plan | None:
+def thorough_plan(around: Surroundings, start: Pose2) -> Plan | None:
     """The cheapest plan that two legs or the lattice know: tens to hundreds of milliseconds.
 
     Args:
         around: constraints.
         start: pose in goal.
-        settings: margins and price.
 
     Returns:
         The plan, or None if none was found.
     """
-    quick = quick_plan(around, start, settings)
-    wide, *_, least = settings.margins()
+    quick = quick_plan(around, start)
+    wide, *_, least = margins()
     for margin, cell, room in ((0.6 * wide, 0.1, 1.2), (least, 0.1, 1.2), (least, 0.06, 1.5)):
         if quick is not None and margin < quick.margin:
             break
         turned = turned_inside(around, start, margin)
-        plan = (
-            lattice_plan(around, turned, margin, settings.price, cell, room) if turned is not None else None
-        )
+        plan = lattice_plan(around, turned, margin, PRICE, cell, room) if turned is not None else None
         if plan is not None:
             return plan if quick is None or plan.cost < quick.cost else quick
     return quick

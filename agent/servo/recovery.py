@@ -7,13 +7,13 @@ import numpy as np
 from mapweave.agent.observation import Command
 from mapweave.agent.servo.field_of_view import FieldOfView
 from mapweave.agent.servo.leg_controller import Limits, clip
+from mapweave.agent.servo.margins import LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN
 from mapweave.agent.servo.plan import Surroundings
 from mapweave.agent.servo.servo_step import State
-from mapweave.agent.servo.settings import LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN, ServoSettings
 from mapweave.hybridmap.pose import Pose2
 
 RETREAT = 0.6
-"""M, longest way back along the optical axis to find landmarks again."""
+"""Longest way back along the optical axis to find landmarks again, m."""
 
 
 _OFFSETS = np.linspace(-0.8, 0.8, 33)
@@ -23,9 +23,9 @@ _OFFSETS = np.linspace(-0.8, 0.8, 33)
 class Recovery:
     """Brings landmarks back into view. Backing off narrows all bearings: tried when no turn helps."""
 
-    def __init__(self, settings: ServoSettings, limits: Limits) -> None:
+    def __init__(self, limits: Limits) -> None:
         """Prepare."""
-        self._settings, self._limits = settings, limits
+        self._limits = limits
         self._retreat_from: Pose2 | None = None
 
     def over(self) -> None:

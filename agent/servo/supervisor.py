@@ -11,41 +11,41 @@ from numpy.typing import NDArray
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.servo.laws import control, saturate
 from mapweave.agent.servo.leg_controller import LegController, Limits, clip
+from mapweave.agent.servo.margins import FIELD_MARGIN, LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN
 from mapweave.agent.servo.obstacles import ObstacleMemory
-from mapweave.agent.servo.plan import Plan, Surroundings, arc, sample
+from mapweave.agent.servo.plan import PRICE, Plan, Surroundings, arc, sample
 from mapweave.agent.servo.planner import needs_thought, quick_plan, thorough_plan
 from mapweave.agent.servo.polar import Polar, continued, polar_of
 from mapweave.agent.servo.recovery import Recovery
 from mapweave.agent.servo.rollout import roll_out
 from mapweave.agent.servo.servo_step import ServoStep, State
-from mapweave.agent.servo.settings import FIELD_MARGIN, LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN, ServoSettings
 from mapweave.agent.servo.visibility import Visibility
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 LAMBDA = 2.0
 """Gain lambda of the laws; 2 is critically damped."""
 GAIN = 1.5
-"""1/s, how fast time runs in the laws; multiplies both speeds."""
+"""How fast time runs in the laws, 1/s; multiplies both speeds."""
 DEAD_ZONE = 0.004
-"""Rho_D, m: nearer than this only the heading is mended."""
+"""Distance rho_D within which only the heading is mended, m."""
 POSITION_TOLERANCE = 0.0075
-"""M, estimated distance at which the goal counts as reached. A centimetre of true distance less what a pose
+"""Estimated distance at which the goal counts as reached, m: a centimetre of true distance less what a pose
 filter may be off."""
 HEADING_TOLERANCE = 0.008
-"""Rad."""
+"""Estimated heading error at which the goal counts as reached, rad."""
 SETTLE_TICKS = 3
 """Ticks in a row inside both tolerances before the robot has arrived."""
 CLEARANCE = 0.04
-"""M, room between the footprint and obstacles."""
+"""Room between the footprint and obstacles, m."""
 LAW_REACH = 0.04
-"""M, nearer than this no law is taken up (one at work goes on): the direction to the goal is noise there,
+"""Nearer than this no law is taken up (one at work goes on), m: the direction to the goal is noise there,
 and short legs are surer."""
 LAW_BONUS = 0.15
 """A law is preferred to a plan up to this share of extra cost."""
 LAW_BONUS_M = 0.05
-"""And up to this extra cost, m."""
+"""And besides up to this extra cost, m."""
 HORIZON = 0.15
-"""S, look-ahead of the last check before a command leaves."""
+"""Look-ahead of the last check before a command leaves, s."""
 CRUISE = 1.0
 """Share of the robot's speed limits that is used."""
 
@@ -59,14 +59,12 @@ class Servo:
     to where landmarks are in view again; (6) report that it is stuck.
     """
 
-    def __init__(self, description: RobotDescription, settings: ServoSettings | None = None) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Prepare for a robot.
 
         Args:
             description: camera, footprint and limits.
-            settings: defaults if None.
         """
-        self.settings = settings or ServoSettings()
         self._description = description
         share = CRUISE
         self._limits = Limits(
@@ -85,7 +83,7 @@ class Servo:
             Whether a way is known already; if not, `command` makes a longer search with the robot at rest.
         """
         self.switches = 0
-        self._visibility = Visibility(self._description.camera, self.settings)
+        self._visibility = Visibility(self._description.camera)
         self._memory = ObstacleMemory()
         self._law: int | None = None
         self._polar = Polar(0.0, 0.0, 0.0)  # continued from tick to tick while a law is at work
@@ -95,7 +93,7 @@ class Servo:
         self._broken_laws = 0
         self._in_dead_zone = False
         self._settled = 0
-        self._recovery = Recovery(self.settings, self._limits)
+        self._recovery = Recovery(self._limits)
         self._wait, self._patience, self._thinking = 0, 2, False
         self._visibility.update(goal_from_robot, points_in_goal, None)
         self._choose(goal_from_robot, self._surroundings(goal_from_robot))
@@ -184,7 +182,7 @@ class Servo:
             if not around.admits(sample(pose_near_start, rest), min(hard, self._plan.margin)):
                 self._drop_plan()
                 return
-            cost = self.settings.price.of(pose_near_start, rest)
+            cost = PRICE.of(pose_near_start, rest)
             law = self._best_law(polar_of(pose), around, cost)
             if law is not None:
                 self._drop_plan()
@@ -201,7 +199,7 @@ class Servo:
         if math.hypot(pose.x, pose.y) < 1e-9 or self._visibility.field.count < MIN_VISIBLE:
             return
         search = thorough_plan if self._thinking else quick_plan
-        plan = search(around, pose, self.settings)
+        plan = search(around, pose)
         law = self._best_law(polar_of(pose), around, plan.cost if plan else math.inf)
         if law is None and not self._thinking and needs_thought(plan):
             self._thinking = True
@@ -221,11 +219,10 @@ class Servo:
 
     def _best_law(self, polar: Polar, around: Surroundings, cost: float) -> int | None:
         """The cheapest law that parks within the constraints for little more than a cost (m)."""
-        settings = self.settings
         if polar.rho < LAW_REACH:
             return None
         rollouts = roll_out(polar, LAMBDA, DEAD_ZONE)
-        costs = rollouts.lengths + settings.price.turn * rollouts.turns + settings.price.leg
+        costs = rollouts.lengths + PRICE.turn * rollouts.turns + PRICE.leg
         # Each law that had to be given up raises the bar for the next: no endless switching.
         margin = FIELD_MARGIN * (1.0 + 0.5 * self._broken_laws)
         limit = cost * (1.0 + LAW_BONUS) + LAW_BONUS_M
@@ -284,7 +281,7 @@ class Servo:
             leg = plan.legs[self._leg]
             if self._follower is None:
                 last = self._leg == len(plan.legs) - 1
-                self._follower = LegController(leg, last, self.settings, self._limits)
+                self._follower = LegController(leg, last, self._limits)
             command = self._follower.command(pose)
             if command is not None:
                 name = f"leg {self._leg + 1} of {len(plan.legs)}"

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.servo.field_of_view import FieldOfView
-from mapweave.agent.servo.settings import MIN_VISIBLE, ServoSettings
+from mapweave.agent.servo.margins import MIN_VISIBLE
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 
 MIN_DEPTH = 0.1
-"""M, nearer landmarks do not count."""
+"""Nearer landmarks do not count, m."""
 MOST_LANDMARKS = 24
 """How many landmarks ways are checked against."""
 MISSED_TICKS = 10
@@ -32,9 +32,9 @@ class Visibility:
         planning_field: of some of them, for ways.
     """
 
-    def __init__(self, camera: Camera, settings: ServoSettings) -> None:
+    def __init__(self, camera: Camera) -> None:
         """Begin without landmarks."""
-        self._camera, self._settings = camera, settings
+        self._camera = camera
         self._points = np.zeros((0, 3))
         self._missed = np.zeros(0, dtype=int)
         self._used = np.zeros(0, dtype=bool)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.rejection_counter import RejectionCounter
-from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features

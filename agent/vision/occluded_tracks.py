@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.vision.template import TemplateMatcher, Templates, TemplateSettings
+from mapweave.agent.vision.template import TemplateCriteria, TemplateMatcher, Templates
 from mapweave.hybridmap.pose import Array
 
 IMAGES = 60
 """A point that has not come back after so many images is given up."""
 
 
-@dataclass(frozen=True, slots=True)
-class OccludedTrackSettings:
-    """How long and how occluded points are searched for.
-
-    Attributes:
-        template: how its patch is found again: further from the expected place than that of a point that is
-            tracked, and therefore only with a higher correlation.
-    """
-
-    template: TemplateSettings = field(
-        default_factory=lambda: TemplateSettings(iterations=6, agree_px=4.0, least_correlation=0.9)
-    )
+AFAR = TemplateCriteria(iterations=6, agree_px=4.0, least_correlation=0.9)
+"""A patch is found again further from the expected place than that of a point that is tracked, and therefore
+only with a higher correlation."""
 
 
 class OccludedTracks:
@@ -35,11 +24,10 @@ class OccludedTracks:
         ids: (N,) of the points that are hidden now.
     """
 
-    def __init__(self, settings: OccludedTrackSettings | None = None) -> None:
+    def __init__(self) -> None:
         """Start with nothing hidden."""
         self.ids: NDArray[np.int64] = np.zeros(0, np.int64)
-        self._settings = settings or OccludedTrackSettings()
-        self._matcher = TemplateMatcher(self._settings.template)
+        self._matcher = TemplateMatcher(AFAR)
         self._templates = self._matcher.none()
         self._waited: NDArray[np.int64] = np.zeros(0, np.int64)
 

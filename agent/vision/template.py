@@ -16,15 +16,6 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array
 
-HALF_PX = 7
-"""A patch reaches this far from its point in each direction."""
-SIGMA_PX = 4.0
-"""Of the Gaussian by which pixels far from the point count less: they are on another surface, or on a
-slanted one, more often than those near it."""
-MOST_SCALE = 1.7
-"""Once a patch has grown or shrunk by more than this it is cut again from the present image."""
-
-
 Floats = NDArray[np.float32]
 
 FAINT = 0.5
@@ -35,7 +26,7 @@ RIDGE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class TemplateSettings:
+class TemplateCriteria:
     """How tracks are held to the patches in which they were first seen.
 
     Attributes:
@@ -102,12 +93,21 @@ class Match:
     templates: Templates
 
 
+HALF_PX = 7
+"""A patch reaches this far from its point in each direction, px."""
+SIGMA_PX = 4.0
+"""Standard deviation of the Gaussian by which pixels far from the point count less, px: they are on another
+surface, or on a slanted one, more often than those near it."""
+MOST_SCALE = 1.7
+"""Once a patch has grown or shrunk by more than this factor it is cut anew from the present image."""
+
+
 class TemplateMatcher:
     """Cuts patches and finds them again, moved, grown and lit differently."""
 
-    def __init__(self, settings: TemplateSettings | None = None) -> None:
+    def __init__(self, settings: TemplateCriteria | None = None) -> None:
         """Lay out the patch."""
-        self._settings = settings or TemplateSettings()
+        self._settings = settings or TemplateCriteria()
         side = np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32)
         self._spots = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
         weights = np.exp(-(self._spots**2).sum(axis=1) / (2 * SIGMA_PX**2))

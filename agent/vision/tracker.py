@@ -6,13 +6,12 @@ seen then says where exactly it is (agent/vision/template.py, docs/decisions/tra
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.vision.template import TemplateMatcher, Templates, TemplateSettings
+from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.template import TemplateMatcher, Templates
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
@@ -20,9 +19,9 @@ from mapweave.vision.lens import Lens
 LEVELS = 2
 """Pyramid levels above the image."""
 BACKWARD_PX = 0.8
-"""A point that does not come back to where it was within this is lost."""
+"""A point that does not come back to where it was within this is lost, px."""
 BORDER_PX = 4.0
-"""Points nearer to the border are lost."""
+"""Points nearer to the border are lost, px."""
 LEAST_TEXTURE = 2.5
 """Mean squared gradient of a patch in its weakest direction, (grey/px)^2; with less (that of noise
 included, about 1 for a webcam) a point would slide along an edge, and is lost."""
@@ -30,22 +29,6 @@ included, about 1 for a webcam) a point would slide along an edge, and is lost."
 
 EIGENVALUE_UNIT = 1024.0
 """OpenCV's Lucas-Kanade measures gradients in units of 1/32 grey/px."""
-
-
-@dataclass(frozen=True)
-class TrackerSettings:
-    """How tracks are followed.
-
-    Attributes:
-        window_px: side of the patch that is matched.
-        anchored: whether points are held to the patches in which they were first seen. What is tracked over
-            one frame only gains nothing by it.
-        template: how they are.
-    """
-
-    window_px: int = 11
-    anchored: bool = True
-    template: TemplateSettings = field(default_factory=TemplateSettings)
 
 
 class Tracker:
@@ -69,7 +52,7 @@ class Tracker:
         self.raw: Array = np.zeros((0, 2))
         self.ages: NDArray[np.int64] = np.zeros(0, np.int64)
         self.held: NDArray[np.bool_] = np.zeros(0, np.bool_)
-        self._matcher = TemplateMatcher(self._settings.template)
+        self._matcher = TemplateMatcher()
         self.templates = self._matcher.none()
 
     @property

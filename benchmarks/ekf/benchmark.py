@@ -28,6 +28,7 @@ from rich.table import Table
 from scipy.stats import chi2
 
 from benchmarks.ekf_speed.benchmark import measure, one_thread
+from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
 from synthetic.localization_run import FEW, Place, Start, try_drives, try_start
 from synthetic.mapping_error import error, filter_error, follow, landmark_nees, left_out
 from synthetic.mapping_optimum import batch_optimum
@@ -67,8 +68,7 @@ def try_run(seed: int, trial: int) -> Trial:
     run = draw_run(rng, SHAPES[trial % len(SHAPES)])
     filter_ = follow(run)
     everything = np.ones(len(run.points), np.bool_)
-    settings = filter_.settings
-    pose_vector, points = batch_optimum(run, settings.prior_depth, settings.prior_spread)
+    pose_vector, points = batch_optimum(run, PRIOR_DEPTH, PRIOR_SPREAD)
     best = error(run, filter_.ids, pose_vector, points[filter_.ids])
     spoiled_run, spoiled = spoil(run, 0.3, rng)
     spoiled_filter = follow(spoiled_run)

@@ -23,8 +23,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
-from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.ekf.mapping_filter import MappingFilter
+from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.pose import Array
 from synthetic.mapping_run import AXLE, WHEEL_NOISE, MappingRun, draw_run
 
@@ -96,7 +98,7 @@ class Theirs:
         """Start with all landmarks of the first image, from our priors."""
         s = plain(run)
         self._filter = FilterPyMapping(
-            run.camera, AXLE, WHEEL_NOISE, run.pixels[0], s.pixel_sigma, s.prior_depth, s.prior_spread
+            run.camera, AXLE, WHEEL_NOISE, run.pixels[0], s.pixel_sigma, PRIOR_DEPTH, PRIOR_SPREAD
         )
 
     def step(self, odometry: Odometry, pixels: Array) -> None:

@@ -27,7 +27,8 @@ from scipy.stats import chi2
 from benchmarks.ekf_speed.benchmark import one_thread
 from benchmarks.ekf_variants.coordinates import Points, Rays
 from benchmarks.ekf_variants.textbook import Choice, TextbookFilter
-from mapweave.agent.ekf.mapping_filter import FilterSettings
+from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
+from mapweave.agent.settings import FilterSettings
 from synthetic.mapping_error import error, filter_error, follow, landmark_nees
 from synthetic.mapping_optimum import batch_optimum
 from synthetic.mapping_run import SHAPES, MappingRun, draw_run
@@ -98,8 +99,7 @@ def try_ours(run: MappingRun, relinearisations: int, best: float) -> Outcome:
 def try_run(seed: int, trial: int, steps: int) -> dict[str, Outcome]:
     """All filters on one run."""
     run = draw_run(np.random.default_rng([seed, trial]), SHAPES[trial % len(SHAPES)], steps)
-    prior = FilterSettings()
-    pose_vector, points = batch_optimum(run, prior.prior_depth, prior.prior_spread)
+    pose_vector, points = batch_optimum(run, PRIOR_DEPTH, PRIOR_SPREAD)
     best = error(run, np.arange(len(run.points)), pose_vector, points)
     outcomes = {name: try_textbook(run, choice, best) for name, choice in TEXTBOOK.items()}
     return outcomes | {name: try_ours(run, again, best) for name, again in OURS.items()}

@@ -34,8 +34,7 @@ from rich.table import Table
 
 from benchmarks.explore.area import Look, MappedFloor, mapped_floor
 from benchmarks.explore.start import office
-from mapweave.agent.exploration.settings import ExplorerSettings
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.evaluation.map_score import score_map
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -46,8 +45,8 @@ from mapweave.scenarios.local_fleet import LocalFleet
 from mapweave.storage.map_file import unpack_map_file
 
 STRATEGIES = {
-    "random": ExplorerSettings(wander=True, ask=False),
-    "ours": ExplorerSettings(ask=False),
+    "random": ExplorerSettings(random=True, ask_fleet=False),
+    "ours": ExplorerSettings(ask_fleet=False),
     "fleet": ExplorerSettings(),
 }
 STRIDE = 5.0
@@ -133,7 +132,7 @@ def measure(
             progress.update(bar, description=f"{name}, {count} {'robots' if count > 1 else 'robot'}")
             scenario = office(rooms, count, seed, spread)
             with tempfile.TemporaryDirectory() as folder:
-                settings = PipelineSettings(explorer=STRATEGIES[name])
+                settings = AgentSettings(exploration=STRATEGIES[name])
                 stage = Stage(scenario, seed, Path(folder), settings)
                 done[name][count] = explore(stage, minutes * 60.0, lambda s: progress.advance(bar, s))
     return done

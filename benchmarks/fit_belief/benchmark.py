@@ -27,7 +27,7 @@ from mapweave.hybridmap.pose import Array
 from mapweave.mapserver.relocalization.calibration import COEFFICIENTS, HypothesisSupport, probabilities
 from mapweave.mapserver.relocalization.place_hypotheses import supported
 from mapweave.mapserver.relocalization.relocalizer import (
-    RELOCALIZATION_CANDIDATES,
+    MOST_COMPARED,
     Relocalizer,
 )
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
@@ -60,7 +60,7 @@ def gather(seed: int, nodes: int, queries: int, bar: Progress) -> Seen:
     relocalizer = Relocalizer(index, lambda node: truth[node].node, joined(places, seed))
     found: Seen = []
     for query in asked:
-        ranked = index.query(query.picture.view, RELOCALIZATION_CANDIDATES)
+        ranked = index.query(query.picture.view, MOST_COMPARED)
         sightings = relocalizer.look(query.picture.view, ranked)[0]
         doubled = []
         if sightings:

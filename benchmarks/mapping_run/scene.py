@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from benchmarks.images.surface_points import Surfaces
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
-from mapweave.agent.ekf.mapping_filter import FilterSettings
 from mapweave.agent.exploration.behaviours import DRIVE, LEAST_FEATURES
 from mapweave.agent.mapping.anchored_keyframe import HERE
-from mapweave.agent.mapping.mapper import DEPTHS_PER_HEIGHT, MapperSettings
+from mapweave.agent.mapping.mapper import DEPTHS_PER_HEIGHT
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.view import View
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.servo.image_drive import ImageDrive, ImageDriveSettings
+from mapweave.agent.servo.image_drive import ImageDrive
+from mapweave.agent.settings import AgentSettings, FilterSettings
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.sim.events import Walk
@@ -180,9 +180,9 @@ class _Run:
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
         self.robot = simulation.describe(NAME)
-        settings, lens = MapperSettings(), Lens(self.robot.camera, self.robot.distortion)
-        self.tracking = Tracking(self.robot, lens, settings.tracking)
-        self.filter_settings = settings.tracking.filter
+        settings, lens = AgentSettings(), Lens(self.robot.camera, self.robot.distortion)
+        self.tracking = Tracking(self.robot, lens, settings)
+        self.filter_settings = settings.filter
         # One tick for the wheels to settle on the floor.
         simulation.step({})
         observation = simulation.step({})[NAME]
@@ -198,7 +198,7 @@ class _Run:
         """Drive back and forth; the shape adds turns to those that the image asks for."""
         turns = speeds(shape, steps)[1]
         reach = DRIVE
-        controller = ImageDrive(self.robot, ImageDriveSettings(speed=SPEED))
+        controller = ImageDrive(self.robot, SPEED)
         controller.start(reach)
         observation: Observation | None = None
         aside = 0.0
@@ -237,7 +237,7 @@ class _Run:
             tuple(self.moments), self._telling(), self.given_up,
         )  # fmt: skip
 
-    def _begin(self, observation: Observation, sift: Sift, settings: MapperSettings) -> View:
+    def _begin(self, observation: Observation, sift: Sift, settings: AgentSettings) -> View:
         """Make the image the anchor view of an episode, as the mapper does."""
         if observation.image is None:
             raise InvalidValue("the camera gave no first image")

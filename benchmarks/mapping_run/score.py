@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.mapping_run.scene import MappingDrive, Moment
 from mapweave.agent.ekf.inverse_depth import rays_of_points
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
+from mapweave.agent.ekf.mapping_filter import CONVERGED_SHARE, CONVERGED_SIGMA
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
@@ -109,7 +110,7 @@ class LastKnown:
     @staticmethod
     def of(run: MappingDrive) -> LastKnown:
         """Go through a run; each moment overwrites what was known before."""
-        ids, camera, settings = run.moments[0].landmarks.ids, run.robot.camera, run.filter_settings
+        ids, camera = run.moments[0].landmarks.ids, run.robot.camera
         points, covariances = np.full((len(ids), 3), np.nan), np.full((len(ids), 2, 2), np.inf)
         errors, depth_errors, nees = np.full((3, len(ids)), np.nan)
         converged = np.zeros(len(ids), np.bool_)
@@ -124,7 +125,7 @@ class LastKnown:
             errors[rows] = np.linalg.norm(points[rows] - true, axis=1)
             depth_errors[rows] = known.depths / (in_robot[:, 0] - camera.mount_forward) - 1.0
             nees[rows] = landmark_nees(known, in_robot, camera)
-            limit = np.maximum(settings.converged_sigma, settings.converged_share * known.depths)
+            limit = np.maximum(CONVERGED_SIGMA, CONVERGED_SHARE * known.depths)
             good = np.isfinite(known.depths) & (known.depth_sigmas <= limit)
             converged[rows] = good
             seconds[rows[good]] = np.minimum(seconds[rows[good]], second)

@@ -11,7 +11,7 @@ import numpy as np
 
 from mapweave.agent.fleet_client import encode_mission
 from mapweave.agent.mission import Explore, Mission
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.status_message import AgentStatus
 from mapweave.hybridmap.errors import InvalidFile, NotConnected
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -57,7 +57,7 @@ class Office:
         scenario = load_scenario(scenario_path("office"), ["robots=1", f"world.rooms={rooms}"])
         scenario = replace(scenario, missions={ROBOT: "idle"})
         self._folder = folder
-        self._fleet = LocalFleet(Stage(scenario, seed, folder, PipelineSettings()))
+        self._fleet = LocalFleet(Stage(scenario, seed, folder, AgentSettings()))
         self.control = self._fleet.control
         self.ticks = 0
 

@@ -33,8 +33,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from mapweave.mapserver.relocalization.relocalizer import RELOCALIZATION_CANDIDATES
-
 # Small matrices gain nothing from more threads, and wait for each other where other programs run.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -48,14 +46,14 @@ from benchmarks.relocalize.peer import WordIndex
 from benchmarks.relocalize.queries import KINDS
 from benchmarks.relocalize.score import figures, recall_by_kind, spent, wrong_by_kind
 from mapweave.hybridmap.node import Node
-from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.relocalization.relocalizer import MOST_COMPARED, Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
 REAL = 1000
 """Places that are real, at most."""
 AT_ONCE = 4096
 """Nodes that are added to an index at once."""
-CANDIDATES = RELOCALIZATION_CANDIDATES
+CANDIDATES = MOST_COMPARED
 PEER_AT_MOST = 100_000
 """Beyond, the bag of words is left out: it is not what is asked."""
 

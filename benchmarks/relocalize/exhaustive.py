@@ -16,7 +16,7 @@ from mapweave.hybridmap.descriptor import root_sift
 from mapweave.hybridmap.query import RelocalizeAnswer
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, is_lonely
 from mapweave.mapserver.relocalization.relocalizer import (
-    RELOCALIZATION_CANDIDATES,
+    MOST_COMPARED,
     Relocalizer,
 )
 from mapweave.registration.matching import match_vectors, squared_distances
@@ -26,7 +26,7 @@ AT_MOST = 10_000
 """Nodes; of a larger fleet so many are compared, all that are real among them."""
 COMPARISONS = 400_000
 """Of views with nodes, about: among many nodes not every view is asked."""
-RIVALS = RELOCALIZATION_CANDIDATES
+RIVALS = MOST_COMPARED
 """Places that look most like a view, among which doubles are looked for."""
 NODES_AT_ONCE = 40
 """Whose landmarks are compared at once."""

@@ -52,7 +52,7 @@ ROOM_NODES = 20
 """Nodes a room, one robot each."""
 PATIENCE = 10.0
 """Longest wait for an answer, s."""
-RIVALS = {"desk": "", "in_turn": "[desk]\nworkers = 1\nin_time = 1000.0\n"}
+RIVALS = {"desk": "", "in_turn": "[admission_control]\nworkers = 1\nin_time = 1000.0\n"}
 """Settings of the servers."""
 
 

@@ -29,8 +29,8 @@ from rich.table import Table
 from benchmarks.sim.bare_view import BareView
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.fleet_client import FleetClient
-from mapweave.agent.pipeline import PipelineSettings
 from mapweave.agent.replication.replicator import Replicator
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.scenarios.fleet import TICKS_PER_SECOND, Fleet, Stage
 from mapweave.scenarios.local_fleet import LocalFleet
@@ -64,7 +64,7 @@ VIEWS = 60
 def stage_of(robots: int, seed: int, out: Path) -> Stage:
     """An office with a room for each robot, at least three."""
     overrides = (f"robots={robots}", f"world.rooms={max(3, min(robots, 12))}")
-    return Stage(load_scenario(scenario_path("office"), overrides), seed, out, PipelineSettings())
+    return Stage(load_scenario(scenario_path("office"), overrides), seed, out, AgentSettings())
 
 
 def time_fleet(fleet: Fleet, seconds: float) -> float:

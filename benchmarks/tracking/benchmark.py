@@ -20,8 +20,6 @@ import time
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from mapweave.agent.vision.tracker import BORDER_PX, LEVELS
-
 # numpy reads it when it is imported. One thread for algebra and images, as in Mapweave's own processes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -33,7 +31,8 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.tracking.scenes import Drive, drives
-from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.tracker import BORDER_PX, LEVELS, Tracker
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift

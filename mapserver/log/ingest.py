@@ -30,10 +30,6 @@ from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark, NewestMap, Refusal
 
-PULLS_AT_ONCE = 4
-"""Of different logs."""
-
-
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT = 3600.0
@@ -62,6 +58,10 @@ class _Pulled:
     map: MapId
     asked: LogRequest
     replies: list[Reply]
+
+
+PULLS_AT_ONCE = 4
+"""Logs that are pulled at once."""
 
 
 class Ingest:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -26,49 +26,30 @@ from mapweave.mapserver.merging.verification_cache import (
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_index import PlaceIndex, bounded
 from mapweave.merge.islands import Islands
-from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemovalSettings, LandmarkRemover
-from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder, NodeSupersedingSettings
-from mapweave.merge.merging import MergeSettings
+from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
+from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
-from mapweave.merge.pose_graph.candidates import CandidateSettings, Pair
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap, WrongGeometry
 from mapweave.merge.pose_graph.pairs import PairTable
 from mapweave.merge.pose_graph.verdicts import MapPair, Verdict, Verdicts
-from mapweave.merge.pose_graph.verification import VerificationSettings, verify
+from mapweave.merge.pose_graph.verification import verify
+from mapweave.merge.settings import MergeSettings
 from mapweave.registration.recognition import RecognitionSettings
 from mapweave.wire.pose_codec import MAX_POSITION
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class MergerSettings:
-    """How maps are merged as they come.
-
-    Attributes:
-        candidates: which pairs are looked at; the place index must have the same.
-        verification: when two nodes are linked.
-        merging: which links are believed.
-        renewal: when newer nodes stand for older ones.
-        fading: when landmarks are thought to be gone.
-    """
-
-    candidates: CandidateSettings = field(default_factory=CandidateSettings)
-    verification: VerificationSettings = field(default_factory=VerificationSettings)
-    merging: MergeSettings = field(default_factory=MergeSettings)
-    renewal: NodeSupersedingSettings = field(default_factory=NodeSupersedingSettings)
-    fading: LandmarkRemovalSettings = field(default_factory=LandmarkRemovalSettings)
-
-
 class Pipeline:
     """From maps to a merged map: the merge, renewal and fading, with what each knows from the last one."""
 
-    def __init__(self, settings: MergerSettings, reaches: ReachabilityCache) -> None:
+    def __init__(self, settings: MergeSettings, reaches: ReachabilityCache) -> None:
         """Nothing is merged yet."""
-        self.islands = Islands(settings.merging)
-        self._renewer = NodeSuperseder(settings.renewal, settings.verification, reaches)
-        self._fader = LandmarkRemover(settings.fading)
+        self.islands = Islands(settings)
+        self._renewer = NodeSuperseder(reaches)
+        self._fader = LandmarkRemover()
 
     def merged(
         self,
@@ -99,7 +80,7 @@ class Merger:
     what the maps hold, not on the order in which it came.
     """
 
-    def __init__(self, index: PlaceIndex | None = None, settings: MergerSettings | None = None) -> None:
+    def __init__(self, index: PlaceIndex | None = None, settings: MergeSettings | None = None) -> None:
         """Start with no maps.
 
         Args:
@@ -112,10 +93,10 @@ class Merger:
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
         self.reaches = ReachabilityCache()
-        self.settings = settings or MergerSettings()
+        self.settings = settings or MergeSettings()
         self._before: CachedVerifications | None = None
         self._prints: dict[NodeId, tuple[Node, bytes]] = {}
-        self._pairs = PairTable(self.settings.candidates)
+        self._pairs = PairTable()
         self._succession = SupersededNodes(self.index, self._pairs, self.node)
         self._uncompared: dict[NodeId, None] = {}
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
@@ -123,8 +104,7 @@ class Merger:
         self._pipeline = Pipeline(self.settings, self.reaches)
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
-        merging = self.settings.merging
-        self._contradictions = WrongGeometrySearch(merging.consistency, merging.strain)
+        self._contradictions = WrongGeometrySearch(self.settings.consistency, self.settings.strain)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}
@@ -369,7 +349,7 @@ class Merger:
 
         def attempt(some: Collection[MapId]) -> MergedMap:
             inside = {one: kept[one] for one in some}
-            return Islands(self.settings.merging).merge(inside, Verdicts(), set(inside), self._rulings)
+            return Islands(self.settings).merge(inside, Verdicts(), set(inside), self._rulings)
 
         return leave_out(sorted(kept), attempt)[0]
 
@@ -406,7 +386,7 @@ class Merger:
                 continue
             verdict: Verdict
             try:
-                verdict = verify(bounded(a), bounded(b), self.settings.verification)
+                verdict = verify(bounded(a), bounded(b))
             except Exception as error:  # a defect with two nodes must not hold up all others
                 log.exception("%s and %s cannot be compared", a.id, b.id)
                 verdict = RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})")

@@ -41,7 +41,7 @@ class SupersededNodes:
             node: has just come.
             before: pairs that it was in, if it was known already.
         """
-        found, _s = self._index.overlaps(node, self._node_of), self._index.settings.candidates
+        found = self._index.overlaps(node, self._node_of)
         for candidate_id in {node_id for pair in before for node_id in pair} & self._left_out:
             candidate = self._node_of(candidate_id)
             if candidate is not None and candidate_id != node.id:

@@ -81,5 +81,4 @@ class VerificationCacheKeeper:
 
 
 def _made_by(merger: Merger) -> str:
-    settings = merger.settings
-    return f"{version('mapweave')} {settings.candidates} {settings.verification} {settings.merging}"
+    return f"{version('mapweave')} {merger.settings}"

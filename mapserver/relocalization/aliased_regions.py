@@ -44,18 +44,12 @@ class AliasedRegionSettings:
             seen them, if the doubles show less. Then they must show more than one thing.
         least_around: nodes whose doubles must imply the same motion then. All but one must have a double of
             its own.
-        nodes: around a place that are asked at most.
-        reach: nodes farther from the robot are not asked, m.
-        beside: a landmark nearer than this to one that a double shows is shown by it too, m.
     """
 
     least_nodes: int = 2
     least_share: float = 0.5
     most_looked_at: float = 0.2
     least_around: int = 2
-    nodes: int = 8
-    reach: float = 3.0
-    beside: float = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +92,14 @@ class _Vote:
     there: Pose2
     robot: Pose2
     shown: Array
+
+
+NODES = 8
+"""Nodes around a place that are asked, at most."""
+REACH = 3.0
+"""Nodes farther from the robot are not asked, m."""
+BESIDE = 0.35
+"""A landmark nearer than this to one that a double shows is shown by it too, m."""
 
 
 class AliasedRegions:
@@ -158,9 +160,7 @@ class AliasedRegions:
         best: tuple[list[_Vote], NDArray[np.bool_]] | None = None
         for party in self._parties(votes):
             shown = np.concatenate([vote.shown for vote in party])
-            twice = (
-                np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1, initial=np.inf) < s.beside
-            )
+            twice = np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1, initial=np.inf) < BESIDE
             if twice.mean() < s.least_share:
                 best_told = max(party, key=lambda vote: (len(vote.shown), vote.alike.other.id))
                 missed = self._looked_at(best_told, frame_from_node, robot, points, node) & ~twice
@@ -238,7 +238,7 @@ class AliasedRegions:
         yield node
         bearings = _ways(points, means)[1] - means[:, 2:]
         seen = np.cos(bearings) > math.cos(node.camera.semi_aperture)
-        for k in np.argsort(-seen.sum(axis=1), kind="stable")[: self._settings.nodes].tolist():
+        for k in np.argsort(-seen.sum(axis=1), kind="stable")[:NODES].tolist():
             one = self._node_of(ids[k])
             if one is not None and one.id != node.id:
                 yield one
@@ -247,8 +247,8 @@ class AliasedRegions:
         """The nodes nearest to a pose in a component, within reach, and (N, 3) their poses."""
         graph = self._merged.graphs[component]
         away = np.hypot(graph.means[:, 0] - at.x, graph.means[:, 1] - at.y)
-        near = np.flatnonzero(away < self._settings.reach)
-        near = near[np.argsort(away[near], kind="stable")][: 3 * self._settings.nodes]
+        near = np.flatnonzero(away < REACH)
+        near = near[np.argsort(away[near], kind="stable")][: 3 * NODES]
         return [graph.nodes[k] for k in near.tolist()], graph.means[near]
 
     def _votes(self, around: Iterable[Node], frame: Frame, robot: Pose2) -> list[_Vote]:

@@ -27,21 +27,11 @@ from mapweave.mapserver.relocalization.aliased_landmarks import (
 )
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions, AliasedRegionSettings
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, PlaceHypothesis, is_lonely
-from mapweave.mapserver.relocalization.verdict import (
-    SLIGHT,
-    HypothesisSelectionSettings,
-    HypothesisSelector,
-    unknown,
-)
+from mapweave.mapserver.relocalization.verdict import ALONE, SLIGHT, HypothesisSelector, unknown
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import match
 from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
-
-RELOCALIZATION_CANDIDATES = 16
-"""Nodes that are compared with the view."""
-EXPLAINED_PX = 12.0
-"""A match nearer than this to where a pose found elsewhere expects it speaks for that."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +40,19 @@ class RelocalizationSettings:
 
     Attributes:
         recognition: when a view counts as recognised.
-        judgement: when a place that was recognised is told.
         regions: when a place counts as being there twice, by its surroundings.
         faint: a node that looks so much less like the view than one that was recognised is not looked at.
     """
 
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
-    judgement: HypothesisSelectionSettings = field(default_factory=HypothesisSelectionSettings)
     regions: AliasedRegionSettings = field(default_factory=AliasedRegionSettings)
     faint: float = 0.25
+
+
+MOST_COMPARED = 16
+"""Nodes that are compared with the view."""
+EXPLAINED_PX = 12.0
+"""A match nearer than this to where a pose found elsewhere expects it speaks for that."""
 
 
 class Relocalizer:
@@ -86,7 +80,7 @@ class Relocalizer:
         self._merged = merged
         self._settings = settings or RelocalizationSettings()
         self.alike = alike or AliasCache(self._settings.recognition)
-        self.judge = HypothesisSelector(merged, self._settings.judgement)
+        self.judge = HypothesisSelector(merged)
         self._regions = AliasedRegions(index, node_of, merged, self.alike, self._settings.regions)
 
     def answer(self, view: View) -> RelocalizeAnswer:
@@ -94,7 +88,7 @@ class Relocalizer:
         s = self._settings
         if len(view) < s.recognition.least_inliers:
             return unknown(f"the view has {len(view)} features; {s.recognition.least_inliers} are needed")
-        ranked = self._index.query(view, RELOCALIZATION_CANDIDATES)
+        ranked = self._index.query(view, MOST_COMPARED)
         if not ranked:
             return unknown("no node of any map has features like these")
         sightings, refusals = self.look(view, ranked)
@@ -119,7 +113,7 @@ class Relocalizer:
         refusals: list[tuple[NodeId, Refusal]] = []
         best_score = 0.0
         for node_id, score in ranked:
-            sure = any(one.recognition.inliers >= s.judgement.alone for one in sightings)
+            sure = any(one.recognition.inliers >= ALONE for one in sightings)
             node = self._node_of(node_id)
             if node is None or (sure and score < s.faint * best_score):
                 continue

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,12 +14,17 @@ from mapweave.mapserver.relocalization.calibration import probabilities
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, PlaceHypothesis, fuse, supported
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
+ALONE = 18
+"""Landmarks that must agree if one node speaks alone. Two nodes that say the same, found each by its own,
+are much better evidence than one: parts of unlike places look alike."""
+
+
 GATE = 16.3
 """Chi-square with 3 degrees of freedom within which two estimates agree."""
 FLOOR_XY = 0.05
 """Error between two estimates that no covariance tells of, m."""
 FLOOR_HEADING = 0.03
-"""The same, rad."""
+"""Heading error between two estimates that no covariance tells of, rad."""
 COMPARABLE = 0.6
 """A second place is a rival if it explains so much of what the best one explains, or if so much of what it
 should see is seen, as compared with the best one."""
@@ -35,24 +39,12 @@ NOWHERE = -1
 """Component of a node that is not in the merged map yet."""
 
 
-@dataclass(frozen=True)
-class HypothesisSelectionSettings:
-    """When a place is told.
-
-    Attributes:
-        alone: landmarks that must agree if one node speaks alone. Two nodes that say the same, found each
-            by its own, are much better evidence than one: parts of unlike places look alike.
-    """
-
-    alone: int = 18
-
-
 class HypothesisSelector:
     """Puts what was recognised together, and answers. It stands for one merged map."""
 
-    def __init__(self, merged: MergedMap, settings: HypothesisSelectionSettings) -> None:
+    def __init__(self, merged: MergedMap) -> None:
         """Take where nodes are, and how strict to be."""
-        self._merged, self._settings = merged, settings
+        self._merged = merged
 
     def places(self, sightings: Sequence[NodeMatch]) -> list[PlaceHypothesis]:
         """Group the sightings by agreement, best supported place first."""
@@ -93,7 +85,7 @@ class HypothesisSelector:
             places: that were recognised, best supported first.
             elsewhere: finds where a robot may be as well that seems to be at the first of them.
         """
-        s, first = self._settings, places[0]
+        first = places[0]
         supports = supported(places)
         rivals = [
             place for place, support in zip(places, supports, strict=True)
@@ -107,7 +99,7 @@ class HypothesisSelector:
             return self._ambiguous(places, rivals)
         best = first.best
         words = f"{best.recognition.inliers} landmarks of {best.node} agree"
-        if len(first.sightings) == 1 and best.recognition.inliers < s.alone:
+        if len(first.sightings) == 1 and best.recognition.inliers < ALONE:
             return unknown(f"not sure: {words}, and no other node says the same")
         if all(one.lonely for one in first.sightings):
             return unknown(f"not sure: {words}, all on one thing, and nothing of what should be beside it")

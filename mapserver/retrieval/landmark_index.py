@@ -20,13 +20,6 @@ from mapweave.hybridmap.landmark_tables import DIMENSIONS
 from mapweave.mapserver.retrieval.coarse_quantizer import SAMPLE, CoarseQuantizer, Codes, Ids, Vectors
 from mapweave.mapserver.retrieval.inverted_file import Block, InvertedFile
 
-FILL = 100
-"""Landmarks in a cell when it is learned, on average."""
-MOST_CELLS = 1 << 18
-"""With as many, cells are not learned again: filling new ones takes the memory twice. These are learned at
-40 million landmarks, where twice is still less than a million nodes take once."""
-
-
 log = logging.getLogger(__name__)
 
 MOST_WITHIN = 256
@@ -68,6 +61,13 @@ class RemovedRows(NamedTuple):
     first: int
     last: int
     codes: Codes | None
+
+
+FILL = 100
+"""Landmarks in a cell when it is learned, on average."""
+MOST_CELLS = 1 << 18
+"""With as many, cells are not learned again: filling new ones takes the memory twice. These are learned at
+40 million landmarks, where twice is still less than a million nodes take once."""
 
 
 class LandmarkIndex:

@@ -14,11 +14,7 @@ from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import voting
 from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
-from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP, CandidateSettings
-
-REACH = 0.6
-"""Distance of two decoded descriptors at which a vote counts nothing."""
-
+from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
 
 SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
@@ -35,13 +31,11 @@ class PlaceIndexSettings:
     """How places are found.
 
     Attributes:
-        candidates: what counts as alike and how much overlap is worth noting.
         landmarks: how landmarks are found.
         votes: descriptors of the fleet that each feature of a view votes for.
         compared: nodes of a large fleet that are compared with one whose overlaps are wanted.
     """
 
-    candidates: CandidateSettings = field(default_factory=CandidateSettings)
     landmarks: LandmarkIndexSettings = field(default_factory=LandmarkIndexSettings)
     votes: int = 16
     compared: int = 64
@@ -55,6 +49,10 @@ def bounded(node: Node) -> Node:
     if len(node.landmarks) <= MOST_LANDMARKS:
         return node
     return replace(node, landmarks=node.landmarks.take(np.arange(MOST_LANDMARKS)))
+
+
+REACH = 0.6
+"""Distance of two decoded descriptors at which a vote counts nothing."""
 
 
 class PlaceIndex:
@@ -203,7 +201,7 @@ class PlaceIndex:
         Returns:
             Overlaps of at least `least_overlap`.
         """
-        _s, node = self._settings.candidates, bounded(node)
+        node = bounded(node)
         if len(node.landmarks) == 0 or len(self._landmarks) == 0:
             return {}
         with self._lock:

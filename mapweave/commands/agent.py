@@ -71,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.node import check_name
     from mapweave.processes.agent import AgentOptions, run_agent
+    from mapweave.settings import robot_settings
     from mapweave.wire.keys import check_epoch
 
     name = check_name(arguments.name)
@@ -90,7 +91,9 @@ def run(arguments: argparse.Namespace) -> int:
             body, _ = connect(replace(network, endpoints=(arguments.body,)))
         if body.wait_connected(SOON):
             claim = Claim(body, keys, name)
-        robot, synchronization = _robot(arguments, settings.robot, body, network.fleet, name)
+        robot, synchronization = _robot(
+            arguments, robot_settings(settings, arguments.settings), body, network.fleet, name
+        )
         # Who is told to stop while it waits for its body stops waiting.
         threading.Thread(target=_close_on, args=(stop, robot), name="stop", daemon=True).start()
         missions: dict[str, Mission] = {"explore": Explore(), "carried": Carried(), "idle": Idle()}
@@ -105,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
             synchronization=synchronization,
             server=network.server,
         )
-        run_agent(CheckedRobot(robot), bus, keys, settings.pipeline, options, stop)
+        run_agent(CheckedRobot(robot), bus, keys, settings.agent, options, stop)
     finally:
         if robot is not None:
             robot.close()

@@ -106,7 +106,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
     with Progress(console=console) as progress:
         task = progress.add_task("frames", total=len(replay))
         evaluated = evaluate_replay(
-            replay, settings_of(arguments).pipeline, truth, lambda frame: progress.advance(task)
+            replay, settings_of(arguments).agent, truth, lambda frame: progress.advance(task)
         )
     for written in evaluated.write(out):
         console.print(f"{written}", highlight=False)
@@ -132,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         check_output(arguments.out)
-    pipeline = settings_of(arguments).pipeline
+    pipeline = settings_of(arguments).agent
     console = Console(stderr=True)
     examination = evaluate_relocalization(
         arguments.folder, arguments.camera, arguments.focal, pipeline, console
@@ -167,14 +167,13 @@ def run_merge(arguments: argparse.Namespace) -> int:
     from mapweave.commands.network import settings_of
     from mapweave.evaluation.merging import evaluate_merging
     from mapweave.output_folder import check_output
-    from mapweave.settings import merge_settings
 
     settings = settings_of(arguments)
-    merge = merge_settings(settings, arguments.settings)
+    merge = settings.merge
     console = Console(stderr=True)
     if arguments.out is not None:
         check_output(arguments.out)
-    examination = evaluate_merging(arguments.folder, arguments.robots, settings.pipeline, merge, console)
+    examination = evaluate_merging(arguments.folder, arguments.robots, settings.agent, merge, console)
     report = examination.report()
     out = arguments.out or Path("out/eval-merge") / examination.name
     for path in examination.write(out):

@@ -12,8 +12,8 @@ from mapweave.commands.network import add_network
 if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import MapsExplanation, PairExplanation
     from mapweave.hybridmap.node import MapId, NodeId
-    from mapweave.merge.merging import MergeSettings
     from mapweave.merge.pose_graph.merged_map import MergedMap
+    from mapweave.merge.settings import MergeSettings
 
 
 def add_to(actions: Any) -> None:
@@ -109,8 +109,7 @@ def _merged(arguments: argparse.Namespace) -> tuple[MergedMap, MergeSettings]:
     """The merged map of a file, and the settings with which it is explained."""
     from mapweave.commands.network import settings_of
     from mapweave.mapserver.map_files import merged_of
-    from mapweave.settings import merge_settings
     from mapweave.storage.map_file import read_map_file
 
-    settings = merge_settings(settings_of(arguments), arguments.settings)
+    settings = settings_of(arguments).merge
     return merged_of(read_map_file(arguments.map), settings), settings

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.node import MapId
-    from mapweave.merge.merging import MergeSettings
     from mapweave.merge.pose_graph.merged_map import MergedMap
+    from mapweave.merge.settings import MergeSettings
 
 
 def add_to(actions: Any) -> None:
@@ -40,12 +40,11 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.merge.explanation.component_changes import joinings
     from mapweave.merge.explanation.map_explanation import explain_fleet
     from mapweave.offline_merge import parts_of
-    from mapweave.settings import merge_settings
     from mapweave.storage.atomic_file import check_place
     from mapweave.storage.map_file import read_map_file, write_map_file
 
     check_place(arguments.out)
-    settings = merge_settings(settings_of(arguments), arguments.settings)
+    settings = settings_of(arguments).merge
     parts = parts_of({path: read_map_file(path) for path in arguments.files})
     merged = merged_with_progress(parts.maps, parts.rulings, settings)
     write_map_file(arguments.out, map_file_of(merged, parts.history))

@@ -103,9 +103,8 @@ def explained_route(
     from mapweave.mapserver.map_files import merged_of
     from mapweave.mapserver.route_explaining import explain_route
     from mapweave.mapserver.routes import Router
-    from mapweave.settings import merge_settings
     from mapweave.storage.map_file import read_map_file
 
-    settings = merge_settings(settings_of(arguments), arguments.settings)
+    settings = settings_of(arguments).merge
     router = Router(merged_of(read_map_file(arguments.map), settings))
     return explain_route(router, start, goal, blocked)

@@ -88,12 +88,11 @@ def _rewrite(arguments: argparse.Namespace, ruling: ManualConstraint) -> None:
     from mapweave.mapserver.map_history import between
     from mapweave.merge.manual_constraints import check_manual_constraint
     from mapweave.offline_merge import parts_of
-    from mapweave.settings import merge_settings
     from mapweave.storage.atomic_file import check_place
     from mapweave.storage.map_file import read_map_file, write_map_file
 
     check_place(arguments.out or arguments.map)
-    settings = merge_settings(settings_of(arguments), arguments.settings)
+    settings = settings_of(arguments).merge
     content = read_map_file(arguments.map, "merged")
     before = merged_of(content, settings)
     check_manual_constraint(before, ManualConstraints(content.rulings), ruling)

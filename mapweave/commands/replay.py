@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus, keys = connect(network)
     try:
-        run_agent(robot, bus, keys, settings.pipeline, options, stop)
+        run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
         bus.close()
     return 0

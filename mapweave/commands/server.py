@@ -43,7 +43,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.node import check_name
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
-    from mapweave.settings import merge_settings
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
@@ -52,7 +51,6 @@ def run(arguments: argparse.Namespace) -> int:
     logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
     logging.getLogger("mapweave.mapserver").setLevel(logging.INFO)
     settings = settings_of(arguments)
-    merge = merge_settings(settings, arguments.settings)
     network = network_of(arguments, settings)
     name, keys = check_name(arguments.name or network.server), Keys(network.fleet)
     address = None
@@ -63,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:
-        how = ServerSettings(desk=settings.desk, merge=merge)
+        how = ServerSettings(settings.admission_control, settings.merge)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
             path = arguments.data / f"{name}.sqlite"

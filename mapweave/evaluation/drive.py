@@ -14,7 +14,8 @@ import numpy as np
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import RobotDescription
-from mapweave.agent.pipeline import Pipeline, PipelineSettings
+from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.verdict import LEVELS, Verdict
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
@@ -88,7 +89,7 @@ class DriveMap:
         covered: truth of all its images.
     """
 
-    def __init__(self, robot: Replay, truth: Truth, settings: PipelineSettings, ticks: Iterable[int]) -> None:
+    def __init__(self, robot: Replay, truth: Truth, settings: AgentSettings, ticks: Iterable[int]) -> None:
         """Map.
 
         Args:

@@ -15,7 +15,8 @@ from rich.progress import track
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
-from mapweave.agent.pipeline import Pipeline, PipelineSettings
+from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.settings import AgentSettings
 from mapweave.drawing.map_picture import MapPicture, draw_map
 from mapweave.evaluation.drive import Truth
 from mapweave.evaluation.map_score import FALSE_LINK, FALSE_LINK_TURN, link_recall, pose_error, score_map
@@ -25,10 +26,10 @@ from mapweave.hybridmap.errors import DeviceError, InvalidFile
 from mapweave.hybridmap.node import Edge, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.map_files import map_file_of
-from mapweave.mapserver.merging.merger import Merger, MergerSettings
-from mapweave.merge.merging import MergeSettings
+from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import write_map_file
 
 FALSE_SHARE = 0.1
@@ -146,7 +147,7 @@ class MergeEvaluation:
         return MapPicture(f"{title} ({wrong} false), ATE {score.ate:.2f} m", laid, edges, false=false)
 
 
-def changes(name: str, robot: Replay, settings: PipelineSettings) -> Iterator[list[Change]]:
+def changes(name: str, robot: Replay, settings: AgentSettings) -> Iterator[list[Change]]:
     """What a robot that is carried along adds to its map, image by image.
 
     One that cannot find itself on its map begins another, as a robot's process does.
@@ -166,7 +167,7 @@ def changes(name: str, robot: Replay, settings: PipelineSettings) -> Iterator[li
 
 
 def evaluate_merging(
-    folder: Path, robots: int | None, settings: PipelineSettings, merge: MergeSettings, console: Console
+    folder: Path, robots: int | None, settings: AgentSettings, merge: MergeSettings, console: Console
 ) -> MergeEvaluation:
     """Cut, map, merge.
 
@@ -182,7 +183,7 @@ def evaluate_merging(
     """
     cut = pieces(folder, robots)
     truth = Truth.read(folder / "truth.csv")
-    merger = Merger(settings=MergerSettings(merging=merge))
+    merger = Merger(settings=merge)
     images = {}
     for name, robot in cut.items():
         images[name] = len(robot)

@@ -33,18 +33,6 @@ from mapweave.storage.image_file import read_grey
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
-CANDIDATES = 8
-"""Places that are compared with a question."""
-APART = 2
-"""Places further from each other than so many images are not neighbours."""
-COMPARABLE = 0.6
-"""And with this share of the best one's inliers the other one makes it ambiguous."""
-
-
-@dataclass(frozen=True)
-class PhotographSettings:
-    """How questions are asked."""
-
 
 @dataclass(frozen=True)
 class Reference:
@@ -137,16 +125,21 @@ def rivals(inliers: Mapping[int, int], together: Callable[[int, int], bool], com
     return kept
 
 
+CANDIDATES = 8
+"""Places that are compared with a question."""
+APART = 2
+"""Places further from each other than so many images are not neighbours."""
+COMPARABLE = 0.6
+"""With this share of the best place's inliers another place makes the answer ambiguous."""
+
+
 class AppearanceMap:
     """Places by their appearance alone."""
 
-    def __init__(
-        self, camera: Camera, distortion: tuple[float, ...], settings: PhotographSettings | None = None
-    ):
+    def __init__(self, camera: Camera, distortion: tuple[float, ...]):
         """Begin with none, for a camera and its lens."""
         self._camera = camera
         self._sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
-        self._settings = settings or PhotographSettings()
         self._index = PlaceIndex()
         self._nodes: dict[int, Node] = {}
 

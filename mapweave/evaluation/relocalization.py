@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.progress import track
 
 from mapweave.agent.drivers.replay import Replay
-from mapweave.agent.pipeline import PipelineSettings
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_of
+from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.drive import DriveMap, Truth
 from mapweave.evaluation.photographs import AppearanceMap, Photographs
 from mapweave.evaluation.splits import robots_of
@@ -63,7 +63,7 @@ def evaluate_relocalization(
     folder: Path,
     camera_file: Path | None,
     focal_px: float | None,
-    settings: PipelineSettings,
+    settings: AgentSettings,
     console: Console,
 ) -> RelocalizationEvaluation:
     """Map from one pass, ask from the others.
@@ -92,7 +92,7 @@ def evaluate_relocalization(
     )
 
 
-def _examine_drive(folder: Path, settings: PipelineSettings, console: Console) -> RelocalizationEvaluation:
+def _examine_drive(folder: Path, settings: AgentSettings, console: Console) -> RelocalizationEvaluation:
     names = robots_of(folder / "splits.toml")
     if len(names) < 2:
         raise DeviceError(

@@ -13,10 +13,11 @@ import numpy as np
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
-from mapweave.agent.pipeline import Pipeline, PipelineSettings
+from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Stamps
 from mapweave.agent.recordings.trajectory_file import tum_line
+from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.drive import Truth
 from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.errors import DeviceError
@@ -148,7 +149,7 @@ def errors(poses: Array, true: Array, parts: Array) -> tuple[float | None, float
 
 def evaluate_replay(
     replay: Replay,
-    settings: PipelineSettings,
+    settings: AgentSettings,
     truth: Path | None,
     on_frame: Callable[[Frame], None] = lambda frame: None,
 ) -> ReplayEvaluation:
@@ -209,7 +210,7 @@ def true_poses(path: Path | None, stamps_ns: Stamps) -> Array:
     return out
 
 
-def _pipeline(number: int, description: Any, settings: PipelineSettings) -> Pipeline:
+def _pipeline(number: int, description: Any, settings: AgentSettings) -> Pipeline:
     pipeline = Pipeline(MapId("replay", number + 1), description, settings)
     pipeline.set_mission(Carried())
     return pipeline

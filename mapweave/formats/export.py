@@ -17,9 +17,9 @@ from mapweave.formats.map_part import MapPart
 from mapweave.hybridmap.node import Edge, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
-from mapweave.hybridmap.route import edge_cost
+from mapweave.hybridmap.route import RouteSettings, edge_cost
 from mapweave.mapserver.roadmap import IMPLIED, Roadmap
-from mapweave.mapserver.routes import NEAR, RouterSettings
+from mapweave.mapserver.routes import NEAR
 from mapweave.storage.atomic_file import write_whole
 
 FRAME = "map"
@@ -89,7 +89,6 @@ def export_geojson(part: MapPart, out: Path) -> list[Path]:
     Ids are unique over nodes and edges, as Nav2 wants them. The edges are those of our own routes, at
     the same cost: edges that only constrain poses are left out, and nodes at one place are joined.
     """
-    settings = RouterSettings()
     roads = Roadmap(part.merged, NEAR, ReachabilityCache())
     places = {node: part.pose(node) for node in part.nodes}
     features: list[dict[str, Any]] = []
@@ -104,7 +103,7 @@ def export_geojson(part: MapPart, out: Path) -> list[Path]:
     for edge in roads.union.edges.values():
         if edge.a not in places or edge.b not in places or edge.id in roads.closed:
             continue
-        cost = edge_cost(edge, places, True, settings.route)
+        cost = edge_cost(edge, places, True, RouteSettings())
         kind = edge.id.agent if edge.id.agent in IMPLIED else str(edge.kind)
         metadata = {"edge": str(edge.id), "kind": kind, **_link_numbers(part, edge)}
         for start, end in ((edge.a, edge.b), (edge.b, edge.a)):

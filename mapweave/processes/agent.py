@@ -16,7 +16,7 @@ from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission import Idle, Mission
 from mapweave.agent.observation import Observation, RobotDescription
-from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile
 from mapweave.agent.replication.epochs import newest_on_server, next_epoch
 from mapweave.agent.replication.journal import Journal
@@ -24,6 +24,7 @@ from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.agent.runner import Runner
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.node import NUMBER, MapId
@@ -86,7 +87,7 @@ class Agent:
         describe: Callable[[], RobotDescription],
         bus: Bus,
         keys: Keys,
-        settings: PipelineSettings,
+        settings: AgentSettings,
         options: AgentOptions,
         on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
         print_line: Callable[[str], None] = lambda line: None,
@@ -278,7 +279,7 @@ def run_agent(
     robot: Robot,
     bus: ZenohBus,
     keys: Keys,
-    settings: PipelineSettings,
+    settings: AgentSettings,
     options: AgentOptions,
     stop: threading.Event,
 ) -> None:

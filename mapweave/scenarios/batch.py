@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import MapweaveError, SettingsError
 from mapweave.scenarios.batch_table import Attempt, batch_json, batch_table
 from mapweave.scenarios.run import TrialOptions, run_trial
@@ -37,7 +37,7 @@ class BatchOptions:
     seeds: int
     out: Path
     processes: bool = True
-    settings: PipelineSettings = field(default_factory=PipelineSettings)
+    settings: AgentSettings = field(default_factory=AgentSettings)
     settings_file: Path | None = None
     film: bool = False
     json: bool = False

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.settings import AgentSettings
 from mapweave.scenarios.scenario import Scenario
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.wire.bus import Bus
@@ -33,7 +33,7 @@ class Stage:
     scenario: Scenario
     seed: int
     out: Path
-    settings: PipelineSettings
+    settings: AgentSettings
     settings_file: Path | None = None
 
     @property

@@ -16,7 +16,7 @@ from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
-from mapweave.settings import load_settings, merge_settings
+from mapweave.settings import load_settings
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.sim.ground_truth_service import GroundTruthService
 from mapweave.sim.keys import SimKeys
@@ -129,7 +129,7 @@ class LocalFleet:
         """Start the server with the disk that is there."""
         self._stage.store.parent.mkdir(parents=True, exist_ok=True)
         self._server_bus, file = MemoryBus(self._hub), self._stage.settings_file
-        settings = ServerSettings(merge=merge_settings(load_settings(file), file))
+        settings = ServerSettings(merge=load_settings(file).merge)
         schedule = LockstepSchedule()
         self._server = MapServer(self._server_bus, self.keys, self._stage.store, SERVER, settings, schedule)
         self._server.__enter__()

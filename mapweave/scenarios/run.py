@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.scenarios.disks import read_disks
 from mapweave.scenarios.expectations import Verdict, check
@@ -49,7 +49,7 @@ class TrialOptions:
     seed: int
     out: Path
     processes: bool = True
-    settings: PipelineSettings = field(default_factory=PipelineSettings)
+    settings: AgentSettings = field(default_factory=AgentSettings)
     settings_file: Path | None = None
     film_every: float = 1.0
     view: int | None = None

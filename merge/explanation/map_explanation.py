@@ -20,8 +20,9 @@ from mapweave.merge.explanation.node_explanation import node_of
 from mapweave.merge.explanation.own_edges import reach_words
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.pose_graph.verification import VerificationSettings, examine
+from mapweave.merge.pose_graph.verification import examine
 from mapweave.registration.matching import match
+from mapweave.registration.recognition import RecognitionSettings
 
 Pair = tuple[MapId, MapId]
 MOST_NEAR = 5
@@ -31,7 +32,7 @@ CLOSELY = 16
 
 
 def explain_maps(
-    merged: MergedMap, first: MapId, second: MapId, verification: VerificationSettings | None = None
+    merged: MergedMap, first: MapId, second: MapId, verification: RecognitionSettings | None = None
 ) -> MapsExplanation:
     """Explain two maps.
 
@@ -53,7 +54,7 @@ def explain_maps(
 
 
 def explain_fleet(
-    merged: MergedMap, most: int, verification: VerificationSettings | None = None
+    merged: MergedMap, most: int, verification: RecognitionSettings | None = None
 ) -> tuple[MapsExplanation, ...]:
     """Explain each two maps: those first that are not one, of these those with the most refused links.
 
@@ -115,7 +116,7 @@ def _explained(
     pair: Pair,
     found: _Between,
     joined: bool,
-    verification: VerificationSettings | None,
+    verification: RecognitionSettings | None,
     closely: bool,
 ) -> MapsExplanation:
     """Of two maps; only looked at closely are alike pairs compared once more."""
@@ -218,14 +219,14 @@ def _near(link: Link, words: str) -> NearMiss:
 
 
 def _most_alike(
-    merged: MergedMap, unverified: Sequence[RefusedLink], verification: VerificationSettings | None
+    merged: MergedMap, unverified: Sequence[RefusedLink], verification: RecognitionSettings | None
 ) -> tuple[NearMiss, ...]:
     """Pairs without a common pose that share the most alike landmarks, compared once more."""
-    s = verification or VerificationSettings()
+    s = verification or RecognitionSettings()
     alike: list[tuple[int, NodeId, NodeId, str]] = []
     for refusal in unverified:
         a, b = node_of(merged, refusal.a), node_of(merged, refusal.b)
-        matches = match(a.landmarks.codes, b.landmarks.codes, s.recognition.matching)
+        matches = match(a.landmarks.codes, b.landmarks.codes, s.matching)
         alike.append((len(matches), a.id, b.id, refusal.reason))
     alike.sort(key=lambda item: (-item[0], item[1:]))
     out = []

@@ -17,24 +17,22 @@ from mapweave.merge.explanation.own_edges import claims, consequences, own_edge,
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import prior_odds, probability, standpoints
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
-from mapweave.merge.outlier_rejection.pairwise_consistency import (
-    ConsistencySettings,
-    group_links,
-    loop_distances2,
-)
+from mapweave.merge.outlier_rejection.pairwise_consistency import group_links, loop_distances2
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.fragments import fragment_by_node
 from mapweave.merge.pose_graph.links import Link, RefusedLink, link_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.pose_graph.verification import VerificationSettings, examine, verify
+from mapweave.merge.pose_graph.verification import examine, verify
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.matching import match
+from mapweave.registration.recognition import RecognitionSettings
 
 
 def explain_nodes(
     merged: MergedMap,
     a: NodeId,
     b: NodeId,
-    verification: VerificationSettings | None = None,
+    verification: RecognitionSettings | None = None,
     consistency: ConsistencySettings | None = None,
 ) -> PairExplanation:
     """Explain two nodes.
@@ -88,7 +86,7 @@ def _verdict(
     own: Edge | None,
     refusal: RefusedLink | None,
     witnesses: tuple[Witness, ...],
-    verification: VerificationSettings | None,
+    verification: RecognitionSettings | None,
 ) -> tuple[Standing, str]:
     """What has become of two nodes, and why, in words."""
     one, two = ends
@@ -138,14 +136,14 @@ def residuals_px(a: Node, b: Node, a_from_b: Pose2, shared: NDArray[np.int64]) -
 
 
 def _looked_at(
-    a: Node, b: Node, link: Link | None, verification: VerificationSettings | None
+    a: Node, b: Node, link: Link | None, verification: RecognitionSettings | None
 ) -> PairExplanation:
     """What the landmarks say. A link brings its pose; else the nodes are compared again.
 
     So what the merge refused because too little agrees is told with the little that does.
     """
-    s = verification or VerificationSettings()
-    matches = match(a.landmarks.codes, b.landmarks.codes, s.recognition.matching)
+    s = verification or RecognitionSettings()
+    matches = match(a.landmarks.codes, b.landmarks.codes, s.matching)
     nothing = np.zeros((0, 2), np.int64)
     out = PairExplanation(a, b, Standing.UNCOMPARED, "", matches, nothing, np.zeros(0))
     if link is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.pose_graph.verification import VerificationSettings, verify
+from mapweave.merge.pose_graph.verification import verify
 from mapweave.registration.matching import match
 
 MOST = 200_000
@@ -14,13 +14,8 @@ MOST = 200_000
 class Comparisons:
     """What was found of pairs of nodes, as long as the two are known just so."""
 
-    def __init__(self, settings: VerificationSettings | None = None) -> None:
-        """Nothing is compared yet.
-
-        Args:
-            settings: when two nodes are linked.
-        """
-        self._settings = settings or VerificationSettings()
+    def __init__(self) -> None:
+        """Nothing is compared yet."""
         self._cache: dict[tuple[NodeId, NodeId], tuple[Node, Node, Link | None]] = {}
 
     def link(self, a: Node, b: Node, least: int) -> Link | None:
@@ -40,6 +35,6 @@ class Comparisons:
         return entry[2]
 
     def _verified(self, a: Node, b: Node, least: int) -> Link | None:
-        alike = match(a.landmarks.codes, b.landmarks.codes, self._settings.recognition.matching)
-        verdict = verify(a, b, self._settings) if len(alike) >= least else None
+        alike = match(a.landmarks.codes, b.landmarks.codes)
+        verdict = verify(a, b) if len(alike) >= least else None
         return verdict if isinstance(verdict, Link) else None

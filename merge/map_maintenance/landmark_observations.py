@@ -20,26 +20,11 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.projected_view import ProjectedView
 from mapweave.registration.matching import squared_distances
 
-MARGIN_PX = 12.0
-"""It should be seen if it projects this far inside the image."""
-SCALE = 1.6
-"""And if its distance has changed by at most this factor."""
-ASIDE = math.radians(25.0)
-"""And if it is seen from a direction that differs by at most this, rad."""
-BEFORE_PX = 12.0
-"""Something hides it that is seen this near to it in the image."""
-BEFORE = 0.8
-"""At less than this share of its distance."""
 NEAR_PX = 25.0
-"""It is found again this near to where it projects."""
+"""A landmark is found again this near to where it projects, px,"""
 ALIKE = 0.3
-"""By a descriptor that is at most this far from its own; of two that have nothing to do with each other one
+"""by a descriptor that is at most this far from its own; of two that have nothing to do with each other one
 in a hundred is, in a whole image."""
-
-
-@dataclass(frozen=True)
-class LandmarkObservationSettings:
-    """When a landmark should be seen, and when it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +50,7 @@ class LandmarkObservations:
     sure: bool = True
 
     @staticmethod
-    def of(
-        node: Node, view: Node, link: Link | None, node_from_view: Pose2, s: LandmarkObservationSettings
-    ) -> LandmarkObservations:
+    def of(node: Node, view: Node, link: Link | None, node_from_view: Pose2) -> LandmarkObservations:
         """Search for a node's landmarks in a view.
 
         Args:
@@ -75,9 +58,8 @@ class LandmarkObservations:
             view: of its place.
             link: between the two, if there is one.
             node_from_view: relative pose.
-            s: when a landmark should be seen, and when it is.
         """
-        shown = expected(node, view, node_from_view, s)
+        shown = expected(node, view, node_from_view)
         found = np.zeros(len(node.landmarks), np.bool_)
         if link is not None:
             found[link.shared[:, 0 if link.a == node.id else 1]] = True
@@ -92,14 +74,25 @@ class LandmarkObservations:
         return LandmarkObservations(node, view, link, node_from_view, shown, found)
 
 
-def expected(old: Node, new: Node, old_from_new: Pose2, s: LandmarkObservationSettings) -> NDArray[np.bool_]:
+MARGIN_PX = 12.0
+"""A landmark should be seen if it projects this far inside the image, px,"""
+SCALE = 1.6
+"""if its distance has changed by at most this factor,"""
+ASIDE = math.radians(25.0)
+"""and if it is seen from a direction that differs by at most this, rad."""
+BEFORE_PX = 12.0
+"""A landmark of the view hides it that is this near to it in the image, px,"""
+BEFORE = 0.8
+"""and at less than this share of its distance."""
+
+
+def expected(old: Node, new: Node, old_from_new: Pose2) -> NDArray[np.bool_]:
     """(N,) which landmarks of a node another view should show.
 
     Args:
         old: the node.
         new: the view.
         old_from_new: relative pose.
-        s: when a landmark should be seen.
     """
     projection = ProjectedView.of(old, new, old_from_new, MARGIN_PX, SCALE, ASIDE)
     shown, candidates = projection.fits, np.flatnonzero(projection.fits)

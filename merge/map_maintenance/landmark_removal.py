@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,82 +31,52 @@ from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.map_maintenance.changed_nodes import ChangedNodes
-from mapweave.merge.map_maintenance.landmark_observations import (
-    LandmarkObservations,
-    LandmarkObservationSettings,
-)
+from mapweave.merge.map_maintenance.landmark_observations import LandmarkObservations
 from mapweave.merge.map_maintenance.node_age import is_older
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
-RATES = (0.1, 0.9)
-"""Within which the share is held that a view finds of what it should show."""
+MOVED = 0.05
+"""Two nodes may move to each other by this before their views are compared anew, m."""
+
+
 LEAST_SHOWN = 15
 """A view that should show fewer landmarks is not used."""
 SURE = (0.05, 0.05, 0.03)
-"""M, m and rad, nor does one that the merged map does not place within one sigma of this."""
-WEIGHT = 15.0
-"""With the weight of so many landmarks."""
+"""A view tells nothing that the merged map does not place within one sigma of this, m, m and rad."""
 THING = 0.3
-"""M, landmarks that are nearer than this to each other go together."""
-HIDDEN = 0.05
-"""Probability that a thing is occluded during a visit by something unmapped."""
-MISTAKEN = 0.01
-"""Probability that a landmark that is gone is found all the same."""
-GOES = 0.02
-"""Probability that a landmark has gone from one visit to the next."""
-COMES = 0.02
-"""That one that had gone is back."""
-AT_FIRST = 0.95
-"""Probability that it was really there when it was mapped."""
+"""Landmarks that are nearer than this to each other go together, m."""
 FAINT = 0.2
 """A landmark that is there with less than this has faded."""
 NEAR = 2.5
-"""M, views of a place that are not linked with it are within this."""
+"""Views of a place that are not linked with it are within this, m."""
 TURNED = math.radians(45.0)
-"""Rad, and are turned by at most this."""
+"""Views of a place that are not linked with it are turned by at most this, rad."""
 MOST = 12
-"""So many of them are used, the newest."""
+"""Views of a place that are looked at without a link, the newest."""
 AGAIN = 120.0
-"""S, views of one map that lie nearer in time are of one visit."""
+"""Views of one map that lie nearer in time are of one visit, s."""
 
 
 SECOND = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class LandmarkRemovalSettings:
-    """When a landmark has faded.
-
-    Attributes:
-        looks: when it should be seen, and when it is.
-        usual: share of what it should show that a view finds, as far as it tells nothing better,
-        moved: m, by which two nodes may move to each other before their views are compared anew.
-    """
-
-    looks: LandmarkObservationSettings = field(default_factory=LandmarkObservationSettings)
-    usual: float = 0.1
-    moved: float = 0.05
-
-
 class LandmarkRemover:
     """Keeps the landmark observations from merged map to merged map: each view is compared once."""
 
-    def __init__(self, settings: LandmarkRemovalSettings | None = None) -> None:
+    def __init__(self) -> None:
         """Begin with nothing seen again.
 
         Args:
             settings: when a landmark has faded.
         """
-        self._settings = settings or LandmarkRemovalSettings()
-        s = self._settings
         self._observations: dict[NodeId, list[LandmarkObservations]] = {}
         self._faded: dict[NodeId, NDArray[np.bool_]] = {}
         self._graphs: tuple[PoseGraph, ...] = ()
         self._links = Adjacency()
         # Each of two nodes may move by a part of `moved`, before and after their comparison.
-        self._drift = ChangedNodes(s.moved / 8.0, s.moved / (4.0 * NEAR))
+        self._drift = ChangedNodes(MOVED / 8.0, MOVED / (4.0 * NEAR))
 
     def fade(self, merged: MergedMap) -> MergedMap:
         """The same map with the faded landmarks of its active nodes.
@@ -128,7 +98,7 @@ class LandmarkRemover:
 
     def _fade(self, merged: MergedMap, graph: PoseGraph) -> None:
         nodes = [merged.maps[node.map].nodes[node] for node in graph.nodes]
-        tree, s = cKDTree(graph.means[:, :2]), self._settings
+        tree = cKDTree(graph.means[:, :2])
         for row in self._affected(graph, nodes, tree, merged.superseded):
             node = nodes[row]
             linked = {link.b if link.a == node.id else link.a: link for link in self._links.at(node.id)}
@@ -141,8 +111,7 @@ class LandmarkRemover:
             faded = (
                 presence(
                     things(node, THING),
-                    [observation for observation in observations if is_informative(observation, s)],
-                    s,
+                    [observation for observation in observations if is_informative(observation)],
                 )
                 < FAINT
             )
@@ -196,7 +165,6 @@ class LandmarkRemover:
         self, merged: MergedMap, graph: PoseGraph, node: Node, views: list[Node], linked: dict[NodeId, Link]
     ) -> list[LandmarkObservations]:
         """Observations by the views; earlier ones are kept while the relative poses have not changed."""
-        s = self._settings
         before = {id(observation.view): observation for observation in self._observations.get(node.id, ())}
         observations: list[LandmarkObservations] = []
         unlinked: list[int] = []
@@ -209,7 +177,7 @@ class LandmarkRemover:
                 or observation.link is not link
                 or self._off(observation, between)
             ):
-                observation = LandmarkObservations.of(node, view, link, between, s.looks)
+                observation = LandmarkObservations.of(node, view, link, between)
                 if link is None and observation.expected.sum() >= LEAST_SHOWN:
                     unlinked.append(len(observations))
             observations.append(observation)
@@ -222,10 +190,10 @@ class LandmarkRemover:
 
     def _off(self, observation: LandmarkObservations, between: Pose2) -> bool:
         off = observation.between.inverse() @ between
-        return max(off.distance(Pose2()), abs(off.heading)) >= self._settings.moved
+        return max(off.distance(Pose2()), abs(off.heading)) >= MOVED
 
 
-def is_informative(observation: LandmarkObservations, s: LandmarkRemovalSettings) -> bool:
+def is_informative(observation: LandmarkObservations) -> bool:
     """Whether a view is informative: it should show enough landmarks, and its pose is certain."""
     return int(observation.expected.sum()) >= LEAST_SHOWN and observation.sure
 
@@ -242,15 +210,24 @@ def things(node: Node, size: float) -> NDArray[np.bool_]:
     return together
 
 
-def presence(
-    together: NDArray[np.bool_], observations: Sequence[LandmarkObservations], s: LandmarkRemovalSettings
-) -> Array:
+HIDDEN = 0.05
+"""Probability that a thing is hidden during a visit by what nobody knows of."""
+MISTAKEN = 0.01
+"""Probability that a landmark that is gone is found all the same."""
+GOES = 0.02
+"""Probability that a landmark has gone from one visit to the next."""
+COMES = 0.02
+"""Probability that a landmark that had gone is back at the next visit."""
+AT_FIRST = 0.95
+"""Probability that it was really there when it was mapped."""
+
+
+def presence(together: NDArray[np.bool_], observations: Sequence[LandmarkObservations]) -> Array:
     """(N,) probability that each landmark of a node is still there after some views.
 
     Args:
         together: (N, N) which of them may be of one thing, see `things`.
         observations: informative later views of it, the earliest first.
-        s: how landmarks come and go.
     """
     present = np.full(len(together), AT_FIRST)
     for visit in visits(observations, AGAIN):
@@ -259,7 +236,7 @@ def presence(
         informed = np.zeros(len(together), np.bool_)
         for observation in visit:
             again = observation.found & observation.expected
-            rate = detection_rate(together, observation, s)
+            rate = detection_rate(together, observation)
             # A found landmark is present, regardless of its neighbours; a missed one is judged with its
             # thing.
             found = np.where(observation.found, 1, together @ again.astype(np.int64))
@@ -294,9 +271,15 @@ def visits(observations: Sequence[LandmarkObservations], again: float) -> list[l
     return grouped
 
 
-def detection_rate(
-    together: NDArray[np.bool_], observation: LandmarkObservations, s: LandmarkRemovalSettings
-) -> float:
+USUAL = 0.1
+"""Prior share of the landmarks it should show that a view finds."""
+RATES = (0.1, 0.9)
+"""Bounds of that share."""
+WEIGHT = 15.0
+"""Landmarks that the prior share weighs as much as."""
+
+
+def detection_rate(together: NDArray[np.bool_], observation: LandmarkObservations) -> float:
     """How often a view finds a landmark that it should show and that is there.
 
     Measured on landmarks of which another one of the same thing is found, if there are enough: so absent
@@ -305,10 +288,9 @@ def detection_rate(
     Args:
         together: (N, N) which landmarks may be of one thing.
         observation: of the view.
-        s: within which bounds.
     """
     again = observation.found & observation.expected
     others_found: NDArray[np.int64] = together @ again.astype(np.int64) - again
     firm = observation.expected & (others_found > 0)
-    rate = ((again & firm).sum() + s.usual * WEIGHT) / (firm.sum() + WEIGHT)
+    rate = ((again & firm).sum() + USUAL * WEIGHT) / (firm.sum() + WEIGHT)
     return float(np.clip(rate, *RATES))

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.hybridmap.reachability import FARTHEST, STOPS, WIDEST, ReachabilitySettings, least_in_view
+from mapweave.hybridmap.reachability import FARTHEST, STOPS, WIDEST, least_in_view
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.merge.map_maintenance.adjacency import Adjacency
@@ -32,38 +32,12 @@ from mapweave.merge.map_maintenance.traversability import ForeignEdges, Traversa
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
-from mapweave.merge.pose_graph.verification import VerificationSettings
 
-DEPTHS = 0.7
-"""It knows at least this share of the number of depths that the other one knows."""
-ENOUGH = 60
-"""Or at least this many."""
-AGAIN = 120.0
-"""S, that lie between them if both belong to one map: views of one visit complete each other."""
-GATE = 16.3
-"""Chi-square with 3 degrees of freedom within which such a comparison agrees with the merged map."""
-FLOOR = (0.05, 0.05, 0.03)
-"""M, m and rad, error of both beyond the covariances."""
+NEAR = 0.5
+"""Nodes nearer than this to each other stand in one place, as for routes, m."""
 
 
 SECOND = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class NodeSupersedingSettings:
-    """When a node stands for another one.
-
-    Attributes:
-        reach: the servo's basin: from one node it brings a robot to the successor.
-        found: landmarks that both show and that stay in view between them.
-        detour: m, by which a way between neighbours may become longer.
-        near: m, nodes nearer than this to each other stand in one place, as for routes.
-    """
-
-    reach: ReachabilitySettings = field(default_factory=ReachabilitySettings)
-    found: int = 20
-    detour: float = 1.5
-    near: float = 0.5
 
 
 class NodeSuperseder:
@@ -71,19 +45,14 @@ class NodeSuperseder:
 
     def __init__(
         self,
-        settings: NodeSupersedingSettings | None = None,
-        verification: VerificationSettings | None = None,
         reaches: ReachabilityCache | None = None,
     ) -> None:
         """Begin with nothing superseded.
 
         Args:
-            settings: when a node is.
-            verification: as in the merge.
             reaches: cache of reachability; it is filled.
         """
-        self._settings = settings or NodeSupersedingSettings()
-        self._comparisons = Comparisons(verification)
+        self._comparisons = Comparisons()
         self._reaches = reaches or ReachabilityCache()
         self._superseded: dict[NodeId, Superseded] = {}
         self._nodes_seen: dict[NodeId, Node] = {}
@@ -113,10 +82,9 @@ class NodeSuperseder:
                 del self._superseded[node]
                 fresh |= {node} & nodes.keys()
         if nodes:
-            s = self._settings
             foreign = self._foreign.of(merged.maps)
             traversability = Traversability(
-                merged, self._links, self._reaches, s.near, foreign, self._superseded
+                merged, self._links, self._reaches, NEAR, foreign, self._superseded
             )
             round_ = _Round(
                 merged,
@@ -126,7 +94,6 @@ class NodeSuperseder:
                 self._blocking,
                 traversability,
                 self._comparisons,
-                s,
             )
             round_.update(fresh | round_.reinstate())
         return replace(merged, superseded=dict(sorted(self._superseded.items())))
@@ -151,6 +118,23 @@ class NodeSuperseder:
         }
 
 
+FOUND = 20
+"""Landmarks that both show and that stay in view between them."""
+DETOUR = 1.5
+"""A way between neighbours may become longer by this, m."""
+DEPTHS = 0.7
+"""A node that stands for another knows at least this share of the number of depths that the other knows,"""
+ENOUGH = 60
+"""or at least this many."""
+AGAIN = 120.0
+"""Nodes of one map stand for each other only if this much time lies between them, s: views of one visit
+complete each other."""
+GATE = 16.3
+"""Chi-square with 3 degrees of freedom within which a comparison of two nodes bears out the merged map."""
+FLOOR = (0.05, 0.05, 0.03)
+"""Error of comparison and map that no covariance tells of, m, m and rad."""
+
+
 class _Round:
     """One merged map's worth of work on the table of what is superseded."""
 
@@ -163,10 +147,8 @@ class _Round:
         blocking: dict[NodeId, NodeId],
         traversability: Traversability,
         comparisons: Comparisons,
-        settings: NodeSupersedingSettings,
     ) -> None:
         self._merged, self._nodes, self._superseded, self._blocking = merged, nodes, superseded, blocking
-        self._settings = settings
         self._comparisons = comparisons
         self._links = links
         self._refused = {refusal.pair for refusal in merged.refused if refusal.edge is None}
@@ -239,7 +221,7 @@ class _Round:
                 return
             successors[covered] = replacement
         successor = self._find_successor(node, node)
-        if successor is None or not self._traversability.spare(node, successor.by, self._settings.detour):
+        if successor is None or not self._traversability.spare(node, successor.by, DETOUR):
             return
         self._traversability.remove(node)
         self._covered.pop(node, None)
@@ -272,7 +254,7 @@ class _Round:
 
     def _covers(self, covered: NodeId, successor: NodeId, between: Pose2) -> Superseded | None:
         """Whether a node within the basin can supersede another."""
-        s, a, b = self._settings, self._nodes[covered], self._nodes[successor]
+        a, b = self._nodes[covered], self._nodes[successor]
         if self._same_visit(a, b):
             return None
         if b.landmarks.has_depth.sum() < min(DEPTHS * a.landmarks.has_depth.sum(), ENOUGH):
@@ -282,16 +264,16 @@ class _Round:
             return None
         link = link if link.a == covered else link.turned()
         in_view = least_in_view(link.shared, a, b, between, STOPS)
-        if in_view < s.found:
+        if in_view < FOUND:
             return None
         return Superseded(successor, in_view, between.distance(Pose2()), abs(between.heading))
 
     def _compare(self, a: Node, b: Node) -> Link | None:
         """A link between two nodes that the merge had no need to compare; one that it refused is none."""
-        s, pair = self._settings, _ordered(a.id, b.id)
+        pair = _ordered(a.id, b.id)
         if pair in self._refused:
             return None
-        verdict = self._comparisons.link(a, b, s.found)
+        verdict = self._comparisons.link(a, b, FOUND)
         if verdict is None:
             return None
         off = (verdict.a_from_b.mean.inverse() @ self._between(*verdict.pair)).vector

@@ -10,8 +10,8 @@ import scipy.special
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
+from mapweave.merge.settings import ExclusionSettings
 
 WINDOW = 2.0
 """Moments within this time count as one observation, s."""

@@ -26,18 +26,16 @@ from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.encounter import Encounter
 from mapweave.merge.mutual_exclusion.mutual_visibility import errors_in_common, none_wrong, odds_against
-from mapweave.merge.mutual_exclusion.negative_evidence import negative_evidence
+from mapweave.merge.mutual_exclusion.negative_evidence import MOST, negative_evidence
 from mapweave.merge.mutual_exclusion.quadrature import SAMPLES, quadrature_points
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, Stay, stay
 from mapweave.merge.mutual_exclusion.visibility_intervals import visibility_intervals
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ExclusionSettings
 
 SIGMAS = 2.0
 """The poses of the two are first moved apart by this many standard deviations, since their errors are common
 to all moments."""
-STEP = 0.5
-"""Interval of the moments between nodes that are tested, s."""
 
 
 def clash_of(
@@ -61,7 +59,7 @@ def clash_of(
     # Covariances cost more than all the rest, and views more than the sensors: they are computed only if the
     # poses as they are collide, and could be enough.
     meeting, clear, odds, still = met.meeting, met.clear, met.odds, np.ones(1)
-    if not meeting.refuses(clear, odds, still, s, math.log(s.absence.most)):
+    if not meeting.refuses(clear, odds, still, s, math.log(MOST)):
         return None
     # Nor for all observations, where the first of them are enough.
     ample = meeting.ample(clear, odds, s)
@@ -71,24 +69,24 @@ def clash_of(
     clear = chances_clear(met.apart, shift, met.spreads, least_apart)
     for some in sorted({ample, len(meeting.times)}):
         part = replace(meeting, seen=meeting.seen.take(meeting.seen.moments < some))
-        errors = errors_in_common(graph, part.seen, s.sight) if len(part.seen) else none_wrong(part.seen)
-        moved = odds_against(part.seen, errors, least_apart, s.sight)
+        errors = errors_in_common(graph, part.seen) if len(part.seen) else none_wrong(part.seen)
+        moved = odds_against(part.seen, errors, least_apart)
         if part.refuses(clear, moved, errors.weights, s):
             evidence = sum(part.evidence(clear, moved, errors.weights, s))
             return _clash(
                 graph, (first, second), meeting, odds[0] if by_visibility > by_footprints else None, evidence
             )
-    if not part.refuses(clear, moved, errors.weights, s, math.log(s.absence.most)):
+    if not part.refuses(clear, moved, errors.weights, s, math.log(MOST)):
         return None
-    views = negative_evidence(graph, first, second, s.absence)
-    absent = views.evidence(s.absence)
+    views = negative_evidence(graph, first, second)
+    absent = views.evidence()
     if not part.refuses(clear, moved, errors.weights, s, absent):
         return None
     evidence = sum(part.evidence(clear, moved, errors.weights, s)) + absent
     clash = _clash(
         graph, (first, second), meeting, odds[0] if by_visibility > by_footprints else None, evidence
     )
-    return replace(clash, blank=int(views.show_nothing(s.absence).sum()))
+    return replace(clash, blank=int(views.show_nothing().sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +112,10 @@ class _Met:
     two: Stay
 
 
+STEP = 0.5
+"""Moments between nodes are looked at as often as this, s."""
+
+
 def _met(
     graph: PoseGraph, first: BodyTrajectory, second: BodyTrajectory, s: ExclusionSettings
 ) -> _Met | None:
@@ -125,7 +127,7 @@ def _met(
     times = np.unique(np.concatenate([first.times, second.times, grid]))
     times = times[(times >= start) & (times <= end)]
     first_stay, second_stay = (
-        stay(trajectory, trajectory.poses(graph)[:, :2], times, s.trail) for trajectory in (first, second)
+        stay(trajectory, trajectory.poses(graph)[:, :2], times) for trajectory in (first, second)
     )
     radii_known = first.radius > 0.0 and second.radius > 0.0
     least_apart = first.radius + second.radius if radii_known else s.least_apart
@@ -140,7 +142,7 @@ def _met(
         return None
     spreads = (first_stay.spreads + second_stay.spreads)[close]
     clear = chances_clear(apart[close], np.zeros(len(close)), spreads, least_apart)
-    odds = odds_against(intervals, none_wrong(intervals), least_apart, s.sight)
+    odds = odds_against(intervals, none_wrong(intervals), least_apart)
     meeting = Encounter(times, both_known, distances, close, intervals, least_apart)
     return _Met(meeting, apart[close], spreads, clear, odds, first_stay, second_stay)
 

@@ -41,31 +41,6 @@ from mapweave.merge.mutual_exclusion.quadrature import quadrature_points
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
-MISSED = 0.1
-"""Largest share of observations in which the sensors miss a robot in their way."""
-SCENERY = 0.2
-"""How often something else ends a ray where the robot would have been."""
-MARGIN = 0.1
-"""A ray went on if it is longer by more than this than where it would have met the robot, m."""
-MARGIN_SHARE = 0.05
-"""And by this share of it."""
-SIGMAS = (0.0, 1.0, 2.0, 3.0)
-"""The poses are moved by so many standard deviations, in every direction."""
-
-
-@dataclass(frozen=True)
-class MutualVisibilitySettings:
-    """What a robot should have seen.
-
-    Attributes:
-        core: a ray surely meets a robot if it comes as near to its middle as this share of its radius: few
-            robots are round, but a square hides this much to four of five sides.
-        floor_xy: error of how the two maps lie to each other that no covariance tells of, m.
-    """
-
-    core: float = 0.8
-    floor_xy: float = 0.03
-
 
 @dataclass(frozen=True, eq=False)
 class Errors:
@@ -91,17 +66,23 @@ def none_wrong(intervals: VisibilityInterval) -> Errors:
     return Errors(np.zeros((1, len(intervals), 2)), np.zeros((len(intervals), 2, 2)), np.ones(1))
 
 
-def errors_in_common(
-    graph: PoseGraph, intervals: VisibilityInterval, settings: MutualVisibilitySettings | None = None
-) -> Errors:
+FLOOR_XY = 0.03
+"""Error of how the two maps lie to each other that no covariance tells of, m."""
+SIGMAS = (0.0, 1.0, 2.0, 3.0)
+"""The poses are moved by so many standard deviations, in every direction."""
+
+
+def errors_in_common(graph: PoseGraph, intervals: VisibilityInterval, floor_xy: float = FLOOR_XY) -> Errors:
     """The principal components of the errors common to all observations.
 
     Args:
         graph: of the nodes.
         intervals: at least one observation.
-        settings: the shifts are `sigmas` standard deviations along each component and between them.
+        floor_xy: error of how the two maps lie to each other that no covariance tells of, m.
+
+    Returns:
+        Shifts of SIGMAS standard deviations along each component and between them.
     """
-    s = settings or MutualVisibilitySettings()
     rows = np.unique(np.concatenate([intervals.observers, intervals.others]))
     joint = graph.covariance([graph.nodes[k] for k in rows]).reshape(3 * len(rows), -1)
     headings = graph.means[:, 2]
@@ -120,7 +101,7 @@ def errors_in_common(
     agents = np.array([graph.nodes[row].agent for row in intervals.others])
     apart = np.kron(np.where(agents == agents[0], 1.0, -1.0)[:, None], np.eye(2))
     root = np.linalg.cholesky(joint + 1e-10 * np.eye(len(joint)))
-    factor = np.hstack([design @ root, s.floor_xy * apart])
+    factor = np.hstack([design @ root, floor_xy * apart])
     # There are many more observations than nodes, so the principal components come from the smaller side.
     count = min(MODES, *factor.shape)
     _, vectors = scipy.linalg.eigh(
@@ -163,7 +144,6 @@ def odds_against(
     intervals: VisibilityInterval,
     errors: Errors,
     least_apart: float,
-    settings: MutualVisibilitySettings | None = None,
 ) -> Array:
     """(S, M) odds against the merge of each observation, for each mode of the pose errors.
 
@@ -171,24 +151,26 @@ def odds_against(
         intervals: the observations.
         errors: the ways.
         least_apart: the robots' middles are never nearer than this, m.
-        settings: what is expected of sensors.
     """
-    s = settings or MutualVisibilitySettings()
     samples = quadrature_points(intervals.spreads + errors.rest)
     out: Array = np.array(
         [
-            _odds(intervals, intervals.offsets[:, None] + shift[:, None] + samples, least_apart, s)
+            _odds(intervals, intervals.offsets[:, None] + shift[:, None] + samples, least_apart)
             for shift in errors.shifts
         ]
     )
     return out
 
 
-def _odds(
-    intervals: VisibilityInterval, places: Array, least_apart: float, s: MutualVisibilitySettings
-) -> Array:
+MISSED = 0.1
+"""Share of looks, at most, in which the sensors miss a robot that stands in their way."""
+SCENERY = 0.2
+"""How often something else ends a ray where the robot would have been."""
+
+
+def _odds(intervals: VisibilityInterval, places: Array, least_apart: float) -> Array:
     """(M,) odds against the merge if the other one was equally likely at each of (M, D, 2) places, m."""
-    passed, ended = _outcomes(intervals, places, s)
+    passed, ended = _outcomes(intervals, places)
     possible = np.hypot(places[..., 0], places[..., 1]) >= least_apart
     on = (passed & possible).sum(axis=1)
     ended_inside = (ended & ~passed & possible).sum(axis=1)
@@ -199,23 +181,30 @@ def _odds(
     return out
 
 
-def _outcomes(
-    intervals: VisibilityInterval, places: Array, s: MutualVisibilitySettings
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+CORE = 0.8
+"""A ray surely meets a robot if it comes as near to its middle as this share of its radius: few robots are
+round, but a square hides this much to four of five sides."""
+MARGIN = 0.1
+"""A ray went on if it is longer by more than this than where it would have met the robot, m."""
+MARGIN_SHARE = 0.05
+"""The same as a share of that distance."""
+
+
+def _outcomes(intervals: VisibilityInterval, places: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(M, D) whether a ray went on where it would have met the other one, and whether one ended there."""
     middles = places.mean(axis=1)
     wander = np.hypot(*(places - middles[:, None]).transpose(2, 0, 1)).max(axis=1)
     u, middle = intervals.directions, middles[intervals.looks]
     across = np.abs(u[:, 0] * middle[:, 1] - u[:, 1] * middle[:, 0])
     along = (u * middle).sum(axis=1)
-    reach = (s.core * intervals.radii + wander)[intervals.looks]
+    reach = (CORE * intervals.radii + wander)[intervals.looks]
     may_meet = np.flatnonzero((across < reach) & (along > -reach) & (intervals.lengths > along - 2.0 * reach))
     rows, u, lengths = intervals.looks[may_meet], u[may_meet], intervals.lengths[may_meet, None]
     x, y = places[rows, :, 0], places[rows, :, 1]
     along = u[:, :1] * x + u[:, 1:] * y
     across2 = (u[:, :1] * y - u[:, 1:] * x) ** 2
     radii = intervals.radii[rows, None]
-    core = (s.core * radii) ** 2 - across2
+    core = (CORE * radii) ** 2 - across2
     meets = (core > 0.0) & (along > 0.0)
     first = along - np.sqrt(np.maximum(radii**2 - across2, 0.0))
     last = along - np.sqrt(np.maximum(core, 0.0))

@@ -33,53 +33,18 @@ from mapweave.merge.pose_graph.projected_view import ProjectedView
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.matching import match
 
-NEAR = 1.5
-"""A view is held against nodes at most so far away, m."""
-TURN = math.radians(50.0)
-"""With headings that differ by at most this, rad."""
-LASTING = 3600.0
-"""And were made at most so much earlier or later, s."""
-MOST_NODES = 4
-"""Against the nearest ones if there are more."""
-MOST_VIEWS = 80
-"""Of each robot are compared, evenly chosen."""
-SIGMA_XY = 0.15
-"""Largest standard deviation of the relative pose, m."""
-SIGMA_HEADING = math.radians(3.0)
-"""And this, rad."""
-MARGIN = 0.04
-"""A landmark should be seen if it projects this far inside the image, rad."""
-SCALE = 1.4
-"""And if its distance has changed by at most this factor."""
-ASIDE = math.radians(15.0)
-"""And if it is seen from a direction that differs by at most this, rad."""
-AROUND = 0.1
-"""And if the view knows a depth this near to it in the image, rad."""
-BEFORE = 0.8
-"""And none there of less than this share of the landmark's distance."""
-WITHIN = 0.15
-"""It is found if what matches it is this near to where it should be, rad."""
-LEAST = 20
-"""Landmarks that a view should show before it counts."""
+MOST = 100.0
+"""Odds against a merge are never more: that all things changed is as probable as this."""
+
+
 NOTHING = 0.03
-"""A view shows nothing if it shows at most this share of them."""
+"""A view shows nothing if it shows at most this share of the landmarks that it should show."""
 MISSED = 0.02
 """Largest share of such views that show nothing though the merge is true."""
 ALIKE = 0.85
 """How often places that are taken for each other show the same."""
 APART = 1.5
 """Views of places nearer to each other than this count once, m."""
-
-
-@dataclass(frozen=True)
-class NegativeEvidenceSettings:
-    """What a view should show of what another robot has mapped.
-
-    Attributes:
-        most: odds against a merge are never more: that all things changed is as probable as this.
-    """
-
-    most: float = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,17 +61,17 @@ class Views:
     expected: NDArray[np.int64]
     found: NDArray[np.int64]
 
-    def show_nothing(self, s: NegativeEvidenceSettings) -> NDArray[np.bool_]:
+    def show_nothing(self) -> NDArray[np.bool_]:
         """(N,) which show nothing of what they should."""
         out: NDArray[np.bool_] = self.found <= NOTHING * self.expected
         return out
 
-    def odds_against(self, s: NegativeEvidenceSettings) -> Array:
+    def odds_against(self) -> Array:
         """(N,) odds against the merge that each gives."""
-        out: Array = np.where(self.show_nothing(s), (1.0 - ALIKE) / MISSED, ALIKE / (1.0 - MISSED))
+        out: Array = np.where(self.show_nothing(), (1.0 - ALIKE) / MISSED, ALIKE / (1.0 - MISSED))
         return out
 
-    def place_numbers(self, s: NegativeEvidenceSettings) -> NDArray[np.int64]:
+    def place_numbers(self) -> NDArray[np.int64]:
         """(N,) number of each view's place."""
         seats = np.full(len(self.places), -1, np.int64)
         for k in range(len(seats)):
@@ -115,20 +80,25 @@ class Views:
                 seats[(seats < 0) & (np.hypot(ways[:, 0], ways[:, 1]) < APART)] = seats.max(initial=-1) + 1
         return seats
 
-    def evidence(self, s: NegativeEvidenceSettings) -> float:
+    def evidence(self) -> float:
         """Natural logarithm of the odds against the merge."""
         if not len(self.places):
             return 0.0
-        seats = self.place_numbers(s)
-        means = np.bincount(seats, self.odds_against(s)) / np.bincount(seats)
-        return min(float(np.log(means).sum()), math.log(s.most))
+        seats = self.place_numbers()
+        means = np.bincount(seats, self.odds_against()) / np.bincount(seats)
+        return min(float(np.log(means).sum()), math.log(MOST))
+
+
+MOST_VIEWS = 80
+"""Views of each robot that are looked at, evenly chosen."""
+LEAST = 20
+"""Landmarks that a view should show before it says anything."""
 
 
 def negative_evidence(
     graph: PoseGraph,
     first: BodyTrajectory,
     second: BodyTrajectory,
-    settings: NegativeEvidenceSettings | None = None,
 ) -> Views:
     """What the views of two robots should show of what the other one has mapped, and what they do show.
 
@@ -136,16 +106,14 @@ def negative_evidence(
         graph: the merged component that holds the nodes of both.
         first: of one robot.
         second: of another one, by the same clock.
-        settings: when a view should show something.
     """
-    s = settings or NegativeEvidenceSettings()
     rows: list[tuple[Array, int, int]] = []
     for observer, mapped in ((first, second), (second, first)):
         chosen = np.unique(np.linspace(0, len(observer.views) - 1, MOST_VIEWS).round().astype(np.int64))
-        pairs = _nearby_pairs(graph, observer, mapped, chosen, s)
+        pairs = _nearby_pairs(graph, observer, mapped, chosen)
         for k in np.unique(pairs[:, 0]):
             compared = [
-                _compare(graph, mapped.views[j], observer.views[k], s) for j in pairs[pairs[:, 0] == k, 1]
+                _compare(graph, mapped.views[j], observer.views[k]) for j in pairs[pairs[:, 0] == k, 1]
             ]
             points = np.concatenate([points for points, _ in compared])
             if len(points) >= LEAST:
@@ -157,12 +125,25 @@ def negative_evidence(
     )
 
 
+NEAR = 1.5
+"""A view is held against nodes at most so far away, m."""
+TURN = math.radians(50.0)
+"""A view is held against nodes turned by at most this, rad."""
+LASTING = 3600.0
+"""A view is held against nodes made at most so much earlier or later, s."""
+MOST_NODES = 4
+"""A view is held against so many nodes at most, the nearest ones."""
+SIGMA_XY = 0.15
+"""A view is held against nodes whose relative position is known as well as this, m."""
+SIGMA_HEADING = math.radians(3.0)
+"""A view is held against nodes whose relative heading is known as well as this, rad."""
+
+
 def _nearby_pairs(
     graph: PoseGraph,
     observer: BodyTrajectory,
     mapped: BodyTrajectory,
     chosen: NDArray[np.int64],
-    s: NegativeEvidenceSettings,
 ) -> NDArray[np.int64]:
     """(P, 2) views, and nodes of the other robot that might show the same, the nearest ones of each view."""
     observer_nodes, mapped_nodes = (
@@ -189,11 +170,15 @@ def _nearby_pairs(
     return out
 
 
-def _compare(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettings) -> tuple[Array, int]:
+WITHIN = 0.15
+"""A landmark is found if what matches it is this near to where it should be, rad."""
+
+
+def _compare(graph: PoseGraph, node: Node, view: Node) -> tuple[Array, int]:
     """(K, 2) m, in merged, a node's landmarks that a view should show, and how many of them it shows."""
     merged_from_node = graph.pose(node.id)
     node_from_view = merged_from_node.inverse() @ graph.pose(view.id)
-    shown, pixels = should_show(node, view, node_from_view, s)
+    shown, pixels = should_show(node, view, node_from_view)
     if not len(shown):
         return np.zeros((0, 2)), 0
     seats = np.full(len(node.landmarks), -1)
@@ -204,16 +189,25 @@ def _compare(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettin
     return merged_from_node.apply(node.points_in_robot[shown][:, :2]), int((off < WITHIN).sum())
 
 
-def should_show(
-    node: Node, view: Node, node_from_view: Pose2, s: NegativeEvidenceSettings
-) -> tuple[NDArray[np.int64], Array]:
+MARGIN = 0.04
+"""A landmark should be seen if it projects this far inside the image, rad,"""
+SCALE = 1.4
+"""if its distance has changed by at most this factor,"""
+ASIDE = math.radians(15.0)
+"""if it is seen from a direction that differs by at most this, rad,"""
+AROUND = 0.1
+"""if the view knows a depth this near to it in the image, rad,"""
+BEFORE = 0.8
+"""and none there of less than this share of the landmark's distance."""
+
+
+def should_show(node: Node, view: Node, node_from_view: Pose2) -> tuple[NDArray[np.int64], Array]:
     """Which of a node's landmarks a view should show, and (K, 2) px where.
 
     Args:
         node: that has mapped them.
         view: another node.
         node_from_view: relative pose.
-        s: when a landmark should be seen.
     """
     projection = ProjectedView.of(node, view, node_from_view, MARGIN * view.camera.fx, SCALE, ASIDE)
     shown = np.flatnonzero(projection.fits)

@@ -12,13 +12,13 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ExclusionSettings
 
 Key = tuple[NodeId, NodeId]
 """Names of two fragments, smaller first."""

@@ -13,30 +13,9 @@ from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.range_scans import RangeScans
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
-LONGEST_GAP = 5.2
-"""Between moments that are further apart nobody knows where the robot was, s."""
-LONGEST_WAY = 1.0
-"""Nor if they are further apart, m."""
-ALONG = 0.15
-"""How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
-standard deviation: it stops and goes."""
-ASIDE = 0.05
-"""The same to the side of the line."""
-CLOCK_ERROR = 0.05
-"""Of two robots with the same clock, s."""
-
-
 NANOSECONDS = 1e9
 DRIFT = 0.02
 """How far a robot on its way is off beside its node, as a share of the way between them, one sigma."""
-
-
-@dataclass(frozen=True)
-class BodyTrajectorySettings:
-    """How well it is known where a robot is between two moments of its trail.
-
-    In the simulator it is within 1 cm of the straight line, but up to a third of its length ahead or behind.
-    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,18 +115,28 @@ class Stay:
     nearest: NDArray[np.int64]
 
 
-def stay(
-    trail: BodyTrajectory, places: Array, times: Array, settings: BodyTrajectorySettings | None = None
-) -> Stay:
+LONGEST_GAP = 5.2
+"""Between moments that are further apart in time nobody knows where the robot was, s."""
+LONGEST_WAY = 1.0
+"""Between moments that are further apart in space nobody knows where the robot was, m."""
+ALONG = 0.15
+"""How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
+standard deviation: it stops and goes. In the simulator it is within 1 cm of the straight line, but up to a
+third of its length ahead or behind."""
+ASIDE = 0.05
+"""Standard deviation to the side of the line midway, as a share of the line."""
+CLOCK_ERROR = 0.05
+"""Standard deviation between two robots with the same clock, s."""
+
+
+def stay(trail: BodyTrajectory, places: Array, times: Array) -> Stay:
     """Where a robot was, on the straight lines between its moments, which it drives at a pace of its own.
 
     Args:
         trail: of N moments.
         places: (N, 2) m, where it was then.
         times: (T,) s.
-        settings: how well that is known.
     """
-    settings or BodyTrajectorySettings()
     before = np.clip(np.searchsorted(trail.times, times, side="right") - 1, 0, max(len(places) - 2, 0))
     after = np.minimum(before + 1, len(places) - 1)
     gaps = np.maximum(trail.times[after] - trail.times[before], 1e-9)

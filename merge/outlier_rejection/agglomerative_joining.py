@@ -18,7 +18,7 @@ from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
 from mapweave.merge.outlier_rejection.link_probability import standpoints
 from mapweave.merge.outlier_rejection.pairwise_consistency import (
-    ConsistencySettings,
+    LEAST_EVIDENCE,
     Sorted,
     group_links,
     sort_links,
@@ -27,6 +27,7 @@ from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ConsistencySettings
 
 Key = tuple[NodeId, NodeId]
 """Names of two pieces of map, smaller first."""
@@ -239,7 +240,7 @@ def _borne_out(
         inside.setdefault(piece.name, (piece.graph, []))[1].append(link)
     out: list[Link] = []
     for graph, inside_links in inside.values():
-        least = max(0.0, s.least_evidence - chance[inside_links[0].a.map].log_odds)
+        least = max(0.0, LEAST_EVIDENCE - chance[inside_links[0].a.map].log_odds)
         good = borne_out(inside_links, graph, agreed, least, s)
         out += [link for link, yes in zip(inside_links, good, strict=True) if yes]
     return out

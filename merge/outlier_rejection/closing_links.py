@@ -9,10 +9,11 @@ import numpy as np
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, Sorted
+from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians
 
 Groups = Mapping[tuple[NodeId, NodeId], Sorted]

@@ -13,10 +13,11 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, trajectories_of
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup, Verdict
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, group_links
+from mapweave.merge.outlier_rejection.pairwise_consistency import group_links
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
 
 T = TypeVar("T")
 Key = tuple[NodeId, NodeId]

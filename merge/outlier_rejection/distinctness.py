@@ -28,17 +28,11 @@ from mapweave.hybridmap.explanation import DOUBLES
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Array
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, link_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
-
-APART_XY = 0.5
-"""They contradict each other by more than this, m, or."""
-APART_HEADING = 0.26
-"""By more than this, rad. Less is how well places are measured, not another place."""
-
 
 FOLLOWED = (EdgeKind.MAPPED, EdgeKind.TURNED)
 """Edges whose two nodes share landmarks that were tracked from image to image."""
@@ -47,17 +41,11 @@ Landmark = tuple[NodeId, int]
 """Which node, and which of its landmarks."""
 
 
-@dataclass(frozen=True)
-class DistinctnessSettings:
-    """When two recognitions mean two places."""
-
-
 def weigh(
     links: Sequence[Link],
     by_node: Mapping[NodeId, Fragment],
     maps: Mapping[MapId, HybridMap],
     consistency: ConsistencySettings | None = None,
-    settings: DistinctnessSettings | None = None,
 ) -> list[Link]:
     """Count how many landmarks of each link are found at other places too.
 
@@ -66,13 +54,12 @@ def weigh(
         by_node: the fragment of each node.
         maps: with the robots' own edges.
         consistency: when two measurements contradict each other,
-        settings: and by how much at least.
 
     Returns:
         The links in the same order; where there are such landmarks, with their number among the evidence.
         Links without landmarks are unchanged. The result does not depend on the order.
     """
-    c, s = consistency or ConsistencySettings(), settings or DistinctnessSettings()
+    c = consistency or ConsistencySettings()
     # A robot's edges between nodes of others are not images: those nodes would lose links by them.
     own = (e for a in maps.values() for e in a.edges.values() if e.within)
     claims = [link_of(e) for e in own if e.kind is EdgeKind.LOOP]
@@ -82,15 +69,21 @@ def weigh(
     if connected:
         sides = _Sides.of(connected, by_node)
         loops, pairs = sides.loops(), sides.pairs()
-        astray = sides.contradict(loops, None, c, s)
+        astray = sides.contradict(loops, None, c)
         for k in loops[astray]:
             doubles |= _ends(connected[k])
-        for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c, s)]:
+        for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c)]:
             node, a, b = sides.meeting(i, j)
             doubles |= {(node, int(landmark)) for landmark in np.intersect1d(a, b)}
         if doubles:
             doubles = _followed(doubles, [connected[k] for k in loops[~astray]], maps)
     return [_weighed(link, doubles) for link in links]
+
+
+APART_XY = 0.5
+"""Recognitions contradict each other if they are further apart than this, m,"""
+APART_HEADING = 0.26
+"""or turned by more than this, rad. Less is how well places are measured, not another place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +169,6 @@ class _Sides:
         sides: NDArray[np.int64],
         but: NDArray[np.int64] | None,
         c: ConsistencySettings,
-        s: DistinctnessSettings,
     ) -> NDArray[np.bool_]:
         """(K,) whether two sides that go out from one node contradict the way between their far ends.
 
@@ -184,7 +176,6 @@ class _Sides:
             sides: (K,) which.
             but: (K,) which; None: loops, and the way between the two ends of each.
             c: when they contradict it,
-            s: and by how much at least.
         """
         starts = self.far[sides]
         ends = self.near[sides] if but is None else self.far[but]

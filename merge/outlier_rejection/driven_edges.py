@@ -14,13 +14,13 @@ import numpy as np
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, MapId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.pose_graph.links import RefusedLink, refuse_edge
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ConsistencySettings
 
 VAGUE = np.array([0.6, 0.6, 0.2])
 """m, m, rad: an edge known no better does not even show that the servo got there. Four of these are its
-range, see `mapweave.hybridmap.reachability.ReachabilitySettings`. Robots report none above 0.1 m."""
+range, see `mapweave.hybridmap.reachability`. Robots report none above 0.1 m."""
 
 
 def refuse_drives(

@@ -7,14 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapweave.merge.outlier_rejection.pairwise_consistency import (
-    ConsistencySettings,
-    Sorted,
-    loop_distances2,
-    sort_links,
-)
+from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted, loop_distances2, sort_links
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
+from mapweave.merge.settings import ConsistencySettings
 
 Verdict = Callable[[Sequence[Link]], str]
 """Why a set of links that agree cannot be true, in words; empty if it can."""

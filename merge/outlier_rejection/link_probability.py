@@ -25,11 +25,11 @@ import numpy as np
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.pose_graph.factors import believable
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ConsistencySettings
 
 AT_ONCE = 64
 """Links whose covariances are solved for together: all at once would take memory by the square."""

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.pose_graph.links import RefusedLink, link_of, refuse_edge
+from mapweave.merge.settings import ConsistencySettings
 
 CLAIMS = (EdgeKind.LOOP, EdgeKind.MERGED, EdgeKind.DRIVEN)
 """Edge kinds that rest on place recognition."""

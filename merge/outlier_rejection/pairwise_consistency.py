@@ -30,47 +30,22 @@ from mapweave.merge.outlier_rejection.independent_support import (
 from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, RefusedLink, place_distinct, refuse
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians
+
+CHANCE = 0.01
+"""So many false sets at most may be expected between two pieces that are as good as the one that is
+kept."""
+EXACT = 40
+"""Up to as many links the best clique is searched exhaustively, beyond greedily."""
+LEAST_EVIDENCE = 4.6
+"""Natural logarithm of the odds from which a link that is too little alone, or was contradicted, is
+believed where others join its two ends: how many witnesses are true for one that is false, times Bayes'
+factor (see mapweave.merge.outlier_rejection.link_probability), which must speak for it."""
+
 
 HUNDREDTHS = 100.0
 """Cliques are weighed in whole hundredths of a landmark."""
-
-
-@dataclass(frozen=True)
-class ConsistencySettings:
-    """When links are believed.
-
-    Attributes:
-        gate: chi-square with 3 degrees of freedom that a loop may miss by; 16.27 is 99.9 %, since a link must
-            agree with every other one.
-        floor_xy: error of any loop that no covariance tells of, m.
-        floor_heading: the same, rad.
-        least_links: independent links (no node in common) that join two pieces.
-        overwhelming_inliers: a single link with as many landmarks ...
-        overwhelming_share: ... and this share of its matches joins them alone.
-        place: nodes of a map that are nearer to each other see the same landmarks, m.
-        chance: so many false sets at most may be expected between two pieces that are as good as the one
-            that is kept.
-        dominance: how many times the landmarks of a contradicting set the kept set must have, and how many
-            times its witnesses if that set would be believed without it.
-        exact: up to as many links the best clique is searched exhaustively, beyond greedily.
-        least_evidence: natural logarithm of the odds from which a link that is too little alone, or was
-            contradicted, is believed where others join its two ends: how many witnesses are true for one that
-            is false, times Bayes' factor (see mapweave.merge.outlier_rejection.link_probability), which must
-            speak for it.
-    """
-
-    gate: float = 16.27
-    floor_xy: float = 0.02
-    floor_heading: float = 0.01
-    least_links: int = 2
-    overwhelming_inliers: int = 45
-    overwhelming_share: float = 0.7
-    place: float = 2.0
-    chance: float = 0.01
-    dominance: float = 1.5
-    exact: int = 40
-    least_evidence: float = 4.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +77,7 @@ class Sorted:
             false: statistics of false places.
             s: when links are accepted.
         """
-        real = [k for k in (0, 1) if self.supports[k].by_chance(false) < s.chance]
+        real = [k for k in (0, 1) if self.supports[k].by_chance(false) < CHANCE]
         if len(real) == 2 or (self.kept and 0 in real):
             return self
         accepted = self.sets[real[0]] if real and not _too_little(self.sets[real[0]], s) else ()
@@ -158,6 +133,10 @@ def _loops(
     return out, spreads
 
 
+PLACE = 2.0
+"""Nodes of a map that are nearer to each other see the same landmarks, m."""
+
+
 def sort_links(
     links: Sequence[Link], first: Fragment, second: Fragment, settings: ConsistencySettings | None = None
 ) -> Sorted:
@@ -180,12 +159,12 @@ def sort_links(
     if not links:
         return Sorted((), tuple(refused))
     distances2, spreads = _loops(links, first, second, s)
-    agree, neighbouring = distances2 < s.gate, neighbours(links, first, second, s.place)
+    agree, neighbouring = distances2 < s.gate, neighbours(links, first, second, PLACE)
     landmarks = np.array([link.weight for link in links])
     # Dependent links count by the root of their number.
     weights = landmarks / np.sqrt(crowds(agree, neighbouring))
     hundredths = np.maximum(np.rint(HUNDREDTHS * weights), 1).astype(np.int64)
-    best = best_clique(agree, hundredths, s.exact)
+    best = best_clique(agree, hundredths, EXACT)
     kept = [links[k] for k in best]
     reason = _too_little(kept, s)
     rival = _rival(agree, hundredths, best, s)
@@ -254,8 +233,14 @@ def _rival(
     """The best set among the links that agree with less than half of the kept ones."""
     rest = np.setdiff1d(np.arange(len(weights)), best)
     rest = rest[agree[rest][:, best].mean(axis=1) < 0.5] if best else rest
-    clique = best_clique(agree[np.ix_(rest, rest)], weights[rest], s.exact)
+    clique = best_clique(agree[np.ix_(rest, rest)], weights[rest], EXACT)
     return [int(k) for k in rest[clique]]
+
+
+OVERWHELMING_INLIERS = 45
+"""A single link with as many landmarks ..."""
+OVERWHELMING_SHARE = 0.7
+"""... and this share of its matches joins them alone."""
 
 
 def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
@@ -271,7 +256,7 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
         return ""
     for link in telling:
         share = link.evidence.get("share", 0.0)
-        if link.weight >= s.overwhelming_inliers and share >= s.overwhelming_share:
+        if link.weight >= OVERWHELMING_INLIERS and share >= OVERWHELMING_SHARE:
             return ""
     return f"no {s.least_links} links that share no node agree with each other, as they must"
 

@@ -14,10 +14,11 @@ from collections.abc import Sequence
 
 from mapweave.merge.outlier_rejection.closing_links import misfits
 from mapweave.merge.outlier_rejection.link_probability import standpoints
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.outlier_rejection.pairwise_consistency import LEAST_EVIDENCE
 from mapweave.merge.pose_graph.component import Component
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
 
 FEW = 0.05
 """Share of a component's links up to which those that are refused are tried."""
@@ -53,7 +54,7 @@ def readmitted(
         cost = _cost(solver, here) if tried else 0.0
         for link, far, found in tried:
             now = _cost(solver, [*here, link])
-            if log_odds + found.log_factor + 0.5 * (far - (now - cost)) > s.least_evidence:
+            if log_odds + found.log_factor + 0.5 * (far - (now - cost)) > LEAST_EVIDENCE:
                 here, cost = [*here, link], now
                 out.append(link)
     return out

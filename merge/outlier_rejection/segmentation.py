@@ -19,12 +19,13 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from mapweave.merge.outlier_rejection.closing_links import join, optimise
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS, sort_loop_closures
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, group_links, sort_links
+from mapweave.merge.outlier_rejection.pairwise_consistency import group_links, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import RefusedLink, link_of
+from mapweave.merge.settings import ConsistencySettings
 
 WORDS = {EdgeKind.LOOP: "loop", EdgeKind.MERGED: "link", EdgeKind.DRIVEN: "drive"}
 

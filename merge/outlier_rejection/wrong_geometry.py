@@ -31,11 +31,12 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, loop_distances2
+from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import WrongGeometry
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians
 
 MOST_LINKS = 60

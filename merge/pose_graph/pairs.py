@@ -11,15 +11,15 @@ from collections import Counter
 from collections.abc import Mapping
 
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.merge.pose_graph.candidates import LEAST_OVERLAP, CandidateSettings, Pair
+from mapweave.merge.pose_graph.candidates import LEAST_HOPS, LEAST_OVERLAP, MOST_PER_MAP, Pair
 
 
 class PairTable:
     """Overlaps by node, the edges that make neighbours, and the pairs that are chosen."""
 
-    def __init__(self, settings: CandidateSettings | None = None) -> None:
-        """Start empty."""
-        self._settings = settings or CandidateSettings()
+    def __init__(self, most_per_map: int = MOST_PER_MAP, least_hops: int = LEAST_HOPS) -> None:
+        """Start empty; the arguments are those of `choose_pairs`."""
+        self._most_per_map, self._least_hops = most_per_map, least_hops
         self._overlaps: dict[NodeId, dict[NodeId, float]] = {}
         self._ways: dict[NodeId, Counter[NodeId]] = {}
         self._best: dict[NodeId, frozenset[Pair]] = {}
@@ -91,7 +91,6 @@ class PairTable:
 
     def _ranked(self, node: NodeId) -> frozenset[Pair]:
         """The best pairs of a node with the nodes of each map."""
-        s = self._settings
         overlaps = self._overlaps.get(node)
         if not overlaps:
             return frozenset()
@@ -101,7 +100,7 @@ class PairTable:
             if value >= LEAST_OVERLAP and neighbour not in neighbours:
                 pair = (node, neighbour) if node < neighbour else (neighbour, node)
                 by_map.setdefault(neighbour.map, []).append((-value, pair))
-        return frozenset(pair for best in by_map.values() for _, pair in sorted(best)[: s.most_per_map])
+        return frozenset(pair for best in by_map.values() for _, pair in sorted(best)[: self._most_per_map])
 
     def _choose(self, node: NodeId, pairs: frozenset[Pair]) -> None:
         """Let a node vote for these pairs, and for no others."""
@@ -121,7 +120,7 @@ class PairTable:
     def _around(self, node: NodeId) -> set[NodeId]:
         """Nodes that are few edges away, the node itself too."""
         reached, ring = {node}, [node]
-        for _ in range(self._settings.least_hops - 1):
+        for _ in range(self._least_hops - 1):
             ring = [
                 neighbour
                 for current in ring

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,25 +11,16 @@ from mapweave.hybridmap.node import Node
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_nodes
 
+MOST_SIGMA_XY = 0.16
+"""Largest standard deviation of their relative position, m. A link that may be off by half a metre joins
+nothing that a robot could drive."""
+
+
 MOST_SIGMA_HEADING = 0.05
-"""Likewise of the heading, rad."""
+"""Largest standard deviation of their relative heading, rad."""
 
 
-@dataclass(frozen=True)
-class VerificationSettings:
-    """When two nodes are linked.
-
-    Attributes:
-        recognition: when they count as the same place.
-        most_sigma_xy: largest standard deviation of their relative position, m. A link that may be off by
-            half a metre joins nothing that a robot could drive.
-    """
-
-    recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
-    most_sigma_xy: float = 0.16
-
-
-def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Link | RefusedLink:
+def verify(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Link | RefusedLink:
     """Compare two nodes.
 
     The answer depends on the two nodes alone: they are put in the order of their ids, and the ids seed the
@@ -44,13 +34,13 @@ def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Li
     Returns:
         A link, or why there is none.
     """
-    s = settings or VerificationSettings()
+    s = settings or RecognitionSettings()
     if b.id < a.id:
         a, b = b, a
     verdict = examine(a, b, s)
     if isinstance(verdict, Recognition):
         sigma_xy, sigma_heading = verdict.evidence["sigma_xy"], verdict.evidence["sigma_heading"]
-        if sigma_xy > s.most_sigma_xy or sigma_heading > MOST_SIGMA_HEADING:
+        if sigma_xy > MOST_SIGMA_XY or sigma_heading > MOST_SIGMA_HEADING:
             degrees = math.degrees(sigma_heading)
             reason = f"the same place, but known to {sigma_xy:.2f} m and {degrees:.1f} deg only"
             return RefusedLink(a.id, b.id, reason)
@@ -58,7 +48,7 @@ def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Li
     return RefusedLink(a.id, b.id, verdict.reason)
 
 
-def examine(a: Node, b: Node, settings: VerificationSettings | None = None) -> Recognition | Refusal:
+def examine(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Recognition | Refusal:
     """Input of `verify`: the same seeds, the same numbers.
 
     Args:
@@ -66,6 +56,6 @@ def examine(a: Node, b: Node, settings: VerificationSettings | None = None) -> R
         b: the other one.
         settings: when they are linked.
     """
-    s = settings or VerificationSettings()
+    s = settings or RecognitionSettings()
     rng = np.random.default_rng(zlib.crc32(f"{a.id} {b.id}".encode()))
-    return examine_nodes(a, b, s.recognition, rng)
+    return examine_nodes(a, b, s, rng)

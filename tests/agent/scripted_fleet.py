@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from mapweave.agent.mission import Answer, Question
-from mapweave.agent.navigation.navigator import Navigator, NavigatorSettings
+from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
@@ -88,7 +89,8 @@ class Trial:
 def navigator(
     eyes: Eyes, own: HybridMap, goal: NodeId, settings: NavigatorSettings | None = None
 ) -> Navigator:
-    return Navigator(BODY, Lens(BODY.camera, BODY.distortion), eyes, own, goal, settings)  # type: ignore[arg-type]
+    every = AgentSettings(navigation=settings or NavigatorSettings())
+    return Navigator(BODY, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every)  # type: ignore[arg-type]
 
 
 def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:

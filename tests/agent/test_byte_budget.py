@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapweave.agent.mapping.mapper import Mapper, MapperSettings
+from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.node import MapId, Node
@@ -18,8 +19,8 @@ FRAMING = 80
 
 def mapped(walls, description, most_bytes: int) -> Node:
     """A node of the walls, made under a budget as a settings file gives it."""
-    table = {"cartographer": {"selection": {"most_bytes": most_bytes}}}
-    mapper = Mapper(MapId("r0", 1), description, build(MapperSettings, table, "robot.toml"))
+    table = {"landmarks": {"most_bytes": most_bytes}}
+    mapper = Mapper(MapId("r0", 1), description, build(AgentSettings, table, "robot.toml"))
     return walls.mapped(mapper, reach=0.4)
 
 
@@ -48,6 +49,6 @@ def test_the_robot_uses_the_quantized_numbers(walls, description):
 
 def test_a_budget_that_leaves_no_room_is_refused():
     with pytest.raises(InvalidValue, match="660 at least"):
-        build(MapperSettings, {"cartographer": {"selection": {"most_bytes": 100}}}, "robot.toml")
+        build(AgentSettings, {"landmarks": {"most_bytes": 100}}, "robot.toml")
     with pytest.raises(SettingsError, match="did you mean 'most_bytes'"):
-        build(MapperSettings, {"cartographer": {"selection": {"most_byte": 1000}}}, "robot.toml")
+        build(AgentSettings, {"landmarks": {"most_byte": 1000}}, "robot.toml")

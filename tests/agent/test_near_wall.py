@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from mapweave.agent.mapping import keyframe_builder
-from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder, KeyframeBuilderSettings
+from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.registration.selection import SelectionSettings
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 
@@ -57,7 +58,7 @@ def test_a_loop_must_agree_with_the_way_there(monkeypatch, off, closed):
     made = KeyframeBuilder(
         MapId("r0", 1),
         RobotDescription(camera=CAMERA),
-        KeyframeBuilderSettings(),
+        SelectionSettings(),
         [NodePut(node(1, earlier))],
         next_number=2,
     )

@@ -13,7 +13,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from mapweave.agent.observation import RobotDescription
-from mapweave.agent.occupancy_grid import OccupancyGrid, OccupancyGridSettings
+from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.agent.settings import OccupancyGridSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 

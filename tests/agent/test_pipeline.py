@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.global_localization.pose_consistency import ConsistencySettings
-from mapweave.agent.global_localization.settings import ResumptionSettings
+from mapweave.agent.global_localization import pose_consistency
 from mapweave.agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
 from mapweave.agent.observation import Command, Observation, Odometry
-from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -237,12 +237,18 @@ def test_a_lost_robot_asks_the_fleet(walls):
 def test_seeds_choose_the_side():
     turns = set()
     for seed in range(6):
-        pipeline = on(Explore(), PipelineSettings(seed=seed))
+        pipeline = on(Explore(), AgentSettings(seed=seed))
         grey = np.full((240, 320), 100, np.uint8)
         for tick in range(3):
             step = pipeline.step(Observation(tick, Odometry(0.0, 0.0), grey, np.full(len(BEARINGS), 3.0)))
         turns.add(math.copysign(1.0, step.command.turn))
     assert turns == {1.0, -1.0}
+
+
+@pytest.fixture
+def near_views(monkeypatch) -> None:
+    """All pictures hang in one direction, so views from places close to each other must do."""
+    monkeypatch.setattr(pose_consistency, "OTHER_VIEW", (0.2, 0.9))
 
 
 def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list[Step]]:
@@ -255,8 +261,7 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
     Returns:
         The pipeline, what was in its map before, and the steps since.
     """
-    near = ResumptionSettings(consistency=ConsistencySettings(way=0.2))
-    pipeline, before = on(Carried(), PipelineSettings(resumption=near)), Pose2(-1.0)
+    pipeline, before = on(Carried()), Pose2(-1.0)
     for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
         pipeline.step(walls.observe(before, Pose2(x), tick))
         before = Pose2(x)
@@ -271,11 +276,9 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
     return pipeline, elements, steps
 
 
+@pytest.mark.usefixtures("near_views")
 def test_after_navigating_it_maps_on_once_it_recognises_a_place(walls):
-    """It was carried 0.3 m further meanwhile, which the wheels do not know.
-
-    All pictures hang in one direction, so looks from places close to each other must do.
-    """
+    """It was carried 0.3 m further meanwhile, which the wheels do not know."""
     places = [Pose2(x) for x in np.arange(0.0, 0.9, 0.025)]
     pipeline, elements, _ = carried_after_navigating(walls, places)
     assert elements < set(pipeline.map.nodes)
@@ -288,6 +291,7 @@ def test_after_navigating_it_maps_on_once_it_recognises_a_place(walls):
             assert (from_start @ node.map_from_robot.mean).distance(Pose2(-1.0).inverse() @ true) < 0.05
 
 
+@pytest.mark.usefixtures("near_views")
 def test_it_does_not_map_on_after_navigating_to_an_unknown_place(walls):
     away = [Pose2(x, 0.0, math.pi) for x in np.arange(0.3, 0.9, 0.025)]
     pipeline, elements, steps = carried_after_navigating(walls, away)

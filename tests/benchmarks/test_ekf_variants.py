@@ -21,7 +21,7 @@ from benchmarks.ekf_variants.coordinates import (
     of_robot,
 )
 from benchmarks.ekf_variants.textbook import Choice, TextbookFilter
-from mapweave.agent.ekf.mapping_filter import FilterSettings
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 from synthetic.mapping_run import MappingRun, draw_run

@@ -17,8 +17,8 @@ from benchmarks.mapping_run.benchmark import main, notes
 from benchmarks.mapping_run.scene import MappingDrive, Moment, drive
 from benchmarks.mapping_run.score import LastKnown, figures, landmark_nees, reprojection_errors, track_errors
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
-from mapweave.agent.ekf.mapping_filter import FilterSettings
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.camera import WEBCAM
 from mapweave.sim.robots import RobotSetup

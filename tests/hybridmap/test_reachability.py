@@ -13,7 +13,14 @@ from mapweave.hybridmap.descriptor import quantise
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.reachability import ReachabilitySettings, closed_edges, least_in_view, reachability_of
+from mapweave.hybridmap.reachability import (
+    FARTHEST,
+    LEAST,
+    WIDEST,
+    closed_edges,
+    least_in_view,
+    reachability_of,
+)
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from synthetic.world import CAMERA, random_vectors
 
@@ -69,22 +76,19 @@ def test_landmarks_in_view_are_those_that_both_cameras_see_at_every_stop(seed: i
 
 def test_few_landmarks_a_long_way_or_a_wide_turn_only_tie_poses() -> None:
     rng = np.random.default_rng(1)
-    s = ReachabilitySettings()
     near = Pose2(0.4, 0.1, 0.1)
     edge, a, b = pair(near, wall(60, rng), rng)
     good = reachability_of(edge, a, b)
-    assert good.drivable and good.in_view >= s.least and "can be driven" in good.reason
+    assert good.drivable and good.in_view >= LEAST and "can be driven" in good.reason
     few, a, b = pair(near, wall(60, rng)[:4], rng)
     assert not reachability_of(few, a, b).drivable
     assert (
         "stay" in reachability_of(few, a, b).reason
         and "ties poses, not driven" in reachability_of(few, a, b).reason
     )
-    far, a, b = pair(Pose2(s.farthest + 0.2), wall(60, rng, x=6.0), rng)
-    assert (
-        not reachability_of(far, a, b).drivable and f"{s.farthest:g} m" in reachability_of(far, a, b).reason
-    )
-    turned, a, b = pair(Pose2(0.0, 0.0, s.widest + 0.05), wall(400, rng), rng)
+    far, a, b = pair(Pose2(FARTHEST + 0.2), wall(60, rng, x=6.0), rng)
+    assert not reachability_of(far, a, b).drivable and f"{FARTHEST:g} m" in reachability_of(far, a, b).reason
+    turned, a, b = pair(Pose2(0.0, 0.0, WIDEST + 0.05), wall(400, rng), rng)
     assert not reachability_of(turned, a, b).drivable and "degrees" in reachability_of(turned, a, b).reason
 
 

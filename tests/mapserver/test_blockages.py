@@ -11,7 +11,7 @@ import pytest
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.blockages import Blockages, BlockageSettings
+from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.routes import Router
 from synthetic.world import room, take_map
@@ -21,7 +21,7 @@ ME = MapId("a", 1)
 
 
 def test_a_blockage_is_forgotten_after_its_last_report() -> None:
-    blockages = Blockages(BlockageSettings(forget=100.0))
+    blockages = Blockages(forget=100.0)
     blockages.report([(B, A)], 0.0)
     blockages.report([(A, B), (B, C)], 50.0)
     assert set(blockages.known(149.0)) == {(A, B), (B, C)}
@@ -30,7 +30,7 @@ def test_a_blockage_is_forgotten_after_its_last_report() -> None:
 
 
 def test_without_a_clock_nothing_is_forgotten_but_the_oldest() -> None:
-    blockages = Blockages(BlockageSettings(forget=math.inf, most=2))
+    blockages = Blockages(forget=math.inf, most=2)
     for pair in ((A, B), (B, C), (A, B), (A, C)):
         blockages.report([pair], 0.0)
     assert blockages.known(1e9) == [(A, B), (A, C)]

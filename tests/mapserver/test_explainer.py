@@ -27,9 +27,8 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
-from mapweave.merge.merging import MergeSettings
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import ConsistencySettings, MergeSettings
 from mapweave.storage.map_file import MapFile, pack_map_file, unpack_map_file
 from mapweave.wire.bus import Reply
 from mapweave.wire.codec import encode_change

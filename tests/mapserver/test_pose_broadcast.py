@@ -14,7 +14,8 @@ import pytest
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.pose_broadcast import PoseBroadcast, PoseBroadcastSettings
+from mapweave.mapserver import pose_broadcast
+from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
@@ -40,13 +41,19 @@ def merged(*graphs: PoseGraph) -> MergedMap:
     return replace(whole, components=tuple(frozenset(one.nodes) for one in graphs))
 
 
-class Recorder:
-    """A pose broadcast, and what it publishes."""
+@pytest.fixture(autouse=True)
+def no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is told a second time, unless a test says so."""
+    monkeypatch.setattr(pose_broadcast, "BEAT", math.inf)
 
-    def __init__(self, fleet: Fleet, settings: PoseBroadcastSettings | None = None) -> None:
+
+class Told:
+    """A herald, and what it publishes."""
+
+    def __init__(self, fleet: Fleet) -> None:
         self.heard: list[PoseNews] = []
         self.bus, self.agent = fleet.join(), fleet.join()
-        self.herald = PoseBroadcast(self.bus, KEYS, "s0", settings or PoseBroadcastSettings(beat=math.inf))
+        self.herald = PoseBroadcast(self.bus, KEYS, "s0")
         self.agent.subscribe(KEYS.poses("s0", "r0"), self._hear)
         self.agent.subscribe(KEYS.server_status("s0"), lambda _: self._marks.append(1))
         self._marks: list[int] = []
@@ -83,7 +90,7 @@ def zenoh() -> Iterator[ZenohFleet]:
 
 
 def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) -> None:
-    told = Recorder(memory)
+    told = Told(memory)
     (first,) = told.tell(graph(A))
     assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
     assert told.tell(graph(A, 0.049)) == []
@@ -96,7 +103,7 @@ def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) 
 
 
 def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> None:
-    told = Recorder(memory)
+    told = Told(memory)
     told.tell(graph(A), graph(B))
     one = graph(A)
     one.means[3, 1] = 0.2
@@ -110,7 +117,7 @@ def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> 
 
 
 def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
-    told = Recorder(memory)
+    told = Told(memory)
     told.tell(graph(A))
     (news,) = told.tell(graph(A[:-1]))
     assert news.gone == (A[-1],) and not news.placed
@@ -119,8 +126,9 @@ def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
     assert set(whole.placed) == set(A[:-1]) and whole.after == 0 and whole.sequence == 2
 
 
-def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet) -> None:
-    told = Recorder(memory, PoseBroadcastSettings(most=2, beat=math.inf))
+def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_broadcast, "MOST", 2)
+    told = Told(memory)
     pieces = told.tell(graph(A))
     assert [len(news.placed) for news in pieces] == [2, 2, 1]
     assert [(news.after, news.sequence) for news in pieces] == [(0, 1), (1, 2), (2, 3)]
@@ -143,11 +151,12 @@ def at(poses: MergedPoses, node: NodeId, x: float) -> Callable[[], bool]:
     return there
 
 
-def test_lost_changes_are_pulled_over_zenoh(zenoh: ZenohFleet) -> None:
+def test_lost_changes_are_pulled_over_zenoh(zenoh: ZenohFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """A late agent, lost news, lost last news, a server that starts again, and one that knows less."""
-    fast = PoseBroadcastSettings(every=0.0, beat=0.0)
+    monkeypatch.setattr(pose_broadcast, "EVERY", 0.0)
+    monkeypatch.setattr(pose_broadcast, "BEAT", 0.0)
     server = zenoh.join()
-    herald = PoseBroadcast(server, KEYS, "s0", fast)
+    herald = PoseBroadcast(server, KEYS, "s0")
     herald.tell(merged(graph(A)))
     alive = server.announce(KEYS.server_alive("s0"))
     poses = kept(zenoh.join())
@@ -169,7 +178,7 @@ def test_lost_changes_are_pulled_over_zenoh(zenoh: ZenohFleet) -> None:
     alive.close()
     herald.close()
     again = zenoh.join()
-    herald = PoseBroadcast(again, KEYS, "s0", fast)
+    herald = PoseBroadcast(again, KEYS, "s0")
     herald.tell(merged(graph(A[:3], 7.0)))
     alive = again.announce(KEYS.server_alive("s0"))
     eventually(at(poses, A[2], 9.0))

@@ -20,7 +20,7 @@ from mapweave.hybridmap.reachability import RECOGNISED, reachability_of
 from mapweave.mapserver.http.explanation_json import route_values
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.route_explaining import explain_route
-from mapweave.mapserver.routes import Router
+from mapweave.mapserver.routes import NEAR, WARY_COST, Router
 from mapweave.wire.explanation_messages import ExplainRequest, decode_explain_request, encode_explain_request
 from mapweave.wire.packing import pack
 from mapweave.wire.route_explanation import decode_route_explanation, encode_route_explanation
@@ -69,7 +69,7 @@ def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
     for a in merged.poses:
         for b in merged.poses:
             one = a < b and merged.component_of(a) == merged.component_of(b)
-            if one and merged.pose(a).distance(merged.pose(b)) <= router.settings.near:
+            if one and merged.pose(a).distance(merged.pose(b)) <= NEAR:
                 graph.add_edge(a, b, gap=0)
     return min(
         sum(graph.edges[hop]["gap"] for hop in pairwise(way))
@@ -119,8 +119,8 @@ def test_recently_blocked_edges_are_reported(router: Router) -> None:
     one, two, _ = nodes_of(ME)
     free, wary = explain_route(router, one, two), explain_route(router, one, two, wary=[(one, two)])
     if [hop.b for hop in wary.hops] == [two]:
-        assert wary.hops[0].cost == pytest.approx(free.hops[0].cost + router.settings.wary_cost)
-        assert "recently could not get through" in wary.hops[0].words
+        assert wary.hops[0].cost == pytest.approx(free.hops[0].cost + WARY_COST)
+        assert "did not get through of late" in wary.hops[0].words
     else:
         assert "recently could not get through" in wary.gaps[0].words
     assert wary.gaps, "the way that would be cheaper is told"

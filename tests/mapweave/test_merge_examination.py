@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from mapweave.agent.drivers.replay import Replay
-from mapweave.agent.global_localization.settings import ResumptionSettings
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.global_localization import resumption
+from mapweave.agent.global_localization.search_policy import TO_MAP
+from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.evaluation.merging import changes
 from mapweave.evaluation.pieces import OVERLAP, cut
@@ -93,7 +94,9 @@ def test_two_robots_of_one_walk_become_one_map(
     assert sum(row["kept"] == "yes" for row in rows) == report["links"]
 
 
-def test_a_robot_that_cannot_localize_begins_another_map(recording: Path, tmp_path: Path) -> None:
+def test_a_robot_that_cannot_localize_begins_another_map(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """After 60 images it stands in a world upside down, which it then drives through."""
     folder = tmp_path / "carried off"
     (folder / "images").mkdir(parents=True)
@@ -104,8 +107,8 @@ def test_a_robot_that_cannot_localize_begins_another_map(recording: Path, tmp_pa
     (folder / "camera.toml").write_text(CAMERA_TOML)
     for k, image in enumerate(shown):
         cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
-    soon = replace(PipelineSettings(), resumption=ResumptionSettings(carried_looks=3, carried_pause=0.1))
-    made = [change for some in changes("one", Replay(folder), soon) for change in some]
+    monkeypatch.setattr(resumption, "TO_MAP", replace(TO_MAP, carried_views=3, carried_pause=0.1))
+    made = [change for some in changes("one", Replay(folder), AgentSettings()) for change in some]
     maps = {epoch: [c for c in made if c.map == MapId("one", epoch)] for epoch in (1, 2)}
     assert len(maps[1]) + len(maps[2]) == len(made)
     for one in maps.values():

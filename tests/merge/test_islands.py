@@ -14,9 +14,9 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge import islands as islands_module
 from mapweave.merge.islands import Islands
-from mapweave.merge.merging import MergeSettings
 from mapweave.merge.pose_graph import component_solver
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import MergeSettings
 from tests.merge.lives import DENSE, Life
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from mapweave.hybridmap.node import Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.registration import recognition
 from mapweave.registration.recognition import (
     Recognition,
     RecognitionSettings,
@@ -134,15 +135,21 @@ def test_depths_that_do_not_agree_are_refused() -> None:
         ({"least_evidence": 1e6}, "chance"),
         ({"most_position_share": 1e-6}, "position is uncertain"),
         ({"most_heading_sigma": 1e-9}, "heading is uncertain"),
-        ({"most_mean_square": 0.01}, "residuals"),
-        ({"least_share": 1.01}, "of the matches agree"),
+        ({"MOST_MEAN_SQUARE": 0.01}, "residuals"),
+        ({"LEAST_SHARE": 1.01}, "of the matches agree"),
     ],
 )
-def test_each_rule_refuses_with_its_own_reason(change: dict[str, float], word: str) -> None:
+def test_each_rule_refuses_with_its_own_reason(
+    change: dict[str, float], word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in change.items():
+        if name.isupper():
+            monkeypatch.setattr(recognition, name, value)
+    settings = RecognitionSettings(**{k: v for k, v in change.items() if k.islower()})  # type: ignore[arg-type]
     rng = np.random.default_rng(8)
     a = Pose2(2.5, 2.0, 0.3)
     view, _ = take_view(world(), near(a, rng), rng)
-    verdict = examine_view(node_at(a, rng), view, RecognitionSettings(**change), rng)  # type: ignore[arg-type]
+    verdict = examine_view(node_at(a, rng), view, settings, rng)
     assert isinstance(verdict, Refusal) and word in verdict.reason
 
 

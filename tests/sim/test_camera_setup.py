@@ -52,13 +52,13 @@ def test_a_robot_describes_what_was_ordered() -> None:
         ({"name": "a", "camera": {"read_nois": 1.0}}, "did you mean 'read_noise'"),
         ({"name": "a", "camera": {"exposure": {"seconds": 9.0}}}, "exposure: seconds is 9"),
         ({"name": "a", "camera": {"distortion": [-2.0, 0, 0, 0, 0]}}, "folds"),
-        ({"name": "a", "camera": {"intrinsics": 3}}, "must be a table"),
+        ({"name": "a", "camera": {"intrinsics": 3}}, "expected table"),
         ({"name": "a b"}, "a b"),
         ({"camera": "wide"}, "name is missing"),
         ({"name": "a", "body": {"slip": -1.0}}, "slip"),
         ({"name": "a", "body": {"ticks_per_turn": 0}}, "ticks_per_turn"),
         ({"name": "a", "rangers": 1000}, "rangers is 1000"),
-        ({"name": "a", "start": [1, 2]}, "start: must be a list of 3"),
+        ({"name": "a", "start": [1, 2]}, "start: expected list of length 3"),
     ],
 )
 def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str) -> None:

@@ -15,14 +15,14 @@ from mapweave.sim.worlds.catalog import KINDS, make_world, parameter_names, worl
     [
         ("offices", {}, "no kind of world 'offices'; there are office, corridor"),
         ("office", {"rooms": 0}, "rooms is 0; use 1 to 32"),
-        ("office", {"rooms": 2.5}, "is no int"),
+        ("office", {"rooms": 2.5}, "expected int"),
         ("office", {"room": 2}, "did you mean 'rooms'"),
         ("corridor", {"breadth": math.nan}, "is no float"),
         ("corridor", {"breadth": 0.2}, "use 1.2 to 5"),
         ("corridor", {"width": 5.0, "breadth": 3.0}, "has no middle"),
         ("warehouse", {"rows": 21}, "use 1 to 20"),
-        ("warehouse", {"bays": True}, "is no int"),
-        ("twins", {"joined": 1}, "is no bool"),
+        ("warehouse", {"bays": True}, "expected int"),
+        ("twins", {"joined": 1}, "expected bool"),
         ("arena", {"length": -3.0}, "use 2 to 60"),
     ],
 )

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 
 from mapweave.agent.observation import Command
-from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.tracker import Tracker
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import PanelSet, World
 from mapweave.vision.lens import Lens

@@ -8,6 +8,7 @@ import pytest
 
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
+from mapweave.vision import sift
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift, SiftSettings
 
@@ -25,10 +26,10 @@ def test_features_are_spread_and_each_has_a_place_of_its_own(pictures, name):
     assert len({(round(x), round(y)) for x, y in features.raw}) == len(features)
     assert (np.diff(features.responses) <= 0).all(), "strongest first"
     assert features.codes.shape == (len(features), 32)
-    assert CAMERA.contains(features.raw, settings.border_px - 1).all()
-    cells = np.floor(features.raw * settings.cells / [320, 240]).astype(int)
+    assert CAMERA.contains(features.raw, sift.BORDER_PX - 1).all()
+    cells = np.floor(features.raw * sift.CELLS / [320, 240]).astype(int)
     _, counts = np.unique(cells, axis=0, return_counts=True)
-    assert counts.max() <= np.ceil(settings.crowding * settings.most / settings.cells**2)
+    assert counts.max() <= np.ceil(sift.CROWDING * settings.most / sift.CELLS**2)
 
 
 def test_the_same_image_gives_the_same_features(pictures):
@@ -78,8 +79,11 @@ def test_points_on_an_edge_are_left_out(angle):
     stairs = across + 0.5 * np.sin(along * 2 * np.pi / 14)
     edge = 120 + 80 * np.tanh(stairs / 1.5) + np.random.default_rng(0).normal(0, 1.0, (240, 320))
     image = edge.clip(0, 255).round().astype(np.uint8)
-    lax = SiftSettings(least_texture=0.0, least_roundness=0.0)
-    assert len(Sift(IDEAL, lax).extract(image)) > 10, "there is something to leave out"
+    with pytest.MonkeyPatch.context() as lax:
+        lax.setattr(sift, "LEAST_TEXTURE", 0.0)
+        lax.setattr(sift, "LEAST_ROUNDNESS", 0.0)
+        everything = Sift(IDEAL).extract(image)
+    assert len(everything) > 10, "there is something to leave out"
     assert len(Sift(IDEAL).extract(image)) == 0
     # A spot is held in both directions, at any position, and so are all patches that contain it.
     spotted = cv2.circle(image.copy(), (160, 120), 5, 20, cv2.FILLED, cv2.LINE_AA)
@@ -94,5 +98,5 @@ def test_held_tracks_match_in_both_directions(pictures, name):
     settings = SiftSettings()
     weak, strong = structure(image, Sift(IDEAL, settings).extract(image).raw).T
     # Sobel's derivative smooths a little more than NumPy's differences.
-    assert (weak > 0.8 * settings.least_texture).all()
-    assert (weak > 0.5 * settings.least_roundness * strong).all()
+    assert (weak > 0.8 * sift.LEAST_TEXTURE).all()
+    assert (weak > 0.5 * sift.LEAST_ROUNDNESS * strong).all()

@@ -169,9 +169,6 @@ def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(
         ({"endpoints": ()}, "at least one endpoint"),
         ({"endpoints": ("localhost:7447",)}, "endpoints look like"),
         ({"mode": "router", "listen": ("tcp/x",)}, "endpoints look like"),
-        ({"retry_first": 2.0}, "retry_first"),
-        ({"lease": 0}, "lease"),
-        ({"router_queue": 17}, "router_queue"),
     ],
 )
 def test_settings_that_cannot_work(settings: dict[str, object], reason: str) -> None:

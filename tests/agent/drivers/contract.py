@@ -38,8 +38,9 @@ import sys, time
 from pathlib import Path
 from mapweave.agent.drivers.registry import find_driver
 from mapweave.agent.observation import Command
-from mapweave.settings import load_settings
-settings = load_settings(Path(sys.argv[1])).robot
+from mapweave.settings import load_settings, robot_settings
+path = Path(sys.argv[1])
+settings = robot_settings(load_settings(path), path)
 robot = find_driver(settings.driver)(settings)
 while True:
     robot.sense()
@@ -113,9 +114,9 @@ class RobotContract:
     @pytest.fixture
     def robot(self, settings: Path) -> Iterator[Robot]:
         from mapweave.agent.drivers.registry import find_driver
-        from mapweave.settings import load_settings
+        from mapweave.settings import load_settings, robot_settings
 
-        given: RobotSettings = load_settings(settings).robot
+        given: RobotSettings = robot_settings(load_settings(settings), settings)
         assert isinstance(given.camera, CameraSettings)
         robot = CheckedRobot(find_driver(given.driver)(given))
         robot.describe()

@@ -8,11 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.edge_measurement.landmark_refinement import (
-    LandmarkRefinement,
-    LandmarkRefinementSettings,
-    refined,
-)
+from mapweave.agent.edge_measurement import landmark_refinement
+from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement, refined
 from mapweave.agent.ekf.localization_filter import LocalizationFilter
 from mapweave.agent.ekf.localization_state import LocalizationState
 from mapweave.agent.localization.fix import Fix
@@ -62,12 +59,13 @@ def drive(rng: np.random.Generator, node: Landmarks, true: np.ndarray) -> Locali
     return one
 
 
-def test_four_drives_make_depths_better_and_never_too_sure():
-    """Each drive begins with the refined node of the drive before: one depth a landmark.
+def test_four_drives_make_depths_better_and_never_too_sure(monkeypatch):
+    """Each drive begins with what the one before has written back: one depth a landmark, as a node holds it.
 
     With the filter's own variances the mean of the squared normalised errors is 1.5 after four drives.
     """
-    settings = LandmarkRefinementSettings(least=1, share=1.0, floor=(0.0, 0.0))
+    for name, value in {"LEAST": 1, "SHARE": 1.0, "FLOOR": (0.0, 0.0)}.items():
+        monkeypatch.setattr(landmark_refinement, name, value)
     errors: list[list[float]] = [[] for _ in range(5)]
     nees: list[list[float]] = [[] for _ in range(5)]
     for seed in range(100, 112):
@@ -84,7 +82,7 @@ def test_four_drives_make_depths_better_and_never_too_sure():
             nees[count].append(float(np.mean((off / node.depth_sigmas) ** 2)))
             learned = drive(rng, node, true) if count < 4 else None
             if learned is not None and learned.healthy:
-                node = refined(node, *learned.state.depths(), settings) or node
+                node = refined(node, *learned.state.depths()) or node
     medians = [float(np.median(one)) for one in errors]
     assert medians[1] < 0.7 * medians[0] and medians[4] < 0.5 * medians[0]
     assert all(np.mean(one) < 1.0 for one in nees)
@@ -108,7 +106,7 @@ def test_depths_that_are_known_no_better_are_left_as_they_are():
     mapped = landmarks(DEPTHS, 0.1 * DEPTHS)
     sigmas = 0.1 * DEPTHS
     sigmas[:6] = 0.02
-    better = refined(mapped, DEPTHS + 0.05, sigmas, LandmarkRefinementSettings())
+    better = refined(mapped, DEPTHS + 0.05, sigmas)
     assert better is not None
     assert better.depths[:6] == pytest.approx(DEPTHS[:6] + 0.05) and (better.depth_sigmas[:6] < 0.1).all()
     assert (better.depth_sigmas[:6] > 0.02).all(), "tracks err alike, which no filter knows"
@@ -126,7 +124,7 @@ def test_too_small_or_contradicting_refinements_are_not_sent(trouble):
         depths *= 1.5
     if trouble == "nothing":
         depths[:] = sigmas[:] = np.nan
-    assert refined(mapped, depths, sigmas, LandmarkRefinementSettings()) is None
+    assert refined(mapped, depths, sigmas) is None
 
 
 class Teacher(NodeLocalizer):

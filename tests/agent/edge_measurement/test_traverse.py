@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder, TraverseSettings
+from mapweave.agent.edge_measurement import traverse
+from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
@@ -42,9 +43,9 @@ class Landmarks(NodeLocalizer):
 class Drive:
     """A robot on its way from A, whose wheels slip."""
 
-    def __init__(self, seed: int = 0, settings: TraverseSettings | None = None) -> None:
+    def __init__(self, seed: int = 0) -> None:
         self.rng = np.random.default_rng(seed)
-        self.surveyor = TraverseRecorder(ROBOT, settings)
+        self.surveyor = TraverseRecorder(ROBOT)
         self.pose = NODES[A]
         self.measured: list[Traverse] = []
 
@@ -81,16 +82,17 @@ def test_a_traverse_is_reported_when_the_next_node_is_reached():
     assert drive.told == [(A, B)]
 
 
-def test_traverse_errors_match_the_covariance():
+def test_traverse_errors_match_the_covariance(monkeypatch):
     """The mean over 60 drives: no surer than it is right, and not much less sure either."""
+    monkeypatch.setattr(traverse, "FLOOR", (0.0, 0.0))
     nees = []
     for seed in range(60):
-        drive = Drive(seed, TraverseSettings(floor=(0.0, 0.0)))
+        drive = Drive(seed)
         drive.by(A, 20)
         drive.by(None, 10)
         drive.by(B, 60)
-        [traverse] = drive.measured
-        nees.append(traverse.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[B]))
+        [measured] = drive.measured
+        nees.append(measured.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[B]))
     assert 1.0 < np.mean(nees) < 4.0
 
 
@@ -149,8 +151,9 @@ def test_a_detour_does_not_measure_the_straight_way():
     assert not drive.told
 
 
-def test_imprecise_traverses_are_not_reported():
-    drive = Drive(settings=TraverseSettings(widest=0.015))
+def test_imprecise_traverses_are_not_reported(monkeypatch):
+    monkeypatch.setattr(traverse, "WIDEST", 0.015)
+    drive = Drive()
     drive.by(A, 20)
     drive.by(B, 60)
     assert not drive.told

@@ -3,15 +3,12 @@
 import numpy as np
 import pytest
 
-from mapweave.agent.ekf.adaptive_odometry_noise import AdaptiveOdometryNoise
+from mapweave.agent.ekf.adaptive_odometry_noise import DISTRUST, AdaptiveOdometryNoise
 from mapweave.agent.ekf.filter_health import FilterHealth
 from mapweave.agent.ekf.motion import WheelNoise
-from mapweave.agent.ekf.settings import FilterSettings
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Pose2
-
-SETTINGS = FilterSettings(prior_depth=2.5, parallax_px=5.0, patience=2)
 
 
 def asked(converged: bool, watch: FilterHealth) -> Health:
@@ -19,7 +16,7 @@ def asked(converged: bool, watch: FilterHealth) -> Health:
 
 
 def test_parallax_is_counted_from_where_landmarks_were_taken_up() -> None:
-    watch = FilterHealth(SETTINGS, focal=250.0)
+    watch = FilterHealth(focal=250.0)
     for x in (0.02, 0.04, 0.049):
         watch.moved(np.array([x, 0.0, 0.1]))
         watch.saw(Health.GOOD, "")
@@ -35,7 +32,7 @@ def test_parallax_is_counted_from_where_landmarks_were_taken_up() -> None:
 
 
 def test_the_base_stays_where_it_is_under_a_new_anchor() -> None:
-    watch = FilterHealth(SETTINGS, focal=250.0)
+    watch = FilterHealth(focal=250.0)
     watch.took_up(np.array([0.3, 0.2, 0.0]))
     new = Pose2(0.34, 0.2, 2.0)
     watch.reanchored(new)
@@ -46,7 +43,7 @@ def test_the_base_stays_where_it_is_under_a_new_anchor() -> None:
 
 
 def test_missing_images_are_reported_first() -> None:
-    watch = FilterHealth(SETTINGS, focal=250.0)
+    watch = FilterHealth(focal=250.0)
     watch.saw(Health.FEW, "2 are left")
     watch.moved(np.zeros(3))
     assert watch.health(lambda: True) == (Health.FEW, "2 are left")
@@ -56,12 +53,12 @@ def test_missing_images_are_reported_first() -> None:
 
 def test_refuted_wheels_get_more_noise_for_a_while() -> None:
     noise = WheelNoise(0.24, 0.02)
-    trust = AdaptiveOdometryNoise(noise, FilterSettings(distrust=3, slip=(0.1, 0.2)))
+    trust = AdaptiveOdometryNoise(noise, 0.0)
     step, stands = Odometry(0.1, 0.0), Odometry(0.0, 0.0)
     np.testing.assert_array_equal(trust.root(step), noise.root(step))
     np.testing.assert_array_equal(trust.refuted(step, 7.0), noise.refuted_root(step, 7.0, 0.1))
-    for _ in range(3):
-        assert trust.increased
+    for _ in range(DISTRUST):
+        assert trust.doubted
         # Wheels that claim to stand may have gone anywhere.
         assert trust.root(stands)[0, 0] == pytest.approx(0.05)
     assert not trust.increased

@@ -57,13 +57,12 @@ def test_propagate(size: tuple[int, int]) -> None:
     n, _ = size
     rng, state = scene(*size)
     blocks, by_input = rng.normal(size=(n + 1, 3, 3)), rng.normal(size=(3 + 3 * n, 3))
-    variances, input_root = rng.random(3), rng.normal(size=(3, 3))
+    input_root = rng.normal(size=(3, 3))
     dense = np.zeros_like(state.covariance)
     for i in range(n + 1):
         dense[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = blocks[i]
     expected = dense @ state.covariance @ dense.T + by_input @ input_root @ input_root.T @ by_input.T
-    expected[:3, :3] += np.diag(variances)
-    got = propagate(state.covariance, blocks, by_input, input_root, variances)
+    got = propagate(state.covariance, blocks, by_input, input_root)
     close(got, expected, expected)
     assert np.array_equal(got, got.T)
 
@@ -79,8 +78,8 @@ def test_a_step_is_linearised_where_it_is_asked(
     forward, turn, mount = step
     at = Odometry(forward, turn)
     measured = Odometry(forward + rng.normal(0, 0.02), turn + rng.normal(0, 0.05)) if elsewhere else at
-    wheel_root, side_slip, variances = rng.normal(size=(2, 2)) * 0.01, 0.003, rng.random(3)
-    taken = Step(state, measured, wheel_root, side_slip, variances, mount, at, state.pose_vector, state.rays)
+    wheel_root, side_slip = rng.normal(size=(2, 2)) * 0.01, 0.003
+    taken = Step(state, measured, wheel_root, side_slip, mount, at, state.pose_vector, state.rays)
     pose_vector, by_pose, pose_by_input = move_pose(state.pose_vector, at)
     moved = move_rays(state.rays, at, mount)
     if moved.scale.min() < 0.05:
@@ -92,7 +91,6 @@ def test_a_step_is_linearised_where_it_is_asked(
         dense[3 + 3 * i : 6 + 3 * i, 3 + 3 * i : 6 + 3 * i] = moved.by_ray[i]
     covariance = dense @ state.covariance @ dense.T
     covariance += by_input @ dense_inputs(wheel_root, side_slip) @ by_input.T
-    covariance[:3, :3] += np.diag(variances)
     further = np.array([measured.forward - forward, measured.turn - turn])
     mean = np.concatenate([pose_vector, moved.rays.ravel()]) + by_input[:, :2] @ further
     after = taken.state
@@ -245,7 +243,7 @@ def test_the_step_is_linearised_at_the_turn_of_the_image(size: tuple[int, int]) 
     slots, root = some_slots(rng, n), rng.normal(size=(2, 2)) * 0.01
     measured, variances = Odometry(0.05, 0.02), rng.uniform(0.2, 2.0, 2)
     expected = move_rays(state.rays, measured, 0.1).rays
-    step = Step(state, measured, root, 0.003, rng.random(3), 0.1, measured, state.pose_vector, expected)
+    step = Step(state, measured, root, 0.003, 0.1, measured, state.pose_vector, expected)
     slopes = expected[slots, :2] + rng.normal(0, 0.01, (len(slots), 2))
     vote = turn_by_image(expected, slots, slopes, root, 4.0)
     after, examined = step.glanced(slots, slopes, variances, 4.0)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.motion import WheelNoise, move_pose, move_rays
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Pose2
@@ -15,9 +16,9 @@ AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_for
 STILL = Odometry(0.0, 0.0)
 
 
-def start(run: MappingRun, **settings: float) -> MappingFilter:
+def start(run: MappingRun, side_slip: float = 0.0, **settings: float) -> MappingFilter:
     made = FilterSettings(pixel_sigma=run.pixel_sigma, **settings)
-    filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, made)
+    filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, made, side_slip)
     filter_.add(np.arange(len(run.points)), run.pixels[0])
     return filter_
 

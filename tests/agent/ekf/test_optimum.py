@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.ekf.mapping_filter import MappingFilter
+from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
+from mapweave.agent.settings import FilterSettings
 from synthetic.mapping_error import error, filter_error, follow, landmark_nees
 from synthetic.mapping_optimum import batch_optimum
 from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
@@ -32,7 +34,7 @@ def everything(run: MappingRun) -> np.ndarray:
 def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     ratios = []
     for run, filter_ in runs[:6]:
-        pose_vector, points = batch_optimum(run, filter_.settings.prior_depth, filter_.settings.prior_spread)
+        pose_vector, points = batch_optimum(run, PRIOR_DEPTH, PRIOR_SPREAD)
         best = error(run, filter_.ids, pose_vector, points[filter_.ids])
         ratios.append(filter_error(run, filter_, everything(run)) / best)
     assert np.median(ratios) < 1.06

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from mapweave.agent.ekf import mapping_filter
-from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.pitch_correction import LEAST, pitch_offset
 from mapweave.agent.ekf.update_report import Health
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
 from synthetic.mapping_run import AXLE, CAMERA, WHEEL_NOISE, MappingRun, draw_run

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from mapweave.agent.exploration.carried_mapping import CarriedMapping, CarriedMappingSettings
+from mapweave.agent.exploration import carried_mapping
+from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.change import NodePut
@@ -60,11 +61,13 @@ def test_a_node_is_made_when_the_view_is_known_or_leaving(stage, node):
     assert stage.finished == node
 
 
-def test_settings_are_heeded():
+def test_limits_are_heeded(monkeypatch):
     stage = Stage(Pose2(0.3), converged_share=0.5)
     CarriedMapping(stage).step(TICK)
     assert not stage.finished
-    CarriedMapping(stage, CarriedMappingSettings(converged=0.4, depth_step=0.1)).step(TICK)
+    monkeypatch.setattr(carried_mapping, "CONVERGED", 0.4)
+    monkeypatch.setattr(carried_mapping, "DEPTH_STEP", 0.1)
+    CarriedMapping(stage).step(TICK)
     assert stage.finished
 
 

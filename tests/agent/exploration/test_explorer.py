@@ -7,10 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.exploration.settings import ExplorerSettings, Phase
+from mapweave.agent.exploration.phase import Phase
+from mapweave.agent.exploration.viewpoint_selection import REACH
 from mapweave.agent.mission import Answer, Explore, WhatIsKnown
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
@@ -26,8 +28,8 @@ ALL_AROUND = np.array([[0.1, 0.1, heading, 0.5] for heading in np.arange(0.0, ma
 
 
 def live(walls, settings: ExplorerSettings, ticks: int, told: dict[int, Answer], seed: int = 0) -> list[Step]:
-    """Let a pipeline explore a wide room with pictures ahead, with given answers at some ticks."""
-    pipeline = Pipeline(MAP, BODY, PipelineSettings(explorer=settings, seed=seed))
+    """Let a pipeline explore a wide room with pictures ahead, with what it is told at some ticks."""
+    pipeline = Pipeline(MAP, BODY, AgentSettings(exploration=settings, seed=seed))
     pipeline.set_mission(Explore())
     pose, moved, steps = Pose2(), Odometry(0.0, 0.0), []
     for tick in range(ticks):
@@ -53,9 +55,9 @@ def test_it_asks_about_its_own_map_and_nothing_waits_for_the_answer(walls):
     steps = live(walls, ExplorerSettings(), 40, {})
     (first, *_) = questions(steps)
     assert (first.map, first.x, first.y) == (MAP, pytest.approx(0.0), pytest.approx(0.0))
-    assert first.reach > ExplorerSettings().reach
+    assert first.reach > REACH
     assert first.number < 0, "the navigator's questions are positive"
-    silent = live(walls, ExplorerSettings(ask=False), 40, {})
+    silent = live(walls, ExplorerSettings(ask_fleet=False), 40, {})
     assert questions(silent) == []
     assert [step.command for step in steps] == [step.command for step in silent]
 
@@ -92,7 +94,7 @@ def turns(steps: list[Step]) -> list[float]:
 
 
 def test_the_papers_way_turns_to_a_side_by_chance_and_goes_on_by_chance(walls):
-    by_chance = ExplorerSettings(wander=True)
+    by_chance = ExplorerSettings(random=True)
     steps = live(walls, by_chance, 250, {})
     sides = turns(steps)
     assert len(sides) >= 3

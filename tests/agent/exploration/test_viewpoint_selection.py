@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from mapweave.agent.clearance import ASIDE, BEFORE, clearance
 from mapweave.agent.exploration.fleet_coverage import FleetCoverage
-from mapweave.agent.exploration.settings import ExplorerSettings
 from mapweave.agent.exploration.viewpoint_selection import next_viewpoint, seen_around, views_of
 from mapweave.agent.mission import Answer, WhatIsKnown
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap

@@ -11,6 +11,7 @@ import pytest
 from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.global_localization.candidates import FleetMap, OwnMap
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
+from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
 from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Observation, Odometry
@@ -136,7 +137,7 @@ def test_a_robot_that_has_lost_all_landmarks_turns_to_headings_of_nearby_nodes(h
     eyes = Eyes(home, TOUR[1] @ Pose2(0.05, 0.0, turned))
     motion = MotionPrimitives(BODY, 50)
     own = OwnMap(own_map, np.random.default_rng(0))
-    lost = GlobalLocalization(BODY, eyes, motion, own, FleetMap(motion))  # type: ignore[arg-type]
+    lost = GlobalLocalization(BODY, eyes, motion, own, TO_NAVIGATE, FleetMap(motion))  # type: ignore[arg-type]
     # The wheels' belief is off by a little.
     believed = TOUR[0].inverse() @ TOUR[1] @ Pose2(0.1, -0.05, turned + 0.08)
     behaviour, moved, way, fix = lost.search(believed), Odometry(0.0, 0.0), 0.0, None

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from mapweave.agent.global_localization.global_localization import MOVE
+from mapweave.agent.global_localization.pose_consistency import OTHER_VIEW
 from mapweave.agent.global_localization.resumption import Resumption
-from mapweave.agent.global_localization.settings import ResumptionSettings
+from mapweave.agent.global_localization.search_policy import TO_MAP, SearchPolicy
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -22,7 +23,7 @@ from synthetic.world import CAMERA, World, room, take_map, take_view
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
 BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)
-QUICK = ResumptionSettings(turns=(1, 1), places=2)
+QUICK = replace(TO_MAP, turns=(1, 1), places=2)
 FREE = np.full(len(BEARINGS), 3.0)
 PLACE = Pose2(2.5, 2.0)
 HEADINGS = np.arange(0, math.tau, math.tau / 7)
@@ -86,7 +87,7 @@ def search(
     body: Body,
     ticks: int = 1000,
     drives: bool = True,
-    settings: ResumptionSettings = QUICK,
+    policy: SearchPolicy = QUICK,
     proximity: np.ndarray = FREE,
     description: RobotDescription = BODY,
     carry: Iterable[Pose2] = (),
@@ -100,14 +101,14 @@ def search(
         body: it.
         ticks: the time.
         drives: whether it may.
-        settings: of the resumption.
+        policy: of the resumption.
         proximity: what its rangers read all the time.
         description: of the body.
         carry: where others put it, tick by tick; its wheels notice.
         scale: by how much too far they turn then.
         camera: whether there are images.
     """
-    resumption = Resumption(description, body, own_map, drives, settings)  # type: ignore[arg-type]
+    resumption = Resumption(description, body, own_map, drives, policy=policy)  # type: ignore[arg-type]
     moved, path = Odometry(0.0, 0.0), iter(carry)
     for tick in range(ticks):
         image = np.zeros((240, 320), np.uint8) if camera else None
@@ -144,7 +145,7 @@ def test_it_turns_until_two_views_agree_where_it_is(home, own_map, heading):
     assert abs(wrap_angle(here.heading - body.pose.heading)) < 0.03
     assert body.commands[-1] == Command()
     assert all(command.forward == 0.0 for command in body.commands)
-    assert QUICK.consistency.turn <= turned(body) < math.pi, "and no further than it needs"
+    assert OTHER_VIEW[1] <= turned(body) < math.pi, "and no further than it needs"
     # The rangers' readings are kept with the poses from which they were taken.
     assert len(resumption.seen) == len(body.commands)
     for odom_from_robot, _ in resumption.seen:
@@ -230,13 +231,13 @@ def test_a_carried_robot_need_not_turn(home):
     body = Body(home, path[0])
     resumption = search(map_of(home, tour), body, ticks=50, drives=False, carry=path)
     assert resumption.found is not None
-    assert body.pose.x - path[0].x >= QUICK.consistency.way
+    assert body.pose.x - path[0].x >= OTHER_VIEW[0]
 
 
 def test_a_carried_robot_gives_up_in_the_end(elsewhere, own_map):
-    patience = ResumptionSettings(carried_looks=5)
+    patience = replace(TO_MAP, carried_views=5)
     body = Body(elsewhere, PLACE)
-    assert search(own_map, body, drives=False, settings=patience).lost
+    assert search(own_map, body, drives=False, policy=patience).lost
     assert body.said[-1].endswith("nothing was recognised in 5 images")
     assert len(body.commands) == pytest.approx(5 * patience.carried_pause / BODY.tick, abs=6)
 
@@ -262,7 +263,7 @@ def test_neither_of_two_similar_places_is_accepted(home, own_map, apart, counts)
 
 def test_a_recognition_that_is_not_exact_does_not_count(home, own_map):
     body = Body(home, PLACE)
-    assert search(own_map, body, ticks=150, settings=replace(QUICK, sure=(1e-5, 1e-5))).found is None
+    assert search(own_map, body, ticks=150, policy=replace(QUICK, sure=(1e-5, 1e-5))).found is None
     assert any("is in view, but too far off" in said for said in body.said)
     assert not any("landmarks agree" in said for said in body.said)
 

@@ -8,12 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.localization.place_recognition import (
-    PlaceRecognitionSettings,
-    lookalikes,
-    recognise_place,
-    recognise_places,
-)
+from mapweave.agent.localization import place_recognition
+from mapweave.agent.localization.place_recognition import lookalikes, recognise_place, recognise_places
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, NodeId
@@ -59,13 +55,15 @@ def test_a_view_is_recognised_where_it_was_taken(world, tour, own_map, seed):
     assert answered.distance(true) < 0.10
     assert abs((answered.inverse() @ true).heading) < math.radians(2)
     assert recognition.node_from_robot.mahalanobis2(place.inverse() @ true) < 25
-    assert recognition.inliers >= PlaceRecognitionSettings().least_inliers
+    assert recognition.inliers >= place_recognition.LEAST_INLIERS
 
 
-def test_the_node_with_the_most_inliers_is_named(world, tour, own_map):
+def test_the_node_with_the_most_inliers_is_named(world, tour, own_map, monkeypatch):
+    monkeypatch.setattr(place_recognition, "TRIES", 16)
+    monkeypatch.setattr(place_recognition, "VOTES", 1)
     rng = np.random.default_rng(3)
     view, _ = take_view(world, tour[3], rng)
-    found = recognise_place(own_map, view, rng, PlaceRecognitionSettings(tries=16, votes=1))
+    found = recognise_place(own_map, view, rng)
     assert found is not None
     assert found[0].id.number == 2 * 3 + 1
 
@@ -94,12 +92,13 @@ def test_nothing_to_recognise(world, own_map):
     assert recognise_place(also_bare, view, rng) is not None
 
 
-def test_the_limits_are_heeded(world, own_map):
+@pytest.mark.parametrize(("limit", "value"), [("VOTES", 10_000), ("TRIES", 0), ("LEAST_INLIERS", 10_000)])
+def test_the_limits_are_heeded(world, own_map, monkeypatch, limit, value):
     rng = np.random.default_rng(0)
     view, _ = take_view(world, Pose2(2.5, 2.0, 0.05), rng)
-    assert recognise_place(own_map, view, rng, PlaceRecognitionSettings(votes=10_000)) is None
-    assert recognise_place(own_map, view, rng, PlaceRecognitionSettings(tries=0)) is None
-    assert recognise_place(own_map, view, rng, PlaceRecognitionSettings(least_inliers=10_000)) is None
+    assert recognise_place(own_map, view, rng) is not None
+    monkeypatch.setattr(place_recognition, limit, value)
+    assert recognise_place(own_map, view, rng) is None
 
 
 def test_the_same_chance_gives_the_same_answer(world, own_map):

@@ -9,17 +9,10 @@ import skimage.data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapweave.agent.mapping.kidnap_detection import (
-    FrameOverlap,
-    KidnapDetector,
-    KidnapDetectorSettings,
-    relit,
-    turned,
-)
-from mapweave.agent.mapping.mapper import Mapper, MapperSettings
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
+from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit, turned
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry
-from mapweave.agent.vision.tracker import TrackerSettings
+from mapweave.agent.settings import AgentSettings, TrackerSettings, TrackingSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
@@ -35,7 +28,6 @@ def continuity(description) -> KidnapDetector:
         Lens(description.camera, description.distortion),
         description.camera,
         TrackerSettings(),
-        KidnapDetectorSettings(),
     )
 
 
@@ -146,7 +138,7 @@ def watch(mapper: Mapper, images, forward: float = 0.0) -> None:
 @pytest.fixture
 def mapper(walls, description) -> Mapper:
     """It has seen the walls for a moment."""
-    patient = MapperSettings(tracking=TrackingSettings(patience=10, blank_patience=30))
+    patient = AgentSettings(tracking=TrackingSettings(patience=10, blank_patience=30))
     mapper = Mapper(MapId("r0", 1), description, patient)
     watch(mapper, [walls.render(HERE)] * 3)
     assert mapper.tracked > 40

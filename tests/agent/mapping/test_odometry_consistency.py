@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.agent.mapping.odometry_consistency import OdometryConsistency, OdometryConsistencySettings
+from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Pose2
 
 
 def drive(steps, wheels):
     """The pose that truly comes of steps, and a dispute that heard what the wheels made of them."""
-    dispute, true = OdometryConsistency(OdometryConsistencySettings()), Pose2()
+    dispute, true = OdometryConsistency(), Pose2()
     for step in steps:
         dispute.step(wheels(step))
         true = true @ step.motion()

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder, TrajectoryRecorderSettings
+from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.observation import Observation, Odometry
-from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.trajectory_segment import MOST
@@ -31,7 +30,7 @@ def seen(tick: int, proximity: tuple[float, ...] = (1.0, 3.0)) -> Observation:
 
 
 def test_one_moment_a_second_with_the_readings(clocked):
-    wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
+    wayside = TrajectoryRecorder(clocked)
     wayside.clear(0)
     for tick in range(1, 46):
         wayside.step(seen(tick), Pose2(0.01 * tick, 0.0, 0.002 * tick))
@@ -42,7 +41,7 @@ def test_one_moment_a_second_with_the_readings(clocked):
 
 
 def test_a_missing_reading_carries_no_information(clocked):
-    wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
+    wayside = TrajectoryRecorder(clocked)
     wayside.clear(0)
     for tick, proximity in ((10, (2.0, 2.0)), (20, ()), (30, (2.0, 2.0))):
         wayside.step(seen(tick, proximity), Pose2())
@@ -54,7 +53,7 @@ def test_a_missing_reading_carries_no_information(clocked):
 def test_a_robot_without_sensors_keeps_poses_and_one_without_a_clock_nothing(description):
     for clock, count in (("net", 3), ("", 0)):
         robot = replace(description, clock=clock)
-        wayside = TrajectoryRecorder(robot, TrajectoryRecorderSettings())
+        wayside = TrajectoryRecorder(robot)
         for tick in range(10, 40):
             wayside.step(seen(tick), Pose2())
         wake = wayside.wake(0, robot.ranges(np.zeros(0)))
@@ -62,7 +61,7 @@ def test_a_robot_without_sensors_keeps_poses_and_one_without_a_clock_nothing(des
 
 
 def test_a_long_wait_is_thinned_evenly(clocked):
-    wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
+    wayside = TrajectoryRecorder(clocked)
     for tick in range(1, 2500):
         wayside.step(seen(tick), Pose2())
     wake = wayside.wake(0, clocked.ranges(np.array([1.0, 3.0])))
@@ -72,7 +71,7 @@ def test_a_long_wait_is_thinned_evenly(clocked):
 
 
 def test_moments_before_a_view_that_became_no_node_belong_to_the_next(clocked):
-    wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
+    wayside = TrajectoryRecorder(clocked)
     wayside.clear(0)
     wayside.step(seen(10), Pose2(0.3, 0.1, 0.5))
     moved = Pose2(1.0, -0.5, 2.0)
@@ -108,9 +107,3 @@ def test_a_mapped_drive_records_the_trajectory(walls, clocked):
     # The next node begins with none of it.
     mapper.finish(replace(observation, stamp_ns=observation.stamp_ns + 1))
     assert sum(len(one.wake) for one in mapper.map.nodes.values()) == 3
-
-
-@pytest.mark.parametrize("period", [0.0, -1.0, np.nan])
-def test_a_period_that_is_no_time_is_refused(period):
-    with pytest.raises(InvalidValue, match="wayside"):
-        TrajectoryRecorderSettings(period)

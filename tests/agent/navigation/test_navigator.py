@@ -10,10 +10,10 @@ import pytest
 from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
-from mapweave.agent.navigation.blocked_edges import BlockedEdges, BlockedEdgeSettings
-from mapweave.agent.navigation.navigator import NavigatorSettings, Stage
+from mapweave.agent.navigation.blocked_edges import BlockedEdges
+from mapweave.agent.navigation.navigator import Stage
 from mapweave.agent.navigation.onboard_router import onboard_route
-from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
+from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
@@ -43,9 +43,7 @@ from tests.agent.scripted_fleet import (
 def blocked_trial(home: World, forget: float = 15.0) -> tuple[Trial, list[tuple[float, WhichWay]]]:
     """A robot before a wall through which the only way leads; the fleet knows no other."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
-    settings = NavigatorSettings(
-        blocks=BlockedEdgeSettings(forget=forget), follower=RouteFollowerSettings(blind=1e9)
-    )
+    settings = NavigatorSettings(blocked_first=forget, blind_distance=1e9)
     nav = navigator(eyes, NOWHERE, B, settings)
     routes: list[tuple[float, WhichWay]] = []
 
@@ -87,7 +85,7 @@ def test_a_block_is_forgotten_after_a_while_and_for_longer_each_time(home):
 
 def test_it_goes_around_by_another_way(home):
     eyes = Eyes(home, Pose2(2.5, 2.0))
-    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(follower=RouteFollowerSettings(blind=1e9)))
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9))
     answered: list[tuple[NodeId, ...]] = []
 
     def fleet(question: Question) -> Answer:
@@ -108,8 +106,8 @@ def test_it_goes_around_by_another_way(home):
 def test_endless_parking_is_retried_before_it_is_a_block(home):
     """Almost at the goal, held there by nothing that could block another robot."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
-    follower = RouteFollowerSettings(blind=1e9, parking_patience=3.0)
-    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(follower=follower))
+    settings = NavigatorSettings(blind_distance=1e9, parking_patience=3.0)
+    nav = navigator(eyes, NOWHERE, B, settings)
     routes: list[WhichWay] = []
 
     def fleet(question: Question) -> Answer:
@@ -125,7 +123,7 @@ def test_endless_parking_is_retried_before_it_is_a_block(home):
 
 
 def test_blocks_are_kept_for_a_time_that_doubles():
-    blocks = BlockedEdges(BlockedEdgeSettings(forget=10.0, longest=25.0))
+    blocks = BlockedEdges(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
     blocks.add(B, A, 0.0)
     assert blocks.at(9.9) == ((A, B),) and blocks.at(10.0) == ()
     blocks.add(A, B, 20.0)
@@ -200,9 +198,9 @@ def test_a_photograph_of_unknown_distance_is_driven_to_and_a_vague_pose_is_not(h
 
 
 def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home):
-    """A long way without a view: by wheels as far as `blind`, twice `further`, and only then it is lost."""
+    """A long way without a view: by wheels twice a little further, and only then it is lost."""
     eyes = Eyes(home, Pose2(0.5, 2.0))
-    settings = NavigatorSettings(follower=RouteFollowerSettings(blind=1.0), further=0.5, looks=2)
+    settings = NavigatorSettings(blind_distance=1.0, further=0.5, looks=2)
     nav = navigator(eyes, NOWHERE, B, settings)
     looks: list[float] = []
     ahead = RouteLeg(bare(B), PoseGaussian(Pose2(9.0), EXACT), None)

@@ -6,14 +6,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.localization.node_detector import Expected, NodeDetector, NodeDetectorSettings
+from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.progress_monitor import ProgressMonitor
-from mapweave.agent.navigation.route_follower import MOST_CANDIDATES, RouteFollower, RouteProgress
-from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
+from mapweave.agent.navigation.route_follower import (
+    MOST_CANDIDATES,
+    STALLED_PARKING,
+    RouteFollower,
+    RouteProgress,
+)
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.servo.servo_step import ServoStep
 from mapweave.agent.servo.supervisor import Servo
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -48,9 +53,7 @@ def follower_at_the_goal(node: Node) -> RouteFollower:
     fix = Fix(node.id, HERE, Deluded(node))  # type: ignore[arg-type]
     route = (RouteLeg(node, HERE, None),)
     rng = np.random.default_rng(0)
-    return RouteFollower(
-        ROBOT, lens, Sift(lens), route, fix, LocalPlanner(ROBOT), RouteFollowerSettings(), rng
-    )
+    return RouteFollower(ROBOT, lens, Sift(lens), route, fix, LocalPlanner(ROBOT), AgentSettings(), rng)
 
 
 @pytest.mark.parametrize(
@@ -76,13 +79,13 @@ def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch
     """Tilted, and of a scale that is off by a quarter: the robot has only the photograph to go by."""
     held = photograph(node, scale, pitch, roll)
     pose, lens = Pose2(-0.7, 0.12, -0.1), Lens(ROBOT.camera, ROBOT.distortion)
-    lookout = NodeDetector(ROBOT, lens, Sift(lens), NodeDetectorSettings(), np.random.default_rng(0))
+    lookout = NodeDetector(ROBOT, lens, Sift(lens), np.random.default_rng(0))
     believed = Pose2(scale * pose.x, scale * pose.y, pose.heading)
     found = lookout.find(walls.render(pose), [Expected(0, held, believed)])
     assert found is not None
     rng, route = np.random.default_rng(0), (RouteLeg(held, HERE, None),)
     follower = RouteFollower(
-        ROBOT, lens, Sift(lens), route, Fix.of(found[1]), LocalPlanner(ROBOT), RouteFollowerSettings(), rng
+        ROBOT, lens, Sift(lens), route, Fix.of(found[1]), LocalPlanner(ROBOT), AgentSettings(), rng
     )
     odometry = Odometry(0.0, 0.0)
     for tick in range(400):
@@ -113,7 +116,7 @@ def test_a_new_detection_replaces_tracks_only_with_many_more_landmarks(walls, no
     """Tracks have been filtered for a while; a look that knows hardly more has not."""
     lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
     image = walls.render(pose)
-    lookout = NodeDetector(ROBOT, lens, Sift(lens), NodeDetectorSettings(), np.random.default_rng(0))
+    lookout = NodeDetector(ROBOT, lens, Sift(lens), np.random.default_rng(0))
     view = Sift(lens).extract(image).view(CAMERA)
     found = recognise(node, view, None, np.random.default_rng(0))
     assert found is not None
@@ -126,7 +129,7 @@ def test_a_new_detection_replaces_tracks_only_with_many_more_landmarks(walls, no
 
 def test_nodes_are_found_where_they_are_expected_only(walls, node):
     lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
-    lookout = NodeDetector(ROBOT, lens, Sift(lens), NodeDetectorSettings(), np.random.default_rng(0))
+    lookout = NodeDetector(ROBOT, lens, Sift(lens), np.random.default_rng(0))
     image, elsewhere = walls.render(pose), pose @ Pose2(-0.5)
     assert lookout.find(image, [Expected(3, node, elsewhere)]) is None
     found = lookout.find(image, [Expected(7, node, elsewhere), Expected(3, node, elsewhere, doubt=2.0)])
@@ -144,7 +147,7 @@ def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypat
     dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
     commands = [follower.step(Observation(k * 10**8, Odometry(0.0, 0.0), dark)) for k in range(140)]
     moved = [command.forward > 0.0 for command in commands]
-    stood = round(RouteFollowerSettings().stalled_parking / ROBOT.tick)
+    stood = round(STALLED_PARKING / ROBOT.tick)
     assert not any(moved[: stood - 1])
     assert all(moved[stood + 2 : stood + 30])
     assert follower.progress is RouteProgress.DRIVING
@@ -169,7 +172,7 @@ def test_a_route_with_a_thousand_nodes_in_one_place_needs_few_detections(node, m
     ahead = PoseGaussian(Pose2(0.5), np.zeros((3, 3)))
     route = (RouteLeg(node, HERE, None), *[RouteLeg(node, ahead, None)], *[RouteLeg(node, HERE, None)] * 1000)
     follower = RouteFollower(
-        ROBOT, lens, Sift(lens), route, Fix(node.id, HERE), LocalPlanner(ROBOT), RouteFollowerSettings(),
+        ROBOT, lens, Sift(lens), route, Fix(node.id, HERE), LocalPlanner(ROBOT), AgentSettings(),
         np.random.default_rng(0),
     )  # fmt: skip
     for tick in range(8):

@@ -16,7 +16,6 @@ from mapweave.agent.servo.field_of_view import FieldOfView
 from mapweave.agent.servo.lattice_planner import FARTHEST, lattice_plan
 from mapweave.agent.servo.plan import Plan, Price, Surroundings
 from mapweave.agent.servo.planner import thorough_plan
-from mapweave.agent.servo.settings import ServoSettings
 from mapweave.agent.servo.two_leg_planner import two_leg_plan
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
@@ -80,7 +79,7 @@ def test_a_wall_in_the_way_is_driven_around(
     assert plan is not None
     assert plan.length > math.hypot(start.x + 0.9, half) + math.hypot(0.9, half)
     check(plan, start, points, robot.camera, seen, wall)
-    either = thorough_plan(around, start, ServoSettings())
+    either = thorough_plan(around, start)
     assert either is not None
     check(either, either.start, points, robot.camera, seen, wall)
 
@@ -90,13 +89,13 @@ def test_there_is_no_plan_out_of_a_ring(robot: RobotDescription) -> None:
     angles = np.linspace(0.0, 2 * math.pi, 60)
     ring = np.column_stack([-1.6 + 0.4 * np.cos(angles), 0.4 * np.sin(angles)])
     around = Surroundings(FieldOfView(points, robot.camera), ring, 0.2)
-    assert thorough_plan(around, Pose2(-1.6, 0.0, 0.0), ServoSettings()) is None
+    assert thorough_plan(around, Pose2(-1.6, 0.0, 0.0)) is None
 
 
 def test_there_is_no_plan_to_a_goal_that_sees_nothing(robot: RobotDescription) -> None:
     points = np.array([[-3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
     around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
-    assert thorough_plan(around, Pose2(-0.5, 0.0, math.pi), ServoSettings()) is None
+    assert thorough_plan(around, Pose2(-0.5, 0.0, math.pi)) is None
 
 
 def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription) -> None:

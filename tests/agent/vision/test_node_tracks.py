@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.node_tracks import NodeTracks
-from mapweave.agent.vision.tracker import TrackerSettings
 from mapweave.hybridmap.pose import Pose2
 from mapweave.registration.recognition import recognise
 from mapweave.vision.lens import Lens

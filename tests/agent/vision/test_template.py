@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapweave.agent.vision.template import TemplateMatcher, TemplateSettings
+from mapweave.agent.vision.template import HALF_PX, SIGMA_PX, TemplateCriteria, TemplateMatcher
 
 SPOTS = np.array([[x + 0.37, y - 0.21] for x in range(60, 280, 40) for y in range(50, 200, 35)])
 
@@ -21,11 +21,10 @@ def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def patches(image: np.ndarray, at: np.ndarray, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """A patch of mean 0 and deviation 1, and its weights, as the settings say."""
-    s = TemplateSettings()
-    side = np.arange(-s.half_px, s.half_px + 1.0)
+    """A patch of mean 0 and deviation 1, and its weights, as the product's."""
+    side = np.arange(-HALF_PX, HALF_PX + 1.0)
     x, y = (grid.ravel() for grid in np.meshgrid(side, side))
-    weights = np.exp(-(x**2 + y**2) / (2 * s.sigma_px**2))
+    weights = np.exp(-(x**2 + y**2) / (2 * SIGMA_PX**2))
     weights /= weights.sum()
     patch = bilinear(image, at[0] + scale * x, at[1] + scale * y)
     patch = patch - weights @ patch
@@ -80,7 +79,7 @@ def test_a_match_is_the_best_there_is(pictures, name):
     spots = textured(image)[::3]
     guess = pictures.mapped(motion, spots) + np.random.default_rng(4).uniform(-0.5, 0.5, spots.shape)
     # More steps than on a robot, where the next image corrects what is left of this one.
-    matcher = TemplateMatcher(TemplateSettings(iterations=8))
+    matcher = TemplateMatcher(TemplateCriteria(iterations=8))
     match = matcher.match(matcher.cut(image, spots), seen, guess)
     steps, growths = np.arange(-0.2, 0.21, 0.05), (0.97, 0.985, 1.0, 1.015, 1.03)
     checked = 0

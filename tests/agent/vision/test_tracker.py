@@ -7,7 +7,8 @@ import copy
 import numpy as np
 import pytest
 
-from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.vision.lens import Lens

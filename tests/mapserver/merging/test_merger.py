@@ -15,8 +15,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.calibration import HypothesisSupport, probabilities
 from mapweave.mapserver.relocalization.place_hypotheses import fuse
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
-from mapweave.mapserver.relocalization.verdict import HypothesisSelectionSettings
-from mapweave.mapserver.routes import Router, RouterSettings
+from mapweave.mapserver.routes import NEAR, Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.recognition import examine_matches
 from synthetic.world import Sensing, World, room, take_map, take_view
@@ -207,7 +206,7 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
         merger.index,
         merger.node,
         merger.merged(),
-        RelocalizationSettings(judgement=HypothesisSelectionSettings(alone=1000), faint=0.0),
+        RelocalizationSettings(faint=0.0),
     )
     quick, rng, counts = relocalizer(merger), np.random.default_rng(11), np.zeros(2, int)
     for stop in list(scene.truth.values())[::4]:
@@ -310,7 +309,7 @@ def test_routes_lead_from_map_to_map_by_measured_edges(scene: Scene, merger: Mer
         edge = edges.get(frozenset((before.node.id, leg.node.id)))
         if edge is None:  # two nodes in one place that look in different directions
             assert leg.kind is EdgeKind.LOOP
-            assert leg.previous_from_node.mean.distance(Pose2()) < RouterSettings().near
+            assert leg.previous_from_node.mean.distance(Pose2()) < NEAR
         else:
             assert leg.kind is edge.kind
         true = scene.truth[before.node.id].inverse() @ scene.truth[leg.node.id]
@@ -338,7 +337,7 @@ def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger) -> None:
 def test_long_undriven_links_are_avoided(scene: Scene, merger: Merger) -> None:
     merged = merger.merged()
     start, goal = min(scene.truth), max(scene.truth)
-    bold = RouterSettings(route=RouteSettings(per_undriven=0.0))
+    bold = RouteSettings(per_undriven=0.0)
     undriven = {EdgeKind.LOOP, EdgeKind.MERGED}
 
     def longest(router: Router) -> float:

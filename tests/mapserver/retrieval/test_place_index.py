@@ -43,8 +43,8 @@ def brute_force(nodes: list[Node], view: View, s: PlaceIndexSettings) -> dict[No
         nearest = sorted((float(((feature - v) ** 2).sum()), node) for v, node in everything)[: s.votes]
         best: dict[NodeId, float] = {}
         for squared, node in nearest:
-            if squared < s.reach**2:
-                best[node] = max(best.get(node, 0.0), 1 - squared / s.reach**2)
+            if squared < place_index.REACH**2:
+                best[node] = max(best.get(node, 0.0), 1 - squared / place_index.REACH**2)
         for node, weight in best.items():
             scores[node] += weight / np.sqrt(len(best))
     return scores

@@ -98,7 +98,7 @@ def test_robots_of_different_kinds(tmp_path):
         (('robot = "r1"', ""), "robot is missing"),
         (("factor = 0.5", "factor = -1.0"), "factor"),
         (("at = 5.0", "at = -5.0"), "at must be 0 to"),
-        (("at = 5.0", 'at = "soon"'), "'soon' is no float"),
+        (("at = 5.0", 'at = "soon"'), "at: expected float, got str; it is 'soon'"),
         (('after = "joined"', 'after = "merged"'), "known are joined"),
         (("within = 60.0", ""), "needs within"),
         (("components = 1", "component = 1"), "did you mean 'components'"),

@@ -27,13 +27,12 @@ from mapweave.merge.outlier_rejection.link_probability import (
     prior_odds,
     standpoints,
 )
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.pose_graph.verification import VerificationSettings
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.recognition import RecognitionSettings
 from synthetic.world import room, take_map
 
@@ -183,7 +182,7 @@ def test_refused_pairs_say_what_they_lack(merged: MergedMap) -> None:
 
 def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None:
     link = between(merged)[0]
-    strict = VerificationSettings(RecognitionSettings(least_inliers=12))
+    strict = RecognitionSettings(least_inliers=12)
     # One of the two nodes has kept eleven landmarks, all of which agree.
     shared = link.shared[:11]
     a = merged.maps[link.a.map].nodes[link.a]
@@ -192,7 +191,7 @@ def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None
     told = explain_nodes(both, *link.pair, strict)
     assert told.standing is Standing.UNCOMPARED and told.a_from_b is None
     assert "11 features match" in told.reason
-    told = explain_nodes(both, *link.pair, VerificationSettings(RecognitionSettings(least_cells=25)))
+    told = explain_nodes(both, *link.pair, RecognitionSettings(least_cells=25))
     assert told.reason.endswith("of 24 image cells") and told.a_from_b is not None
     assert len(told.shared) == told.evidence["inliers"] == len(told.residuals_px) >= 10
     assert {(int(shared[i, 0]), int(j)) for i, j in told.shared} <= set(map(tuple, shared.tolist()))

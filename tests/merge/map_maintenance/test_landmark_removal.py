@@ -14,21 +14,15 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.mapserver.active_nodes import without_faded
-from mapweave.mapserver.merging.merger import Merger, MergerSettings
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.map_maintenance import landmark_observations as observations
+from mapweave.merge.map_maintenance import landmark_removal as removal
+from mapweave.merge.map_maintenance import node_superseding
 from mapweave.merge.map_maintenance.landmark_observations import LandmarkObservations, expected
-from mapweave.merge.map_maintenance.landmark_removal import (
-    LandmarkRemovalSettings,
-    LandmarkRemover,
-    detection_rate,
-    presence,
-    things,
-)
-from mapweave.merge.map_maintenance.node_superseding import NodeSupersedingSettings
+from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover, detection_rate, presence, things
 from mapweave.merge.pose_graph.links import Link
 from synthetic.world import CAMERA, Sensing, World, random_vectors, room, take_map, take_node
 
-S = LandmarkRemovalSettings()
-L = S.looks
 SHARP = Sensing(unknown_depth=0.0, clutter=5, most=150)
 
 
@@ -54,20 +48,20 @@ def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]
     """Every sequence of there and gone, hidden and not, weighed with it and with what was seen."""
     looks = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(story)]
     weights = {True: 0.0, False: 0.0}
-    told = [(seen, detection_rate(ALONE, one, S)) for seen, one in zip(story, looks, strict=True)]
+    told = [(seen, detection_rate(ALONE, one)) for seen, one in zip(story, looks, strict=True)]
     told = [(seen, rate) for seen, rate in told if seen is not None]
     for states in product([True, False], repeat=len(told) + 1):
         for veils in product([True, False], repeat=len(told)):
-            weight = S.at_first if states[0] else 1 - S.at_first
+            weight = removal.AT_FIRST if states[0] else 1 - removal.AT_FIRST
             for (before, now), veil, (seen, rate) in zip(pairwise(states), veils, told, strict=True):
-                stays = 1 - S.goes if before else 1 - S.comes
+                stays = 1 - removal.GOES if before else 1 - removal.COMES
                 weight *= stays if now == before else 1 - stays
-                weight *= S.hidden if veil else 1 - S.hidden
-                # A false detection does not depend on what is there.
-                likely = (0.0 if veil else rate) if now else S.mistaken
+                weight *= removal.HIDDEN if veil else 1 - removal.HIDDEN
+                # Who finds by mistake what is gone finds it whatever stands there.
+                likely = (0.0 if veil else rate) if now else removal.MISTAKEN
                 weight *= likely if seen else 1 - likely
             weights[states[-1]] += weight
-    there = presence(ALONE, looks, S)[0]
+    there = presence(ALONE, looks)[0]
     assert there == pytest.approx(weights[True] / sum(weights.values()), abs=1e-12)
 
 
@@ -81,21 +75,21 @@ def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None
     def after(misses: int, hits: int = 0, things: np.ndarray = together) -> np.ndarray:
         story = [look([True] * 6, [False] * 6, k) for k in range(misses)]
         story += [look([True] * 6, [True] + [False] * 5, misses + k) for k in range(hits)]
-        return presence(things, story, S)
+        return presence(things, story)
 
     course = [after(k)[0] for k in range(12)]
     assert all(later < earlier for earlier, later in pairwise(course))
-    assert course[1] > S.faint > course[3]
-    assert after(11, 1)[0] > S.faint, "it is back"
-    assert (after(0, 4) > S.faint)[:6].all(), "what is missed beside what is found is not gone"
+    assert course[1] > removal.FAINT > course[3]
+    assert after(11, 1)[0] > removal.FAINT, "it is back"
+    assert (after(0, 4) > removal.FAINT)[:6].all(), "what is missed beside what is found is not gone"
     one_visit = [look([True] * 6, [False] * 6, 0)] * 9
-    assert presence(together, one_visit, S)[0] > S.faint, "somebody may have stood before it all the while"
+    assert presence(together, one_visit)[0] > removal.FAINT, "somebody may have stood before it all the while"
     lonely = np.eye(26, dtype=np.bool_)
     lonely[6:, 6:] = True
     alone = [after(k, things=lonely)[0] for k in range(14)]
-    assert 4 <= next(k for k, there in enumerate(alone) if there < S.faint) <= 12
+    assert 4 <= next(k for k, there in enumerate(alone) if there < removal.FAINT) <= 12
     nobody = [look([False] * 6, [False] * 6, k) for k in range(20)]
-    assert presence(together, nobody, S)[0] == S.at_first, "nobody could have seen it"
+    assert presence(together, nobody)[0] == removal.AT_FIRST, "nobody could have seen it"
 
 
 def test_near_landmarks_may_be_of_one_thing() -> None:
@@ -116,22 +110,22 @@ def test_expected_landmarks_are_visible_near_and_unoccluded() -> None:
     old, new = (
         take_node(world, NodeId("r", k, 1), pose, nothing, rng, SHARP) for k, pose in ((1, here), (2, there))
     )
-    shown = expected(old, new, here.inverse() @ there, L)
+    shown = expected(old, new, here.inverse() @ there)
     points = here.apply(old.points_in_robot)
     known = there.apply(new.points_in_robot)
     seen = 0
     for k, point in enumerate(points):
         pixel = CAMERA.project(there.inverse().apply(point[None]))[0]
-        inside = bool(CAMERA.contains(pixel, L.margin_px))
+        inside = bool(CAMERA.contains(pixel, observations.MARGIN_PX))
         eyes = [pose.apply(np.array([[CAMERA.mount_forward, 0.0, 0.0]]))[0, :2] for pose in (here, there)]
         rays = [point[:2] - eye for eye in eyes]
         far = [float(np.hypot(*ray)) for ray in rays]
         angle = np.arccos(np.clip(rays[0] @ rays[1] / far[0] / far[1], -1, 1))
-        fits = inside and max(far) / min(far) < L.scale and angle < L.aside
+        fits = inside and max(far) / min(far) < observations.SCALE and angle < observations.ASIDE
         depth = there.inverse().apply(point[None])[0, 0] - CAMERA.mount_forward
         hidden = any(
-            np.hypot(*(new.landmarks.pixels[j] - pixel)) < L.before_px
-            and there.inverse().apply(other[None])[0, 0] - CAMERA.mount_forward < L.before * depth
+            np.hypot(*(new.landmarks.pixels[j] - pixel)) < observations.BEFORE_PX
+            and there.inverse().apply(other[None])[0, 0] - CAMERA.mount_forward < observations.BEFORE * depth
             for j, other in enumerate(known)
         )
         assert shown[k] == (fits and not hidden)
@@ -139,7 +133,7 @@ def test_expected_landmarks_are_visible_near_and_unoccluded() -> None:
     assert 20 < seen < len(points)
 
 
-def test_furniture_that_is_moved_fades_and_comes_back() -> None:
+def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Landmarks of a thing that stands elsewhere from the second drive on; it returns before the last."""
     rng = np.random.default_rng(2)
     world = room(0, 0, 6, 4, 700, rng)
@@ -147,7 +141,8 @@ def test_furniture_that_is_moved_fades_and_comes_back() -> None:
     other = replace(world, vectors=world.vectors.copy())
     other.vectors[thing] = random_vectors(len(thing), rng)
     # Nothing is superseded: what has been is linked with no later view.
-    merger = Merger(settings=MergerSettings(renewal=NodeSupersedingSettings(found=10_000)))
+    monkeypatch.setattr(node_superseding, "FOUND", 10_000)
+    merger = Merger()
     epochs = [world, *[other] * 8, *[world] * 3]
     told: dict[int, np.ndarray] = {}
     first: np.ndarray | None = None
@@ -167,15 +162,18 @@ def test_furniture_that_is_moved_fades_and_comes_back() -> None:
     assert told[12][first].mean() < 0.5 * told[9][first].mean(), "what is back is used again"
 
 
-def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it() -> None:
-    """The wall behind has stayed, and localizes the robot; half of what is there is found."""
+def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The wall behind has stayed, and tells where the robot stands; half of what is there is found."""
     rng = np.random.default_rng(3)
     world = room(0, 0, 6, 4, 1200, rng)
     wall = np.flatnonzero(world.normals[:, 0] < -0.5)
     other = replace(world, vectors=world.vectors.copy())
     other.vectors[wall] = random_vectors(len(wall), rng)
-    fading = LandmarkRemovalSettings(usual=0.5)
-    merger = Merger(settings=MergerSettings(renewal=NodeSupersedingSettings(found=10_000), fading=fading))
+    monkeypatch.setattr(removal, "USUAL", 0.5)
+    monkeypatch.setattr(node_superseding, "FOUND", 10_000)
+    merger = Merger()
     shares = []
     for epoch, now in enumerate([world, *[other] * 4], start=1):
         x, y = rng.normal([3.2, 2.0], 0.05)
@@ -203,8 +201,8 @@ def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.Mon
     thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
     other = replace(world, vectors=world.vectors.copy())
     other.vectors[thing] = random_vectors(len(thing), rng)
-    fading = LandmarkRemovalSettings(moved=0.01)
-    merger = Merger(settings=MergerSettings(fading=fading))
+    monkeypatch.setattr(removal, "MOVED", 0.01)
+    merger = Merger()
     judged: list[int] = []
 
     def counted(*args: Any) -> Array:
@@ -221,7 +219,7 @@ def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.Mon
         judged.clear()
         merged = merger.merged()
         counts.append(len(judged))
-        anew = LandmarkRemover(fading).fade(replace(merged, faded={})).faded
+        anew = LandmarkRemover().fade(replace(merged, faded={})).faded
         for one in set(anew) | set(merged.faded):
             none = np.zeros(len(merged.maps[one.map].nodes[one].landmarks), np.bool_)
             agree.append((anew.get(one, none) == merged.faded.get(one, none)).mean())

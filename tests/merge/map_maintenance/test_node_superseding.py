@@ -14,16 +14,16 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty
-from mapweave.hybridmap.reachability import least_in_view
+from mapweave.hybridmap.reachability import FARTHEST, WIDEST, least_in_view
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.active_nodes import ActiveNodes
 from mapweave.mapserver.map_files import map_file_of, merged_of
-from mapweave.mapserver.merging.merger import Merger, MergerSettings
+from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.roadmap import Roadmap
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.node_explanation import explain_nodes
-from mapweave.merge.map_maintenance.node_superseding import NodeSupersedingSettings
+from mapweave.merge.map_maintenance import node_superseding as rules
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import verify
@@ -75,17 +75,17 @@ def living(merged: MergedMap) -> set[NodeId]:
 
 
 def test_the_second_drive_supersedes_the_first(drives: Drives, merger: Merger) -> None:
-    merged, s = merger.merged(), NodeSupersedingSettings()
+    merged = merger.merged()
     assert len(merged.superseded) >= 3
     assert {node.map for node in merged.superseded} == {OLD}, "views the other way stand for themselves"
     assert f"{len(merged.superseded)} superseded" in merged.summary()
     for node, fate in merged.superseded.items():
         assert fate.by in living(merged) and fate.by.map == NEW
         between = drives.truth[node].inverse() @ drives.truth[fate.by]
-        assert math.hypot(between.x, between.y) < s.reach.farthest + 0.1
-        assert abs(between.heading) < s.reach.widest + 0.1
+        assert math.hypot(between.x, between.y) < FARTHEST + 0.1
+        assert abs(between.heading) < WIDEST + 0.1
         link = verify(merger.maps[OLD].nodes[node], merger.maps[NEW].nodes[fate.by])
-        assert isinstance(link, Link) and s.found <= fate.found <= link.weight
+        assert isinstance(link, Link) and rules.FOUND <= fate.found <= link.weight
         assert str(fate.by) in str(fate)
 
 
@@ -202,13 +202,16 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(seed: int) -> None:
-    """Where ways do not matter: each node has an active one that covers it, and none can be removed."""
+def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where ways do not matter: each node has a living one that covers it, and none can be spared."""
     rng = np.random.default_rng(seed)
     world = room(0, 0, 6, 4, 1200, rng)
-    # Nodes at one place reach each other: the whole room is one.
-    s = NodeSupersedingSettings(near=100.0, detour=1000.0)
-    merger = Merger(settings=MergerSettings(renewal=s))
+    # Whoever stands in one place gets there: all the room is one.
+    monkeypatch.setattr(rules, "NEAR", 100.0)
+    monkeypatch.setattr(rules, "DETOUR", 1000.0)
+    merger = Merger()
     for epoch in range(1, 5):
         tour = [Pose2(*rng.uniform([1.5, 1.5], [3.5, 2.5]), rng.uniform(-0.6, 0.6)) for _ in range(6)]
         nodes, edges = take_map(world, MapId("r0", epoch), tour, rng, sigma_xy=0.01, sigma_heading=0.01)
@@ -217,24 +220,24 @@ def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(seed: int) 
         merged = merger.merged()
         alive, stood_for = living(merged), dict[NodeId, list[NodeId]]()
         for node, fate in merged.superseded.items():
-            assert covers(merged, node, fate.by, s)
+            assert covers(merged, node, fate.by)
             stood_for.setdefault(fate.by, []).append(node)
         for one in alive:
             whom = [one, *stood_for.get(one, [])]
-            spare = all(any(covers(merged, node, by, s) for by in alive - {one}) for node in whom)
+            spare = all(any(covers(merged, node, by) for by in alive - {one}) for node in whom)
             assert not spare, f"{one} could be spared"
     assert len(alive) < 18
 
 
-def covers(merged: MergedMap, one: NodeId, other: NodeId, s: NodeSupersedingSettings) -> bool:
+def covers(merged: MergedMap, one: NodeId, other: NodeId) -> bool:
     a, b = (merged.maps[node.map].nodes[node] for node in (one, other))
     between = merged.pose(one).inverse() @ merged.pose(other)
     link = verify(*sorted((a, b), key=lambda node: node.id))
-    if one.map == other.map or not isinstance(link, Link) or abs(between.heading) > s.reach.widest:
+    if one.map == other.map or not isinstance(link, Link) or abs(between.heading) > WIDEST:
         return False
     shared = link.shared if link.a == one else link.shared[:, ::-1]
-    depths = b.landmarks.has_depth.sum() >= min(s.depths * a.landmarks.has_depth.sum(), s.enough)
-    return bool(depths and least_in_view(shared, a, b, between) >= s.found)
+    depths = b.landmarks.has_depth.sum() >= min(rules.DEPTHS * a.landmarks.has_depth.sum(), rules.ENOUGH)
+    return bool(depths and least_in_view(shared, a, b, between) >= rules.FOUND)
 
 
 def test_nodes_of_today_are_searched_even_if_superseded(drives: Drives) -> None:

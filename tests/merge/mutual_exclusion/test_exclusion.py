@@ -15,9 +15,9 @@ from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import MOST, TrajectorySegment
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import chances_clear, clash_of
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ExclusionSettings
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 

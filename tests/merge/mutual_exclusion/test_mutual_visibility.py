@@ -13,13 +13,9 @@ from mapweave.hybridmap.node import Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
+from mapweave.merge.mutual_exclusion import mutual_visibility as rules
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.mutual_visibility import (
-    MutualVisibilitySettings,
-    errors_in_common,
-    none_wrong,
-    odds_against,
-)
+from mapweave.merge.mutual_exclusion.mutual_visibility import errors_in_common, none_wrong, odds_against
 from mapweave.merge.mutual_exclusion.quadrature import quadrature_points
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
@@ -63,7 +59,6 @@ def marched(angle: float, place: Array, radius: float, reach: float = 6.0) -> fl
 
 def test_odds_against_rays_marched_step_by_step() -> None:
     rng = np.random.default_rng(1)
-    s = MutualVisibilitySettings()
     for _ in range(15):
         angle = rng.uniform(-np.pi, np.pi)
         place = rng.uniform(0.3, 2.5) * np.array([np.cos(angle), np.sin(angle)])
@@ -75,14 +70,17 @@ def test_odds_against_rays_marched_step_by_step() -> None:
                 continue
             went_on = ended = False
             for bearing, length in zip(np.arange(16) * np.pi / 8, lengths, strict=True):
-                last = marched(bearing, draw, s.core * RADIUS)
-                margin = s.margin + s.margin_share * last
+                last = marched(bearing, draw, rules.CORE * RADIUS)
+                margin = rules.MARGIN + rules.MARGIN_SHARE * last
                 if np.isfinite(last) and length >= marched(bearing, draw, RADIUS) - margin:
                     went_on |= length > last + margin
                     ended |= length <= last + margin
-            weight, odd = (s.missed, (1 - s.scenery) / s.missed) if went_on else (1.0, 1.0)
+            weight, odd = (rules.MISSED, (1 - rules.SCENERY) / rules.MISSED) if went_on else (1.0, 1.0)
             if ended and not went_on:
-                weight, odd = (1 - s.missed) / s.scenery, s.scenery / (1 - s.missed)
+                weight, odd = (
+                    (1 - rules.MISSED) / rules.SCENERY,
+                    rules.SCENERY / (1 - rules.MISSED),
+                )
             numerator, denominator = numerator + weight * odd, denominator + weight
         # A draw on an edge may fall on either side of it.
         assert np.isclose(odds(seen)[0], numerator / denominator if denominator else 1.0, rtol=0.15)
@@ -149,8 +147,7 @@ def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
         looks(offsets, np.full((16, 4), 3.0)), observers=observers, others=others,
         levers=levers[observers], other_levers=levers[others],
     )  # fmt: skip
-    s = MutualVisibilitySettings(floor_xy=0.0)
-    errors = errors_in_common(graph, seen, s)
+    errors = errors_in_common(graph, seen, floor_xy=0.0)
     joint = graph.covariance(graph.nodes).reshape(48, 48)
     moved = np.zeros((4000, 16, 2))
     for draw, delta in enumerate(rng.multivariate_normal(np.zeros(48), joint, 4000).reshape(-1, 16, 3)):
@@ -161,8 +158,8 @@ def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
     moved -= moved.mean(axis=0)
     # The 26 ways of a shell are even: their mean square is a third of that of each component.
     assert np.array_equal(errors.shifts[0], np.zeros((16, 2))) and len(errors.shifts) == 1 + 3 * 26
-    full = errors.shifts[-26:] / s.sigmas[-1]
-    # All modes together are about as wide as the covariance.
+    full = errors.shifts[-26:] / rules.SIGMAS[-1]
+    # All ways together are about as wide as what they stand for.
     wide = np.einsum("s,smi,smj->mij", errors.weights, errors.shifts, errors.shifts)
     assert errors.weights.sum() == pytest.approx(1.0)
     assert np.trace(wide, axis1=1, axis2=2) == pytest.approx(
@@ -187,7 +184,7 @@ def test_errors_between_maps_have_opposite_signs() -> None:
     observers, others = np.array([0, 8]), np.array([8, 0])
     offsets = graph.means[others, :2] - graph.means[observers, :2]
     seen = replace(looks(offsets, np.full((2, 4), 3.0)), observers=observers, others=others)
-    errors = errors_in_common(graph, seen, MutualVisibilitySettings(floor_xy=0.1))
+    errors = errors_in_common(graph, seen, floor_xy=0.1)
     assert np.allclose(errors.shifts[:, 0], -errors.shifts[:, 1], atol=0.01)
     furthest = np.hypot(*errors.shifts[:, 0].T).max()
     assert 0.25 < furthest < 0.31

@@ -19,10 +19,9 @@ from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.mutual_visibility import MutualVisibilitySettings
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ExclusionSettings
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 
@@ -101,10 +100,6 @@ def between_twins(seed: int) -> float:
     return first.x - second.x
 
 
-BLIND = ExclusionSettings(sight=MutualVisibilitySettings(core=0.0))
-"""Robots that see nothing of each other."""
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_twins_should_have_seen_each_other(seed: int) -> None:
     """Within five minutes, in any room: where little floor is free they rarely see each other."""
@@ -180,11 +175,13 @@ def test_broken_sensors_are_no_evidence(fails: str) -> None:
     assert walks.clash() is None
 
 
-def test_robots_without_a_radius_are_not_used_for_visibility() -> None:
+def test_robots_without_a_radius_are_not_used_for_visibility(monkeypatch: pytest.MonkeyPatch) -> None:
     walks = Walks("twins", 0, (0, 1))
     walks.nodes = [replace(node, radius=0.0) for node in walks.nodes]
-    blind = ExclusionSettings(sight=MutualVisibilitySettings(core=0.0))
-    assert walks.clash(between_twins(0)) == walks.clash(between_twins(0), blind)
+    seeing = walks.clash(between_twins(0))
+    # Robots that see nothing of each other.
+    monkeypatch.setattr("mapweave.merge.mutual_exclusion.mutual_visibility.CORE", 0.0)
+    assert seeing == walks.clash(between_twins(0))
 
 
 class Exploration:

@@ -14,11 +14,11 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.mutual_exclusion.refutation import Refutation
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import ExclusionSettings
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 EDGE_SIGMAS = np.array([0.006, 0.005, 0.005])

@@ -10,15 +10,12 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
-from mapweave.merge.outlier_rejection.pairwise_consistency import (
-    ConsistencySettings,
-    loop_distances2,
-    sort_links,
-)
+from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
 
 
 def fragment(agent: str, tour: list[Pose2], rng: np.random.Generator, sigma: float = 0.02) -> Fragment:

@@ -15,9 +15,9 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection import wrong_geometry
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch, looked_through
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.25)
 STEP = 0.3

@@ -5,7 +5,7 @@ import numpy as np
 from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.merge.pose_graph.candidates import CandidateSettings, choose_pairs, overlap, overlaps
+from mapweave.merge.pose_graph.candidates import choose_pairs, overlap, overlaps
 from synthetic.world import room, take_map, take_node
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
@@ -37,7 +37,7 @@ def test_true_overlaps_rank_above_chance_and_neighbours_are_left_out() -> None:
     elsewhere, more = take_map(room(0, 0, 5, 4, 600, rng), MapId("b", 1), tour, rng)
     table = overlaps([*nodes, *elsewhere])
     assert table and all(a.map == b.map for a, b in table)
-    chosen = choose_pairs(table, [*edges, *more], CandidateSettings(least_hops=3))
+    chosen = choose_pairs(table, [*edges, *more], least_hops=3)
     assert chosen
     assert all((b.number - a.number) // 2 >= 3 for a, b in chosen)
 
@@ -45,11 +45,10 @@ def test_true_overlaps_rank_above_chance_and_neighbours_are_left_out() -> None:
 def test_only_the_best_of_each_map_are_chosen() -> None:
     ids = [NodeId("a", 1, 1), *(NodeId("b", 1, k) for k in range(1, 8)), NodeId("c", 1, 1)]
     table = {(ids[0], other): 10.0 + other.number for other in ids[1:]}
-    s = CandidateSettings(most_per_map=2)
-    chosen = choose_pairs(table, (), s)
+    chosen = choose_pairs(table, (), most_per_map=2)
     # Each b has only this one pair, so it is among the best of b: the limit is on both ends together.
     assert len(chosen) == 8
     table |= {(NodeId("a", 1, 2), other): 50.0 for other in ids[1:8]}
     table |= {(NodeId("a", 1, 3), other): 60.0 for other in ids[1:8]}
-    chosen = choose_pairs(table, (), s)
+    chosen = choose_pairs(table, (), most_per_map=2)
     assert [b.number for a, b in chosen if a == ids[0] and b.agent == "b"] == [6, 7]

@@ -5,7 +5,7 @@ import pytest
 
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.merge.pose_graph.candidates import CandidateSettings, Pair, choose_pairs
+from mapweave.merge.pose_graph.candidates import Pair, choose_pairs
 from mapweave.merge.pose_graph.pairs import PairTable
 
 STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
@@ -15,9 +15,9 @@ STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
 def test_it_agrees_with_a_fresh_choice(seed: int) -> None:
     """Nodes and edges come and go, nodes are refined; every change is returned once."""
     rng = np.random.default_rng(seed)
-    settings = CandidateSettings(most_per_map=2, least_hops=int(rng.integers(1, 4)))
+    limits = 2, int(rng.integers(1, 4))
     nodes = [NodeId("abc"[k % 3], 1, k) for k in range(24)]
-    table, overlaps, edges = PairTable(settings), dict[Pair, float](), dict[EdgeId, Edge]()
+    table, overlaps, edges = PairTable(*limits), dict[Pair, float](), dict[EdgeId, Edge]()
     known: set[Pair] = set()
     there: set[NodeId] = set()
     for number in range(150):
@@ -43,10 +43,10 @@ def test_it_agrees_with_a_fresh_choice(seed: int) -> None:
             gone = edges.pop(list(edges)[int(rng.integers(len(edges)))])
             table.disconnect(gone.a, gone.b)
         if what < 0.6 and rng.random() < 0.5:
-            near = [p for p in choose_pairs(overlaps, edges.values(), settings) if node in p]
+            near = [p for p in choose_pairs(overlaps, edges.values(), *limits) if node in p]
             assert table.of(node) == near
         if rng.random() < 0.4:
-            wanted = set(choose_pairs(overlaps, edges.values(), settings))
+            wanted = set(choose_pairs(overlaps, edges.values(), *limits))
             changed = set(table.changed())
             assert changed >= wanted ^ known
             assert all((pair in table) == (pair in wanted) for pair in changed | wanted | known)

@@ -1,0 +1,18 @@
+"""How much room ways keep to the border of the field of view, and what parts of the servo have in common."""
+
+from __future__ import annotations
+
+MIN_VISIBLE = 4
+"""Landmarks that must stay in view."""
+FIELD_MARGIN = 0.05
+"""Room that ways keep to the border of the field of view where they can, rad."""
+LEAST_MARGIN = 0.008
+"""Room below which no way is taken, rad."""
+TURN_GAIN = 2.5
+"""Gain of turns on the spot and of the heading on legs, 1/s."""
+
+
+def margins() -> tuple[float, ...]:
+    """Margins to plan with, rad, the widest first."""
+    wide, least = FIELD_MARGIN, LEAST_MARGIN
+    return (wide, 0.6 * wide, max(0.3 * wide, least), least)
