@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.limits import NAME_OR_NOTHING, Angle, Share
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.ranges import Ranges
+
+MAX_RANGERS = 256
+FARTHEST = 1e4
+"""No ranger reaches farther, m."""
+FASTEST = 1e3
+"""No robot drives or turns faster, m/s and rad/s."""
+
+Coefficient = Annotated[float, Meta(ge=-1e4, le=1e4)]
+Distortion = tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
+Length = Annotated[float, Meta(ge=1e-3, le=100.0)]
+Reach = Annotated[float, Meta(ge=0.0, le=FARTHEST)]
+Speed = Annotated[float, Meta(ge=0.0, le=FASTEST)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,17 +106,17 @@ class RobotDescription:
     """
 
     camera: Camera
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    radius: float = 0.16
-    axle: float = 0.24
-    wheel_noise: float = 0.02
-    side_slip: float = 0.005
-    ranger_bearings: tuple[float, ...] = ()
-    ranger_reach: float = 0.0
-    max_forward: float = 0.3
-    max_turn: float = 0.8
-    tick: float = 0.1
-    clock: str = ""
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+    radius: Length = 0.16
+    axle: Length = 0.24
+    wheel_noise: Share = 0.02
+    side_slip: Share = 0.005
+    ranger_bearings: Annotated[tuple[Angle, ...], Meta(max_length=MAX_RANGERS)] = ()
+    ranger_reach: Reach = 0.0
+    max_forward: Speed = 0.3
+    max_turn: Speed = 0.8
+    tick: Annotated[float, Meta(ge=1e-4, le=3600.0)] = 0.1
+    clock: Annotated[str, Meta(pattern=NAME_OR_NOTHING)] = ""
     ranges_see_robots: bool = False
 
     def ranges(self, proximity: NDArray[np.float64]) -> Ranges:

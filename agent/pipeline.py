@@ -19,6 +19,7 @@ from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.random_exploration import RandomExploration
 from mapweave.agent.global_localization.resumption import Resumption
+from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
 from mapweave.agent.navigation.navigator import Navigator
@@ -222,11 +223,20 @@ class Pipeline:
             return Command(), []
         if isinstance(self._mission, Carried):
             assert self._passenger is not None
-            self._passenger.step(observation)
-            return Command(), []
+            return self._act(self._passenger, observation), []
         assert self._explorer is not None
         self._floor.see(self._mapper.map_from_robot.mean, observation.proximity)
-        return self._explorer.step(observation, answers)
+        self._explorer.see(observation, answers)
+        return self._act(self._explorer, observation), self._explorer.questions
+
+    def _act(self, behaviour: Explorer | CarriedMapping, observation: Observation) -> Command:
+        """The behaviour's command for this tick; what it asks of the mapper before that is done at once.
+
+        Only here do the views of an episode become nodes. They leave with the step's changes.
+        """
+        while isinstance(move := behaviour.next_move(), EpisodeRequest):
+            self._mapper.meet(move, observation)
+        return move
 
     def _resume(self, observation: Observation) -> Command:
         """Find the robot on its own map; then map on from there."""

@@ -4,10 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import (
+    MAX_POSITION,
+    Amount,
+    Angle,
+    Cost,
+    Distance,
+    Key,
+    Number,
+    Probability,
+    Words,
+)
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, PoseGaussian
@@ -32,6 +46,10 @@ DOUBLES = "doubles"
 is known (see mapweave.merge.outlier_rejection.distinctness)."""
 
 
+MAX_MAPS_TOLD = 256
+"""Pairs of maps in one answer."""
+
+
 @dataclass(frozen=True, slots=True)
 class Witness:
     """Another link between the same two pieces of map.
@@ -46,7 +64,7 @@ class Witness:
 
     a: NodeId
     b: NodeId
-    distance2: float
+    distance2: Amount
     agrees: bool
     kept: bool
 
@@ -64,8 +82,13 @@ class Misfit:
 
     merged_a_from_b: PoseGaussian
     off: Array
-    strain2: float
+    strain2: Amount
     alone: bool
+
+    def __post_init__(self) -> None:
+        """Refuse what is no difference of poses (InvalidValue)."""
+        if self.off.shape != (3,) or not (np.abs(self.off) <= 2 * MAX_POSITION).all():
+            raise InvalidValue("a misfit must be three numbers of a pose")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,17 +117,30 @@ class PairExplanation:
     a: Node
     b: Node
     standing: Standing
-    reason: str
+    reason: Words
     matches: NDArray[np.int64]
     shared: NDArray[np.int64]
     residuals_px: Array
     a_from_b: PoseGaussian | None = None
-    evidence: dict[str, float] = field(default_factory=dict)
-    probability: float | None = None
+    evidence: Annotated[dict[Key, float], Meta(max_length=64)] = field(default_factory=dict)
+    probability: Probability | None = None
     misfit: Misfit | None = None
     witnesses: tuple[Witness, ...] = ()
-    claims: tuple[str, ...] = ()
+    claims: tuple[Words, ...] = ()
     rulings: tuple[ManualConstraint, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse what does not belong together.
+
+        Raises:
+            InvalidValue: pairs of landmarks that the nodes do not have, or residuals of others.
+        """
+        counts = [len(self.a.landmarks), len(self.b.landmarks)]
+        for pairs in (self.matches, self.shared):
+            if pairs.shape != (len(pairs), 2) or not ((pairs >= 0) & (pairs < counts)).all():
+                raise InvalidValue("a landmark is named that the node does not have")
+        if self.residuals_px.shape != (len(self.shared),) or (self.residuals_px < 0.0).any():
+            raise InvalidValue(f"residuals {self.residuals_px.shape} of {len(self.shared)} landmarks")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +157,9 @@ class NearMiss:
 
     a: NodeId
     b: NodeId
-    matches: int
-    inliers: int
-    lacks: str
+    matches: Number
+    inliers: Number
+    lacks: Words
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +183,20 @@ class MapsExplanation:
     first: MapId
     second: MapId
     joined: bool
-    reason: str
-    links: int
-    landmarks: int
-    refused: int
-    unverified: int
+    reason: Words
+    links: Number
+    landmarks: Number
+    refused: Number
+    unverified: Number
     nearest: tuple[NearMiss, ...] = ()
     rulings: tuple[ManualConstraint, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FleetExplanation:
+    """Of some two maps each, why they are one or are not."""
+
+    maps: Annotated[tuple[MapsExplanation, ...], Meta(max_length=MAX_MAPS_TOLD)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +216,11 @@ class Hop:
 
     a: NodeId
     b: NodeId
-    kind: str
-    distance: float
-    turn: float
-    cost: float
-    words: str
+    kind: Key
+    distance: Distance
+    turn: Angle
+    cost: Cost
+    words: Words
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,11 +242,11 @@ class RouteExplanation:
     start: NodeId
     goal: NodeId
     found: bool
-    reason: str
+    reason: Words
     hops: tuple[Hop, ...] = ()
     gaps: tuple[Hop, ...] = ()
     apart: MapsExplanation | None = None
 
 
-Explanation = PairExplanation | tuple[MapsExplanation, ...] | RouteExplanation
+Explanation = PairExplanation | FleetExplanation | RouteExplanation
 """Of two nodes, of some two maps each, or of a route."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.node import NUMBER, MapId, NodeId, check_name
 
 Ends = tuple[NodeId, NodeId] | tuple[MapId, MapId]
@@ -36,7 +37,7 @@ class ManualConstraint:
     ends: Ends
     apart: bool
     who: str
-    stamp_ns: int
+    stamp_ns: Stamp
     because: str = ""
 
     def __post_init__(self) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from mapweave.hybridmap.limits import Stamp, Words
+
 
 class MapEventKind(StrEnum):
     """What sort of thing has happened."""
@@ -31,6 +33,13 @@ class MapEvent:
         words: what, and why; one printable line.
     """
 
-    stamp_ns: int
+    stamp_ns: Stamp
     kind: MapEventKind
-    words: str
+    words: Words
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """What has happened, in order."""
+
+    history: tuple[MapEvent, ...]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import Name, Number
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
@@ -33,7 +34,7 @@ LEAST_DEPTH_SHARE = 0.03
 uncertainty of both together is rounded to steps of 13 %."""
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
-"""What an agent, server or fleet may be called: it becomes a chunk of a key expression."""
+"""See mapweave.hybridmap.limits.Name."""
 
 
 NUMBER = re.compile(r"[0-9]{1,20}")
@@ -50,8 +51,8 @@ def check_name(name: str) -> str:
 class MapId(NamedTuple):
     """Whose map, and which: a fresh epoch starts when a robot starts a map from nothing."""
 
-    agent: str
-    epoch: int
+    agent: Name
+    epoch: Number
 
     def __str__(self) -> str:
         """For example `r0.1`."""
@@ -61,9 +62,9 @@ class MapId(NamedTuple):
 class NodeId(NamedTuple):
     """(agent, epoch, number), never reused. Edges have ids of the same form from the same counter."""
 
-    agent: str
-    epoch: int
-    number: int
+    agent: Name
+    epoch: Number
+    number: Number
 
     @property
     def map(self) -> MapId:

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import EdgeKind, Node, NodeId
-from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import MAX_NUMBER, MAX_POSITION, Coordinate, LandmarkCount, Probability, Words
+from mapweave.hybridmap.manual_constraint import Ends
+from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+
+MAX_CANDIDATES = 64
+MAX_BLOCKED = 256
+MAX_LEGS = 512
+"""A route through a building has tens of legs."""
+MAX_KNOWN = 512
+"""Views in one answer: 8 kB, as much as two or three nodes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +54,10 @@ class Certainty(StrEnum):
     UNKNOWN = "unknown"
 
 
+NO_COMPONENT = -1
+"""Component of a node that is not in the merged map yet."""
+
+
 @dataclass(frozen=True, eq=False)
 class Whereabouts:
     """One place where the robot may be.
@@ -50,7 +66,7 @@ class Whereabouts:
         node: the node that was recognised.
         node_from_robot: the robot's pose in that node's robot frame.
         merged_from_robot: the same in the merged frame of the node's component, if it has one.
-        component: number of the node's component in the merged map.
+        component: number of the node's component in the merged map; `NO_COMPONENT` if it is in none.
         inliers: landmarks that agree.
         probability: that this place is the right one, 0 to 1.
         distance_known: if not, the node's scale was not measured, and the covariance includes that.
@@ -59,9 +75,9 @@ class Whereabouts:
     node: NodeId
     node_from_robot: PoseGaussian
     merged_from_robot: PoseGaussian | None
-    component: int
-    inliers: int
-    probability: float
+    component: Annotated[int, Meta(ge=-1, le=MAX_NUMBER)]
+    inliers: LandmarkCount
+    probability: Probability
     distance_known: bool = True
 
 
@@ -70,8 +86,8 @@ class RelocalizeAnswer:
     """Where a view was taken: candidates best first, and the reason of the outcome, in words."""
 
     certainty: Certainty
-    candidates: tuple[Whereabouts, ...]
-    reason: str
+    candidates: Annotated[tuple[Whereabouts, ...], Meta(max_length=MAX_CANDIDATES)]
+    reason: Words
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +109,8 @@ class RouteLeg:
 class RouteAnswer:
     """A way through the merged map. `legs[0]` is the node where the robot is; empty if there is no way."""
 
-    legs: tuple[RouteLeg, ...]
-    reason: str
+    legs: Annotated[tuple[RouteLeg, ...], Meta(max_length=MAX_LEGS)]
+    reason: Words
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,5 +123,77 @@ class KnownAnswer:
         reason: of the outcome, in words.
     """
 
-    views: Array
-    reason: str
+    views: NDArray[np.float32]
+    reason: Words
+
+    def __post_init__(self) -> None:
+        """Refuse what nobody can have mapped.
+
+        Raises:
+            InvalidValue: more views than are told at once, or a number out of range.
+        """
+        if self.views.shape != (len(self.views), 4) or len(self.views) > MAX_KNOWN:
+            raise InvalidValue(f"views of shape {self.views.shape}; at most ({MAX_KNOWN}, 4) are told")
+        # A comparison with what is no number is false.
+        bounded = (np.abs(self.views) <= [MAX_POSITION, MAX_POSITION, 4.0, 4.0]).all()
+        if not bounded or (self.views[:, 3] < 0.0).any():
+            raise InvalidValue("a view's pose or aperture is out of range")
+        object.__setattr__(self, "views", self.views.astype(np.float32))
+
+
+Blocked = Annotated[tuple[tuple[NodeId, NodeId], ...], Meta(max_length=MAX_BLOCKED)]
+"""Pairs of nodes between which a robot could not drive."""
+
+
+@dataclass(frozen=True, slots=True)
+class RouteRequest:
+    """How does one get from node to node?
+
+    Attributes:
+        start: node that the robot knows itself by.
+        goal: node where it wants to be.
+        blocked: pairs of nodes between which it could not drive.
+        start_from_robot: where it is exactly.
+    """
+
+    start: NodeId
+    goal: NodeId
+    blocked: Blocked = ()
+    start_from_robot: Pose2 = field(default_factory=Pose2)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownRequest:
+    """What have others mapped around a position?
+
+    Attributes:
+        map: the asking robot's own.
+        x: m, in that map.
+        y: m, in that map.
+        reach: how far around, m.
+    """
+
+    map: MapId
+    x: Coordinate
+    y: Coordinate
+    reach: Annotated[float, Meta(ge=0.0, le=MAX_POSITION)]
+
+
+@dataclass(frozen=True, slots=True)
+class ExplainRequest:
+    """Why are these linked, or are not? Or why does a route lead this way, and why is there none?
+
+    Attributes:
+        ends: two nodes or two maps, for a route start and goal; None for each two maps of the fleet.
+        route: whether it is about the route between two nodes.
+        blocked: for a route, pairs of nodes between which the robot cannot drive.
+    """
+
+    ends: Ends | None = None
+    route: bool = False
+    blocked: Blocked = ()
+
+    def __post_init__(self) -> None:
+        """Refuse routes from what is no node (InvalidValue)."""
+        if self.route and (self.ends is None or not all(isinstance(end, NodeId) for end in self.ends)):
+            raise InvalidValue("a route leads from node to node: r0.1.17 r1.1.5")

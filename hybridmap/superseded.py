@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from mapweave.hybridmap.limits import Angle, Distance, Number
 from mapweave.hybridmap.node import NodeId
 
 
@@ -20,9 +21,9 @@ class Superseded:
     """
 
     by: NodeId
-    found: int
-    distance: float
-    turn: float
+    found: Number
+    distance: Distance
+    turn: Angle
 
     def __str__(self) -> str:
         """For example `r1.1.5 replaces it, 0.31 m off and turned by 12 degrees, with 34 landmarks`."""

@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.retrieval.place_index import PlaceIndex, bounded
+from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.wire_limits import FARTHEST
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
+class Places(Protocol):
+    """Finds nodes, but for some; for example mapweave.mapserver.retrieval.place_database.PlaceDatabase."""
+
+    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
+        """At most k nodes with how much they look like a view, best first."""
+        ...
+
+
 class ActiveNodes:
-    """The place index without superseded and misplaced nodes and maps retired or set apart, and nodes
+    """The place database without superseded and misplaced nodes and maps retired or set apart, and nodes
     without what has faded.
 
-    It belongs to one merged map; make another for the next. New nodes are compared with the whole index.
+    It belongs to one merged map; make another for the next. New nodes are compared with all of the database.
     """
 
     def __init__(
         self,
-        index: PlaceIndex,
+        places: Places,
         node_of: Callable[[NodeId], Node | None],
         merged: MergedMap,
         set_apart: Iterable[NodeId] = (),
@@ -31,12 +40,12 @@ class ActiveNodes:
         """Take a merged map and the index.
 
         Args:
-            index: of all nodes, also of those not in the merged map yet.
+            places: all nodes, also those not in the merged map yet.
             node_of: gives a node by its id as its robot sent it.
             merged: with the superseded, retired, set apart and faded.
             set_apart: the nodes of maps that are set apart.
         """
-        self._index, self._node_of, self._merged = index, node_of, merged
+        self._places, self._node_of, self._merged = places, node_of, merged
         self._left_out = frozenset((*merged.rulings.retired, *merged.set_apart))
         left_out = (
             node for map_id in self._left_out if map_id in merged.maps for node in merged.maps[map_id].nodes
@@ -46,7 +55,7 @@ class ActiveNodes:
 
     def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
         """At most k active nodes with their similarity to a view, best first."""
-        ranked = self._index.query(view, k, exclude=self._hidden)
+        ranked = self._places.query(view, k, exclude=self._hidden)
         # A retired map's robot may have mapped on.
         return [(node, score) for node, score in ranked if node.map not in self._left_out]
 

@@ -34,6 +34,6 @@ class Answers:
     def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
         """Answers from a merged map; newer nodes, which `node_of` returns, have no merged pose yet."""
         set_apart = [node for map_id in merged.set_apart for node in merger.maps[map_id].nodes]
-        places = ActiveNodes(merger.index, node_of, merged, set_apart)
+        places = ActiveNodes(merger.places, node_of, merged, set_apart)
         relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
         return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Coverage(merged))

@@ -8,9 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.hybridmap.query import KnownAnswer
+from mapweave.hybridmap.query import MAX_KNOWN, KnownAnswer
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.messages import MAX_KNOWN
 
 
 class Coverage:
@@ -32,7 +31,7 @@ class Coverage:
             reach: how far around, m.
         """
         if asking not in self._merged.maps:
-            return KnownAnswer(np.zeros((0, 4)), f"map {asking} is not in the merged map")
+            return KnownAnswer(np.zeros((0, 4), np.float32), f"map {asking} is not in the merged map")
         views = [view for component in self._merged.components for view in self._views(asking, component)]
         # A view whose principal point is outside of its image looks nowhere.
         near = [view for view in views if view[3] > 0.0 and math.dist(view[:2], position) <= reach]
@@ -42,7 +41,7 @@ class Coverage:
             reason = f"no other map is joined to {asking} yet"
         else:
             reason = f"{len(told)} of {len(views)} views of others within {reach:.1f} m"
-        return KnownAnswer(np.array(told).reshape(-1, 4), reason)
+        return KnownAnswer(np.array(told, np.float32).reshape(-1, 4), reason)
 
     def _views(self, asking: MapId, component: frozenset[NodeId]) -> list[tuple[float, float, float, float]]:
         """[x m, y m, heading rad, semi-aperture rad], in the asking map, of a component's foreign nodes."""

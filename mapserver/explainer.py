@@ -9,10 +9,18 @@ from dataclasses import replace
 from typing import TypeVar
 
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.explanation import Explanation, MapsExplanation, PairExplanation, RouteExplanation
+from mapweave.hybridmap.explanation import (
+    MAX_MAPS_TOLD,
+    Explanation,
+    FleetExplanation,
+    MapsExplanation,
+    PairExplanation,
+    RouteExplanation,
+)
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.log.store import Store
@@ -24,19 +32,9 @@ from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.manual_constraints import check_manual_constraint
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.wire.bus import Bus, Closing, Request
-from mapweave.wire.explanation_messages import (
-    MAX_MAPS_TOLD,
-    ExplainRequest,
-    decode_explain_request,
-    decode_ruling,
-    encode_maps,
-    encode_pair,
-    encode_ruling,
-)
-from mapweave.wire.history_codec import encode_history
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
-from mapweave.wire.route_explanation import encode_route_explanation
+from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +50,7 @@ class RulingBook:
         made: list[ManualConstraint] = []
         for body in store.rulings():
             try:
-                made.append(decode_ruling(body))
+                made.append(decode(body, ManualConstraint))
             except InvalidMessage as error:
                 log.error("a manual constraint cannot be read (%s); it is left out", error)
         self._rulings = ManualConstraints(made)
@@ -73,7 +71,7 @@ class RulingBook:
             InvalidValue: there are too many.
             InvalidFile: the disk does not take it; then nothing has changed.
         """
-        self._store.add_ruling(encode_ruling(ruling))
+        self._store.add_ruling(encode(ruling))
         self._rulings = ManualConstraints([*self._rulings.made, ruling])
 
 
@@ -121,7 +119,7 @@ class Explainer:
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
             bus.serve(keys.rule(name), guarded(self._decree)),
-            bus.serve(keys.history(name), guarded(lambda _: encode_history(self.history()))),
+            bus.serve(keys.history(name), guarded(lambda _: encode(History(self.history())))),
         ]
 
     def close(self) -> None:
@@ -134,10 +132,7 @@ class Explainer:
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _explain(self, payload: bytes) -> bytes:
-        told = self.explain(decode_explain_request(payload))
-        if isinstance(told, RouteExplanation):
-            return encode_route_explanation(told)
-        return encode_pair(told) if isinstance(told, PairExplanation) else encode_maps(told)
+        return encode(self.explain(decode(payload, ExplainRequest)))
 
     def explain(self, request: ExplainRequest) -> Explanation:
         """Why nodes or maps are linked, or are not, or why a route leads this way. Takes its time.
@@ -150,21 +145,23 @@ class Explainer:
         answers = self._answers()
         merged = answers.merged
         if request.ends is None:
-            return tuple(_still(one, settled) for one in explain_fleet(merged, MAX_MAPS_TOLD))
+            maps = explain_fleet(merged, MAX_MAPS_TOLD)
+            return FleetExplanation(tuple(_still(one, settled) for one in maps))
         first, second = request.ends
         if isinstance(first, NodeId) and isinstance(second, NodeId):
             if request.route:
                 told = explain_route(answers.router, first, second, request.blocked, self._wary())
                 return _still(told, settled)
             return _still(explain_nodes(merged, first, second, None, self._consistency), settled)
-        return (_still(explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])), settled),)
+        two = explain_maps(merged, MapId(*first[:2]), MapId(*second[:2]))
+        return FleetExplanation((_still(two, settled),))
 
     def history(self) -> tuple[MapEvent, ...]:
         """What has become of the maps, and what people have ruled, in order."""
         return with_rulings(self._happenings(), self._book.rulings)
 
     def _decree(self, payload: bytes) -> bytes:
-        ruling = decode_ruling(payload)
+        ruling = decode(payload, ManualConstraint)
         with self._turn:
             check_manual_constraint(self._answers().merged, self._book.rulings, ruling, self._book.maps())
             self._book.add(ruling)

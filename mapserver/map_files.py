@@ -80,7 +80,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     maps, constraints = maps_of(content), ManualConstraints(content.rulings)
     links = tuple(_links(change.edge for change in content.changes if isinstance(change, EdgePut)))
     try:
-        parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency, s.strain)
+        parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency)
         solved = ComponentSolver(parts).solve(links)
     except (np.linalg.LinAlgError, RuntimeError, InvalidValue) as error:
         # The solver raises RuntimeError if a system is singular.

@@ -9,13 +9,14 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.store import Store
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.history_codec import MAX_WORDS, KeptHistory, decode_kept_history, encode_kept_history
+from mapweave.wire.messages import KeptHistory, decode, encode
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ class MapHistory:
         found = None if store is None else store.result(NAME)
         if found is not None:
             try:
-                self._kept = decode_kept_history(found)
+                self._kept = decode(found, KeptHistory)
             except InvalidMessage as error:
                 self.failed(f"the record of what happened before was damaged ({error}); a new one begins")
 
@@ -132,7 +133,7 @@ class MapHistory:
         if self._store is None:
             return
         try:
-            self._store.put_result(NAME, encode_kept_history(kept))
+            self._store.put_result(NAME, encode(kept))
         except (InvalidFile, InvalidValue) as error:
             log.warning("what has happened to the maps is not kept: %s", error)
 

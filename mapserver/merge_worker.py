@@ -16,7 +16,7 @@ from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
-from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import Job, Schedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
@@ -40,7 +40,7 @@ class MergeWorker:
         self,
         schedule: Schedule,
         share: float = 0.4,
-        index: PlaceIndex | None = None,
+        places: PlaceDatabase | None = None,
         merge: MergeSettings | None = None,
         keeper: VerificationCacheKeeper | None = None,
         history: MapHistory | None = None,
@@ -50,7 +50,7 @@ class MergeWorker:
         Args:
             schedule: runs the work, all of it one after the other.
             share: largest share of the time that is spent merging.
-            index: is filled with the nodes that come; may have them already.
+            places: is filled with the nodes that come; may have them already.
             merge: how maps are merged.
             keeper: of the verification cache.
             history: records what joins and parts.
@@ -59,7 +59,7 @@ class MergeWorker:
         self._keeper = keeper
         self._history = history or MapHistory()
         self._share = share
-        self._merger = Merger(index, merge)
+        self._merger = Merger(places, merge)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False
@@ -98,13 +98,13 @@ class MergeWorker:
         """Take note of a change, in the order of its log. Returns at once.
 
         A new place can be found from now on, however long a merge takes: the merging thread takes
-        the change in when its turn comes, and its result for the index is final.
+        the change in when its turn comes, and its result for the place database is final.
         """
         self._schedule.observe(change.stamp_ns)
         if isinstance(change.body, NodePut):
             self._fresh[change.body.node.id] = change.body.node
             try:
-                self._merger.index.add(change.body.node)
+                self._merger.places.announce(change.body.node)
             except Exception:  # it is tried once more when its turn comes
                 log.exception("change %s of %s cannot be found yet", change.sequence, change.map)
         self._post(lambda: self._take(change))

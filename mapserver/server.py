@@ -15,7 +15,7 @@ from types import TracebackType
 
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.query import RelocalizeAnswer, View
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import Explainer, RulingBook
@@ -25,12 +25,11 @@ from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
-from mapweave.mapserver.retrieval.index_keeper import EVERY, PlaceIndexKeeper
+from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
 from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus
-from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
 
@@ -89,10 +88,10 @@ class MapServer:
         self._schedule = clock = schedule or LiveSchedule()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = Store(path)
-        self._keeper = PlaceIndexKeeper(self._store, path)
+        self._places = PlaceDatabase(self._store, path)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._chronicle = MapHistory(self._store, clock=clock.time_ns)
-        self._upkeep = MergeWorker(clock, MERGE_SHARE, self._keeper.index, s.merge, findings, self._chronicle)
+        self._upkeep = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._chronicle)
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
         self._desk = AdmissionControl(
@@ -116,7 +115,7 @@ class MapServer:
         )  # fmt: skip
         self._herald = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._tell)
-        clock.every(EVERY, self._keeper.look)
+        clock.every(EVERY, self._places.save_if_worthwhile)
         return self
 
     def __exit__(
@@ -129,7 +128,7 @@ class MapServer:
         self._ingest.close()
         self._herald.close()
         self._upkeep.close()
-        self._keeper.close()
+        self._places.close()
         self._store.close()
 
     def summary(self) -> str:

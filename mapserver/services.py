@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 
 from mapweave.hybridmap.errors import Busy, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.query import RouteAnswer
+from mapweave.hybridmap.query import KnownRequest, RouteAnswer, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
@@ -17,14 +17,7 @@ from mapweave.mapserver.wire_limits import Pairs, drivable, said
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
-from mapweave.wire.messages import (
-    decode_known_request,
-    decode_route_request,
-    decode_view,
-    encode_known_answer,
-    encode_relocalize_answer,
-    encode_route_answer,
-)
+from mapweave.wire.messages import decode, decode_view, encode
 
 log = logging.getLogger(__name__)
 
@@ -90,10 +83,10 @@ class Services:
 
     def _relocalize(self, payload: bytes) -> bytes:
         view = decode_view(payload)
-        return encode_relocalize_answer(said(self._answers().relocalizer.answer(view)))
+        return encode(said(self._answers().relocalizer.answer(view)))
 
     def _route(self, payload: bytes) -> bytes:
-        request = decode_route_request(payload)
+        request = decode(payload, RouteRequest)
         answers = self._answers()
         self._blockages.report(request.blocked, self._clock())
         wary = self._blockages.known(self._clock())
@@ -102,12 +95,12 @@ class Services:
             start, goal, here = request.start, request.goal, request.start_from_robot
             return answers.router.route(start, goal, blocked, wary, here)
 
-        return encode_route_answer(drivable(route, request.blocked))
+        return encode(drivable(route, request.blocked))
 
     def _known(self, payload: bytes) -> bytes:
-        request = decode_known_request(payload)
+        request = decode(payload, KnownRequest)
         answer = self._answers().known.answer(request.map, (request.x, request.y), request.reach)
-        return encode_known_answer(answer)
+        return encode(answer)
 
     def _tell_status(self, payload: bytes) -> bytes:
         self._answers()

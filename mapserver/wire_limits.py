@@ -12,8 +12,7 @@ from dataclasses import replace
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer
-from mapweave.mapserver.relocalization.verdict import NOWHERE
+from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, RouteAnswer
 from mapweave.wire.pose_codec import pack_pose
 
 FARTHEST = 1e5
@@ -43,7 +42,9 @@ def said(answer: RelocalizeAnswer) -> RelocalizeAnswer:
     """
     fine = [can_be_said(one.node_from_robot) for one in answer.candidates]
     told = tuple(
-        one if can_be_said(one.merged_from_robot) else replace(one, merged_from_robot=None, component=NOWHERE)
+        one
+        if can_be_said(one.merged_from_robot)
+        else replace(one, merged_from_robot=None, component=NO_COMPONENT)
         for one, good in zip(answer.candidates, fine, strict=True)
         if good
     )

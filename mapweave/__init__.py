@@ -1,7 +1,86 @@
-"""The composition root: command line, settings, processes. Nothing imports it."""
+"""Mapweave as a library: `mapweave.read_map_file`, `mapweave.HybridMap` and what else is named here.
+
+A name is imported when it is first used, so `import mapweave` loads no library. What is not named here may
+change from one version to the next. Nothing in the project itself imports these names from here.
+"""
 
 import os
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 # One core a robot. The filters' matrices are small: on a busy machine, BLAS threads that wait for each other
 # made an update of the localization filter forty times slower. numpy reads this when it is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+if TYPE_CHECKING:
+    from mapweave.agent.drivers.robot import Robot as Robot
+    from mapweave.agent.observation import Command as Command
+    from mapweave.agent.observation import Observation as Observation
+    from mapweave.agent.observation import Odometry as Odometry
+    from mapweave.agent.observation import RobotDescription as RobotDescription
+    from mapweave.agent.recordings.camera_file import read_camera as read_camera
+    from mapweave.hybridmap.camera import Camera as Camera
+    from mapweave.hybridmap.errors import MapweaveError as MapweaveError
+    from mapweave.hybridmap.hybrid_map import HybridMap as HybridMap
+    from mapweave.hybridmap.node import Edge as Edge
+    from mapweave.hybridmap.node import EdgeKind as EdgeKind
+    from mapweave.hybridmap.node import Landmarks as Landmarks
+    from mapweave.hybridmap.node import MapId as MapId
+    from mapweave.hybridmap.node import Node as Node
+    from mapweave.hybridmap.node import NodeId as NodeId
+    from mapweave.hybridmap.pose import Pose2 as Pose2
+    from mapweave.hybridmap.pose import PoseGaussian as PoseGaussian
+    from mapweave.hybridmap.query import Certainty as Certainty
+    from mapweave.hybridmap.query import RelocalizeAnswer as RelocalizeAnswer
+    from mapweave.hybridmap.query import View as View
+    from mapweave.mapserver.map_files import maps_of as maps_of
+    from mapweave.mapserver.relocalization.relocalizer import Relocalizer as Relocalizer
+    from mapweave.offline_merge import merge_map_files as merge_map_files
+    from mapweave.offline_relocalization import relocalizer_of as relocalizer_of
+    from mapweave.offline_relocalization import view_of as view_of
+    from mapweave.storage.image_file import read_grey as read_grey
+    from mapweave.storage.map_file import MapFile as MapFile
+    from mapweave.storage.map_file import read_map_file as read_map_file
+    from mapweave.storage.map_file import write_map_file as write_map_file
+
+    __version__: str
+else:
+    _NAMES = {
+        "mapweave.agent.drivers.robot": ("Robot",),
+        "mapweave.agent.observation": ("Command", "Observation", "Odometry", "RobotDescription"),
+        "mapweave.agent.recordings.camera_file": ("read_camera",),
+        "mapweave.hybridmap.camera": ("Camera",),
+        "mapweave.hybridmap.errors": ("MapweaveError",),
+        "mapweave.hybridmap.hybrid_map": ("HybridMap",),
+        "mapweave.hybridmap.node": ("Edge", "EdgeKind", "Landmarks", "MapId", "Node", "NodeId"),
+        "mapweave.hybridmap.pose": ("Pose2", "PoseGaussian"),
+        "mapweave.hybridmap.query": ("Certainty", "RelocalizeAnswer", "View"),
+        "mapweave.mapserver.map_files": ("maps_of",),
+        "mapweave.mapserver.relocalization.relocalizer": ("Relocalizer",),
+        "mapweave.offline_merge": ("merge_map_files",),
+        "mapweave.offline_relocalization": ("relocalizer_of", "view_of"),
+        "mapweave.storage.image_file": ("read_grey",),
+        "mapweave.storage.map_file": ("MapFile", "read_map_file", "write_map_file"),
+    }
+    _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
+    __all__ = [*_MODULE_OF]
+
+    def __getattr__(name):
+        if name == "__version__":
+            from importlib.metadata import version
+
+            return version("mapweave")
+        if name not in _MODULE_OF:
+            raise AttributeError(f"module 'mapweave' has no attribute {name!r}")
+        try:
+            return getattr(import_module(_MODULE_OF[name]), name)
+        except ModuleNotFoundError as error:
+            from mapweave.extras import MissingExtra, extra_of
+
+            extra = extra_of(error.name)
+            if extra is None:
+                raise
+            raise ImportError(f"mapweave.{name} {MissingExtra([extra])}") from error
+
+    def __dir__():
+        return [*globals(), *__all__, "__version__"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.map_files import maps_of
+from mapweave.mapserver.map_files import map_file_of, maps_of
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
-from mapweave.storage.map_file import MapFile
+from mapweave.storage.map_file import MapFile, read_map_file
 from mapweave.wire.codec import encode_body
 
 Progress = Callable[[int, int], None]
@@ -119,3 +119,17 @@ def merge_parts(
     for map_id, reason in merged.set_apart.items():
         raise InvalidValue(f"map {map_id} cannot be merged: {reason}; leave its file out, or retire it")
     return merged
+
+
+def merge_map_files(paths: Iterable[Path]) -> MapFile:
+    """Merge map files as `mapweave map merge` does.
+
+    Returns:
+        The merged map, to be written with `write_map_file`. It does not depend on the order of the files.
+
+    Raises:
+        InvalidFile: a file cannot be read, or two hold different maps of one name.
+        InvalidValue: a map cannot be merged.
+    """
+    parts = parts_of({path: read_map_file(path) for path in paths})
+    return map_file_of(merge_parts(parts.maps, parts.rulings), parts.history)

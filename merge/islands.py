@@ -15,8 +15,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.manual_constraints import apply_constraints
-from mapweave.merge.merging import decide
-from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
+from mapweave.merge.merging import MergeCache, decide
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
@@ -42,7 +41,7 @@ class Islands:
         """
         self._settings = settings or MergeSettings()
         self._exact = exact
-        self._memory = DecisionCache()
+        self._cache = MergeCache()
         self._known: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
         self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
         self._rulings = ManualConstraints()
@@ -90,7 +89,7 @@ class Islands:
     ) -> tuple[MergedMap, StandingDecisions]:
         links, refused = _sorted_out(verdicts)
         undone = apply_constraints(maps, links, rulings)
-        everything = undone.maps, undone.links, [*refused, *undone.refused], self._settings, self._memory
+        everything = undone.maps, undone.links, [*refused, *undone.refused], self._settings, self._cache
         small = sum(len(one.nodes) for one in maps.values()) <= self._exact
         before = None if small or not earlier else StandingDecisions.union(earlier)
         merged, stands = decide(*everything, before)

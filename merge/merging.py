@@ -4,8 +4,7 @@
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
 3. Pieces are joined, best supported first, and the links between what is larger now are sorted anew. Links
    that would join what is joined already must agree with it.
-4. Each component is optimised; a link that then strains more than it should is refused, worst first. Where
-   few are refused, each is tried once more by solving with it.
+4. Each component is optimised. Where few links are refused, each is tried once more by solving with it.
 5. Where two robots would have been at the same place at the same time, the links that make them so are
    refuted, and it goes on at 2 with the rest.
 6. Drives of a robot among others' nodes are checked against the outcome.
@@ -14,12 +13,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.refutation import Refutation
+from mapweave.merge.mutual_exclusion.trajectories import TrajectoryCache
 from mapweave.merge.outlier_rejection.agglomerative_joining import agglomerate
-from mapweave.merge.outlier_rejection.closing_links import optimise
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
@@ -33,6 +33,19 @@ from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
+
+
+@dataclass(frozen=True, eq=False)
+class MergeCache:
+    """What a merge found out that the next one with the same settings need not find out again.
+
+    Attributes:
+        decisions: fragments of maps, and links between them, sorted.
+        trajectories: of the robots.
+    """
+
+    decisions: DecisionCache = field(default_factory=DecisionCache)
+    trajectories: TrajectoryCache = field(default_factory=TrajectoryCache)
 
 
 def merge_maps(
@@ -52,7 +65,7 @@ def merge_maps(
     Returns:
         The merged map. It does not depend on the order of maps, links or nodes.
     """
-    return decide(maps, links, refused, settings or MergeSettings(), DecisionCache())[0]
+    return decide(maps, links, refused, settings or MergeSettings(), MergeCache())[0]
 
 
 def decide(
@@ -60,7 +73,7 @@ def decide(
     links: Iterable[Link],
     refused: Iterable[RefusedLink],
     settings: MergeSettings,
-    memory: DecisionCache,
+    cache: MergeCache,
     before: StandingDecisions | None = None,
 ) -> tuple[MergedMap, StandingDecisions]:
     """Merge, and tell what was decided, so that the next merge can begin from it.
@@ -70,7 +83,7 @@ def decide(
         links: verified, see `merge_maps`.
         refused: pairs that were refused before, to be kept with their reasons.
         settings: how.
-        memory: of merges with the same settings; what they have found out is not found out again.
+        cache: of merges with the same settings.
         before: what stands of the same maps, as far as it is still true. A link keeps its decision until
             links between the same two maps come or go; None: all are decided.
 
@@ -78,7 +91,7 @@ def decide(
         The merged map, and what stands now.
     """
     s = settings
-    fragments = memory.fragments(maps, s.consistency, s.strain)
+    fragments = cache.decisions.fragments(maps, s.consistency)
     solver = ComponentSolver(fragments)
     by_node = solver.by_node
     given = {link.pair: link for link in links if link.a in by_node and link.b in by_node}
@@ -86,7 +99,7 @@ def decide(
     known = {pair for pair, link in given.items() if standing.given.get(pair) is link}
     news = (given.keys() - known) | (standing.given.keys() - known)
     fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
-    weighed = _weighed(given, standing, known, fresh, by_node, maps, memory, s)
+    weighed = _weighed(given, standing, known, fresh, by_node, maps, cache.decisions, s)
     held = [link for pair, link in weighed.items() if pair in standing.believed and pair in known]
     refuted = standing.refuted & known
     closed = {
@@ -97,9 +110,9 @@ def decide(
     if before is not None:
         gone = [standing.weighed[pair] for pair in standing.believed - known]
         solver.resume(standing.graphs, standing.fragments, held, gone)
-    refutation = Refutation(maps, fragments, s.exclusion, memory)
+    refutation = Refutation(maps, fragments, s.exclusion, cache.trajectories)
     open_ = [link for pair, link in weighed.items() if pair not in refuted]
-    groups = memory.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
+    groups = cache.decisions.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
     # Each round refutes a link at least, so there is a last one.
     while True:
         solved, kept, unjoined = _joined(solver, groups, held, closed, s, whole=before is None)
@@ -148,12 +161,11 @@ def _joined(
 ) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
     """Join and optimise: the components, the links that are kept, and those that are not."""
     kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
-    _, kept, strained = optimise(solver, kept, s.strain, whole)
-    refused = [*unjoined, *strained]
-    tried = [r.link for r in refused if r.link is not None]
+    solver.solve(kept, whole=whole)
+    tried = [r.link for r in unjoined if r.link is not None]
     kept += readmitted(solver, kept, tried, s.consistency)
     told = {link.key for link in kept}
-    return solver.solve(kept, believed=True), kept, [r for r in refused if r.pair not in told]
+    return solver.solve(kept), kept, [r for r in unjoined if r.pair not in told]
 
 
 def _weighed(
@@ -163,7 +175,7 @@ def _weighed(
     fresh: Set[tuple[MapId, MapId]],
     by_node: Mapping[NodeId, Fragment],
     maps: Mapping[MapId, HybridMap],
-    memory: DecisionCache,
+    cache: DecisionCache,
     s: MergeSettings,
 ) -> dict[Pair, Link]:
     """Links with their doubles, which are looked for among those between maps of which links are new."""
@@ -171,7 +183,7 @@ def _weighed(
     some = [link for link in given.values() if link.maps in fresh]
     involved = {one: maps[one] for pair in fresh for one in pair if one in maps}
     for link, found in zip(
-        some, memory.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
+        some, cache.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
     ):
         # What is known to be elsewhere too stays so, whoever is looked at.
         if link.key not in out or out[link.key].doubles < found.doubles:

@@ -53,11 +53,9 @@ class MergeSettings:
     """How maps are merged.
 
     Attributes:
-        strain: chi-square with 3 degrees of freedom above which an optimised link is refused.
         consistency: when links are believed.
         exclusion: when two robots would have been in one place.
     """
 
-    strain: Positive = 25.0
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
     exclusion: ExclusionSettings = field(default_factory=ExclusionSettings)

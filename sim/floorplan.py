@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import Coordinate, Words
 from mapweave.hybridmap.pose import Array, Pose2
 
 CELL = 0.05
@@ -37,12 +38,12 @@ class Rectangle:
         name: of the thing.
     """
 
-    x: float
-    y: float
-    length: float
-    width: float
-    heading: float = 0.0
-    name: str = ""
+    x: Coordinate
+    y: Coordinate
+    length: Coordinate
+    width: Coordinate
+    heading: Coordinate = 0.0
+    name: Words = ""
 
     @property
     def corners(self) -> Array:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
 
 from mapweave.agent.drivers.remote import PATIENCE, RemoteRobot
+from mapweave.hybridmap.limits import MAX_NUMBER
 from mapweave.sim.keys import SimKeys
 from mapweave.wire.bus import Bus
-from mapweave.wire.packing import MAX_NUMBER, Reader, pack
+from mapweave.wire.packing import Limit
+from mapweave.wire.typed import decode, encode
 
-MAX_BYTES = 64
+LIMIT = Limit("rendezvous", 64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +28,12 @@ class Rendezvous:
         sequence: counts together with the steps of the same robot.
     """
 
-    sequence: int
+    sequence: Annotated[int, Meta(ge=1, le=MAX_NUMBER)]
 
 
 def encode_rendezvous(step: Rendezvous) -> bytes:
     """Encode it."""
-    return pack({"q": step.sequence})
+    return encode(step, LIMIT)
 
 
 def decode_rendezvous(data: bytes) -> Rendezvous:
@@ -37,7 +42,7 @@ def decode_rendezvous(data: bytes) -> Rendezvous:
     Raises:
         InvalidMessage: anything is wrong with it.
     """
-    return Rendezvous(Reader(data, "rendezvous", MAX_BYTES).integer("q", 1, MAX_NUMBER))
+    return decode(data, Rendezvous, LIMIT)
 
 
 class LockstepRobot(RemoteRobot):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.limits import Name, Number, Stamp
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.floorplan import Rectangle
 
@@ -25,9 +26,9 @@ class Snapshot:
         images: (H, W) grey, by robot, as its camera gave it last; None if it gave none.
     """
 
-    tick: int
-    stamp_ns: int
-    robots: Mapping[str, Pose2]
+    tick: Number
+    stamp_ns: Stamp
+    robots: Mapping[Name, Pose2]
     actors: tuple[Rectangle, ...]
     furniture: tuple[Rectangle, ...]
-    images: Mapping[str, NDArray[np.uint8] | None]
+    images: Mapping[Name, NDArray[np.uint8] | None]

@@ -74,7 +74,7 @@ def wrong_measurements(
     graph.add(gtsam.PriorFactorPose2(row[anchor], gtsam.Pose2(*anchor_pose.vector), tight))
     # GNC sets the weights itself: its factors must have plain noise.
     factors = Factors.of(ordered, [row[m.a] for m in ordered], [row[m.b] for m in ordered])
-    add_measurements(graph, factors, np.inf)
+    add_measurements(graph, factors)
     inliers = [0] + [k for k, m in enumerate(ordered, 1) if not m.robust]
     if len(inliers) == 1 + len(ordered):
         return []

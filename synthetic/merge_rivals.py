@@ -19,10 +19,12 @@ from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import fragment_by_node
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
-from mapweave.merge.settings import ConsistencySettings, MergeSettings
+from mapweave.merge.settings import ConsistencySettings
 from synthetic.fleet import SyntheticFleet
 from synthetic.gnc import inliers
 
+STRAIN = 25.0
+"""Chi-square with 3 degrees of freedom above which GNC holds a link for wrong."""
 MAPWEAVE = "mapweave"
 """The settings that are the default."""
 Maps = Mapping[MapId, HybridMap]
@@ -34,7 +36,7 @@ def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
     fragments = fragments_of(maps)
     by_node = fragment_by_node(fragments)
     used = [link for link in links if link.a in by_node and link.b in by_node]
-    graphs = ComponentSolver(fragments).solve(used, believed=True)
+    graphs = ComponentSolver(fragments).solve(used)
     return MergedMap(
         maps,
         tuple(sorted(used, key=lambda link: link.pair)),
@@ -47,7 +49,7 @@ def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
 
 def gnc(maps: Maps, links: Sequence[Link]) -> MergedMap:
     """Graduated non-convexity over all links at once (Yang et al., RA-L 2020)."""
-    return least_squares(maps, inliers(fragments_of(maps), links, MergeSettings().strain))
+    return least_squares(maps, inliers(fragments_of(maps), links, STRAIN))
 
 
 def pcm(maps: Maps, links: Sequence[Link]) -> MergedMap:

@@ -11,35 +11,34 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId, check_name
+from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER, MAX_STAMP_NS, Key, Name, Number, Stamp
+from mapweave.hybridmap.node import Edge, EdgeKind, Node, NodeId
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
-from mapweave.wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
-from mapweave.wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
+from mapweave.wire.landmark_codec import MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
+from mapweave.wire.packing import Limit, pack, unpack
 from mapweave.wire.pose_codec import MAX_MEASURED, pack_camera, pack_pose, unpack_camera, unpack_pose
-from mapweave.wire.range_codec import MAX_RANGE_BYTES, pack_ranges, unpack_ranges
+from mapweave.wire.range_codec import pack_ranges, unpack_ranges
 from mapweave.wire.trajectory_codec import MAX_WAKE_BYTES, pack_trajectory, unpack_trajectory
 
 MAX_RADIUS_MM = 100_000
 MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + MAX_WAKE_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
+BODY = Limit("change", MAX_BODY_BYTES)
+CHANGE = Limit("change", MAX_CHANGE_BYTES)
 MAX_SHARED = MAX_LANDMARKS
 SINGLE = struct.Struct("<f")
-NO_RANGES = Ranges()
-NO_WAKE = TrajectorySegment()
-MAX_EVIDENCE = 64
 MOST_EVIDENCE = float(MAX_LANDMARKS)
 """Greatest number among the evidence: most are counts of landmarks or less. More says nothing more."""
-
-NODE_PUT, NODE_RETIRED, EDGE_PUT, EDGE_RETIRED = 1, 2, 3, 4
 
 EDGE_KINDS = {
     EdgeKind.MAPPED: 1,
@@ -49,6 +48,46 @@ EDGE_KINDS = {
     EdgeKind.MERGED: 5,
 }
 KINDS_OF_EDGE = {number: kind for kind, number in EDGE_KINDS.items()}
+
+
+class _Element(msgspec.Struct, tag_field="k", omit_defaults=True):
+    id: NodeId = msgspec.field(name="i")
+
+
+class _NodePut(_Element, tag=1):
+    stamp_ns: Stamp = msgspec.field(name="t")
+    map_from_robot: bytes = msgspec.field(name="p")
+    camera: bytes = msgspec.field(name="c")
+    landmarks: bytes = msgspec.field(name="m")
+    clock: Name | None = msgspec.field(name="z", default=None)
+    radius_mm: Annotated[int, Meta(ge=0, le=MAX_RADIUS_MM)] = msgspec.field(name="r", default=0)
+    ranges: bytes | None = msgspec.field(name="g", default=None)
+    wake: bytes | None = msgspec.field(name="u", default=None)
+
+
+class _NodeRetired(_Element, tag=2):
+    pass
+
+
+class _EdgePut(_Element, tag=3):
+    a: Number | NodeId
+    b: Number | NodeId
+    a_from_b: bytes = msgspec.field(name="p")
+    kind: Annotated[int, Meta(ge=1, le=len(EDGE_KINDS))] = msgspec.field(name="w")
+    shared: Annotated[bytes, Meta(max_length=1 + 4 * MAX_SHARED)] = msgspec.field(name="h", default=b"\x01")
+    evidence: Annotated[dict[Key, Annotated[float, Meta(ge=0.0, le=MOST_EVIDENCE)]], Meta(max_length=64)] = (
+        msgspec.field(name="x", default_factory=dict)
+    )
+
+
+class _EdgeRetired(_Element, tag=4):
+    pass
+
+
+class _Envelope(msgspec.Struct):
+    sequence: Annotated[int, Meta(ge=1, le=MAX_NUMBER)] = msgspec.field(name="q")
+    stamp_ns: Stamp = msgspec.field(name="t")
+    body: Annotated[bytes, Meta(max_length=MAX_BODY_BYTES)] = msgspec.field(name="b")
 
 
 def element_of(body: ChangeBody) -> NodeId:
@@ -68,17 +107,17 @@ def encode_body(body: ChangeBody) -> bytes:
     Raises:
         InvalidValue: it would not decode: too many landmarks, a number out of range.
     """
-    element = element_of(body)
-    head = {"i": list(element)}
     match body:
         case NodePut(node):
-            data = pack({"k": NODE_PUT, **head, **_node_fields(node)})
+            message: _Element = _node_message(node)
         case EdgePut(edge):
-            data = pack({"k": EDGE_PUT, **head, **_edge_fields(edge)}, single_floats=True)
-        case NodeRetired():
-            data = pack({"k": NODE_RETIRED, **head})
-        case EdgeRetired():
-            data = pack({"k": EDGE_RETIRED, **head})
+            message = _edge_message(edge)
+        case NodeRetired(element):
+            message = _NodeRetired(element)
+        case EdgeRetired(element):
+            message = _EdgeRetired(element)
+    fields = msgspec.to_builtins(message, builtin_types=(bytes,))
+    data = pack(fields, single_floats=True)
     try:
         # One rule for both sides: what a receiver would refuse is not sent.
         decode_body(data)
@@ -93,14 +132,16 @@ def decode_body(data: bytes) -> ChangeBody:
     Raises:
         InvalidMessage: anything is wrong with it.
     """
-    reader = Reader(data, "change", MAX_BODY_BYTES)
-    kind = reader.integer("k", NODE_PUT, EDGE_RETIRED)
-    element = reader.node_id("i")
-    if kind == NODE_PUT:
-        return NodePut(_read_node(reader, element))
-    if kind == EDGE_PUT:
-        return EdgePut(_read_edge(reader, element))
-    return NodeRetired(element) if kind == NODE_RETIRED else EdgeRetired(element)
+    message = unpack(data, _NodePut | _NodeRetired | _EdgePut | _EdgeRetired, BODY)
+    match message:
+        case _NodePut():
+            return NodePut(_read_node(message))
+        case _EdgePut():
+            return EdgePut(_read_edge(message))
+        case _NodeRetired():
+            return NodeRetired(message.id)
+        case _:
+            return EdgeRetired(message.id)
 
 
 def encode_change(change: Change) -> bytes:
@@ -142,96 +183,64 @@ def unwrap_body(data: bytes) -> tuple[int, int, bytes]:
     Raises:
         InvalidMessage: the envelope is broken.
     """
-    reader = Reader(data, "change", MAX_CHANGE_BYTES)
-    sequence = reader.integer("q", 1, MAX_NUMBER)
-    return sequence, reader.integer("t", 0, MAX_STAMP_NS), reader.binary("b", MAX_BODY_BYTES)
+    envelope: _Envelope = unpack(data, _Envelope, CHANGE)
+    return envelope.sequence, envelope.stamp_ns, envelope.body
 
 
-def _node_fields(node: Node) -> dict[str, object]:
-    fields: dict[str, object] = {
-        "t": node.stamp_ns,
-        "p": pack_pose(node.map_from_robot, MAX_MEASURED),
-        "c": pack_camera(node.camera),
-        "m": pack_landmarks(node.landmarks, node.camera),
-    }
-    if node.clock:
-        fields["z"] = check_name(node.clock)
-    if node.radius:
-        fields["r"] = _millimetres(node.radius)
-    if len(node.ranges):
-        fields["g"] = pack_ranges(node.ranges)
-    if len(node.wake):
-        fields["u"] = pack_trajectory(node.wake, node.ranges.reach)
-    return fields
+def _node_message(node: Node) -> _NodePut:
+    if not 0.0 <= node.radius <= MAX_RADIUS_MM / 1000.0:
+        raise InvalidValue(f"node: a robot's radius of {node.radius} m is out of range")
+    return _NodePut(
+        node.id,
+        node.stamp_ns,
+        pack_pose(node.map_from_robot, MAX_MEASURED),
+        pack_camera(node.camera),
+        pack_landmarks(node.landmarks, node.camera),
+        node.clock or None,
+        round(node.radius * 1000.0),
+        pack_ranges(node.ranges) if len(node.ranges) else None,
+        pack_trajectory(node.wake, node.ranges.reach) if len(node.wake) else None,
+    )
 
 
-def _millimetres(radius: float) -> int:
-    if not 0.0 <= radius <= MAX_RADIUS_MM / 1000.0:
-        raise InvalidValue(f"node: a robot's radius of {radius} m is out of range")
-    return round(radius * 1000.0)
-
-
-def _read_node(reader: Reader, element: NodeId) -> Node:
-    camera = unpack_camera(reader.binary("c", MAX_BODY_BYTES))
-    ranges = unpack_ranges(reader.binary("g", MAX_RANGE_BYTES)) if reader.has("g") else NO_RANGES
+def _read_node(message: _NodePut) -> Node:
+    camera = unpack_camera(message.camera)
+    ranges = Ranges() if message.ranges is None else unpack_ranges(message.ranges)
     return Node(
-        id=element,
-        stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
-        map_from_robot=unpack_pose(reader.binary("p", MAX_BODY_BYTES), MAX_MEASURED),
-        camera=camera,
-        landmarks=_read_landmarks(reader, camera),
-        clock=reader.name("z") if reader.has("z") else "",
-        radius=reader.integer("r", 0, MAX_RADIUS_MM) / 1000.0 if reader.has("r") else 0.0,
-        ranges=ranges,
-        wake=unpack_trajectory(reader.binary("u", MAX_WAKE_BYTES), ranges) if reader.has("u") else NO_WAKE,
+        message.id,
+        message.stamp_ns,
+        unpack_pose(message.map_from_robot, MAX_MEASURED),
+        camera,
+        unpack_landmarks(message.landmarks, camera),
+        message.clock or "",
+        message.radius_mm / 1000.0,
+        ranges,
+        TrajectorySegment() if message.wake is None else unpack_trajectory(message.wake, ranges),
     )
 
 
-def _read_landmarks(reader: Reader, camera: Camera) -> Landmarks:
-    return unpack_landmarks(reader.binary("m", MAX_BODY_BYTES), camera)
-
-
-def _edge_fields(edge: Edge) -> dict[str, object]:
-    fields: dict[str, object] = {
-        "a": _reference(edge.a, edge.id.map),
-        "b": _reference(edge.b, edge.id.map),
-        "p": pack_pose(edge.a_from_b, MAX_MEASURED),
-        "w": EDGE_KINDS[edge.kind],
-    }
+def _edge_message(edge: Edge) -> _EdgePut:
+    a, b = (end.number if end.map == edge.id.map else end for end in (edge.a, edge.b))
+    message = _EdgePut(edge.id, a, b, pack_pose(edge.a_from_b, MAX_MEASURED), EDGE_KINDS[edge.kind])
     if len(edge.shared):
-        fields["h"] = _pack_shared(edge.shared)
-    if edge.evidence:
-        fields["x"] = {name: _small(value) for name, value in edge.evidence.items()}
-    return fields
+        message.shared = _pack_shared(edge.shared)
+    message.evidence = {name: _small(value) for name, value in edge.evidence.items()}
+    return message
 
 
-def _read_edge(reader: Reader, element: NodeId) -> Edge:
-    a, b = (_read_reference(reader, end, element.map) for end in "ab")
+def _read_edge(message: _EdgePut) -> Edge:
+    a, b = (NodeId(*message.id.map, end) if isinstance(end, int) else end for end in (message.a, message.b))
     if a == b:
-        raise reader.error(f"edge {element} joins {a} to itself")
-    evidence = reader.table("x", MAX_EVIDENCE) if reader.has("x") else {}
+        raise InvalidMessage(f"change: edge {message.id} joins {a} to itself")
     return Edge(
-        id=element,
-        a=a,
-        b=b,
-        a_from_b=unpack_pose(reader.binary("p", MAX_BODY_BYTES), MAX_MEASURED),
-        kind=KINDS_OF_EDGE[reader.integer("w", 1, len(EDGE_KINDS))],
-        shared=_unpack_shared(reader.binary("h", 1 + 4 * MAX_SHARED) if reader.has("h") else b"\x01"),
-        evidence={
-            name: reader.as_number(value, name, 0.0, MOST_EVIDENCE) for name, value in evidence.items()
-        },
+        message.id,
+        a,
+        b,
+        unpack_pose(message.a_from_b, MAX_MEASURED),
+        KINDS_OF_EDGE[message.kind],
+        _unpack_shared(message.shared),
+        message.evidence,
     )
-
-
-def _reference(element: NodeId, home: MapId) -> int | list[str | int]:
-    return element.number if element.map == home else list(element)
-
-
-def _read_reference(reader: Reader, name: str, home: MapId) -> NodeId:
-    value = reader.any(name)
-    if type(value) is int:
-        return NodeId(*home, reader.integer(name, 0, MAX_NUMBER))
-    return reader.node_id(name)
 
 
 def _small(value: float) -> int | float:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.landmark_tables import SYMBOLS, TOTAL_BITS, VERSION, landmark_tables
+from mapweave.hybridmap.limits import MAX_LANDMARKS
 from mapweave.hybridmap.node import CODE_BYTES, Landmarks
 from mapweave.hybridmap.quantization import (
     FINE_BITS,
@@ -28,9 +29,17 @@ from mapweave.hybridmap.quantization import (
     restore_landmarks,
     round_landmarks,
 )
-from mapweave.wire.rans import BitReader, Column, Columns, Ints, LaneReader, LaneWriter, pack_bits
+from mapweave.wire.rans import (
+    BitReader,
+    Column,
+    Columns,
+    Frequencies,
+    Ints,
+    LaneReader,
+    LaneWriter,
+    pack_bits,
+)
 
-MAX_LANDMARKS = 2000
 HEAD = struct.Struct("<BBHHHHH")
 """Version, flags, count, least x, reach of x, least y, reach of y."""
 
@@ -102,6 +111,13 @@ def _read_columns() -> tuple[Columns, Columns, Columns]:
     return Columns.of(_code_columns()), Columns.of([shares]), Columns.of([cells])
 
 
+@cache
+def _written_columns() -> tuple[Frequencies, Frequencies, Frequencies]:
+    """Of codes, shares and cells."""
+    shares, cells = _depth_columns()
+    return Frequencies.of(_code_columns()), Frequencies.of([shares]), Frequencies.of([cells])
+
+
 def _pack(rounded: QuantizedLandmarks, codes: NDArray[np.uint8], with_depths: bool) -> bytes:
     count = len(codes)
     if count > MAX_LANDMARKS:
@@ -118,8 +134,7 @@ def _pack(rounded: QuantizedLandmarks, codes: NDArray[np.uint8], with_depths: bo
     lanes = LaneWriter((x << low | y & ((1 << low) - 1)) + (1 << size), size)
     if with_depths:
         _push_depths(lanes, rounded)
-    for k in reversed(range(CODE_BYTES)):
-        lanes.push(codes[:, k].astype(np.int64), _code_columns()[k])
+    lanes.push(codes.T, _written_columns()[0])
     flags = ASCENDING * ascending + WITH_DEPTHS * with_depths
     head = HEAD.pack(VERSION, flags, count, least_x, reach_x, least_y, reach_y)
     rows = row, np.ones_like(row)
@@ -183,13 +198,13 @@ def _read(data: bytes, lay: _Layout) -> _Parts:
 
 
 def _push_depths(lanes: LaneWriter, rounded: QuantizedLandmarks) -> None:
-    shares, cells = _depth_columns()
+    _, shares, cells = _written_columns()
     known = np.flatnonzero(rounded.share)
     fine = FINE_BITS[rounded.share[known]]
     depth = rounded.depth[known]
     lanes.push_plain(depth & ((1 << fine) - 1), fine, known)
-    lanes.push(depth >> fine, cells, known)
-    lanes.push(rounded.share, shares)
+    lanes.push((depth >> fine).astype(np.uint8)[None], cells, known)
+    lanes.push(rounded.share.astype(np.uint8)[None], shares)
 
 
 def _pop_depths(lanes: LaneReader) -> tuple[Ints, Ints]:

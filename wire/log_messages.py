@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Annotated, ClassVar, Self
+
+import msgspec
+from msgspec import Meta, field
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.limits import MAX_FLOAT, MAX_NUMBER, Key, Name, Number
 from mapweave.hybridmap.node import MapId
 from mapweave.wire.codec import MAX_CHANGE_BYTES
-from mapweave.wire.packing import MAX_NUMBER, Reader, pack
+from mapweave.wire.packing import Limit, pack, unpack
 
 MARK = struct.Struct("<QQ")
 MAX_ROWS = 256
@@ -18,10 +24,13 @@ MAX_ROWS = 256
 MAX_SERVERS = 64
 MAX_REFUSALS = 16
 MAX_REASON = 300
-MAX_RECORD_FIELDS = 64
 MAX_SMALL_BYTES = 65536
 
 Scalar = bool | int | float | str
+Id = Annotated[int, Meta(ge=0)]
+"""Drawn by chance, below 2^64."""
+Sequence = Annotated[int, Meta(ge=1, le=MAX_NUMBER)]
+Encoded = Annotated[bytes, Meta(max_length=MAX_CHANGE_BYTES)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +65,23 @@ class Mark:
         return Mark(sequence, log_id)
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
+class LogMessage(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Any of them."""
+
+    limit: ClassVar[Limit] = Limit("message", MAX_SMALL_BYTES)
+
+    def encode(self) -> bytes:
+        """As bytes."""
+        return pack(msgspec.to_builtins(self, builtin_types=(bytes,)))
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """The same back; raises InvalidMessage."""
+        message: Self = unpack(data, cls, cls.limit)
+        return message
+
+
+class Head(LogMessage, frozen=True):
     """An agent's beacon.
 
     Attributes:
@@ -67,35 +91,22 @@ class Head:
             again.
     """
 
-    log_id: int
-    newest: int
-    acknowledged: Mapping[str, int] = field(default_factory=dict)
-
-    def encode(self) -> bytes:
-        """Encode."""
-        return pack({"l": self.log_id, "q": self.newest, "a": dict(self.acknowledged)})
-
-    @staticmethod
-    def decode(data: bytes) -> Head:
-        """Decode; raises InvalidMessage."""
-        reader = Reader(data, "head", MAX_SMALL_BYTES)
-        acknowledged = {
-            reader.as_name(server, "server"): reader.as_integer(watermark, "watermark", 0, MAX_NUMBER)
-            for server, watermark in reader.table("a", MAX_SERVERS).items()
-        }
-        return Head(_log_id(reader), reader.integer("q", 0, MAX_NUMBER), acknowledged)
+    limit = Limit("head", MAX_SMALL_BYTES)
+    log_id: Id = field(name="l")
+    newest: Number = field(name="q")
+    acknowledged: Annotated[dict[Name, Number], Meta(max_length=MAX_SERVERS)] = field(
+        name="a", default_factory=dict
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class Refusal:
+class Refusal(msgspec.Struct, frozen=True, array_like=True):
     """A change that a server could not take, and why. Sequence 0: the whole log."""
 
-    sequence: int
-    reason: str
+    sequence: Number
+    reason: Annotated[str, Meta(max_length=MAX_REASON)]
 
 
-@dataclass(frozen=True, slots=True)
-class Ack:
+class Ack(LogMessage, frozen=True):
     """What a server has on its disk.
 
     Attributes:
@@ -107,75 +118,45 @@ class Ack:
             has lost its store acknowledges with another, and less.
     """
 
-    map: MapId
-    log_id: int
-    watermark: int
-    refusals: tuple[Refusal, ...] = ()
-    store: int = 0
+    limit = Limit("ack", MAX_SMALL_BYTES)
+    map: MapId = field(name="m")
+    log_id: Id = field(name="l")
+    watermark: Number = field(name="q")
+    refusals: Annotated[tuple[Refusal, ...], Meta(max_length=MAX_REFUSALS)] = field(name="r", default=())
+    store: Annotated[int, Meta(ge=0, le=2**63 - 1)] = field(name="s", default=0)
 
     def encode(self) -> bytes:
-        """Encode."""
-        refusals = [[one.sequence, one.reason[:MAX_REASON]] for one in self.refusals[-MAX_REFUSALS:]]
-        fields = {"m": list(self.map), "l": self.log_id, "q": self.watermark, "r": refusals}
-        return pack({**fields, "s": self.store} if self.store else fields)
-
-    @staticmethod
-    def decode(data: bytes) -> Ack:
-        """Decode; raises InvalidMessage."""
-        reader = Reader(data, "ack", MAX_SMALL_BYTES)
-        refusals = []
-        for element in reader.array("r", MAX_REFUSALS):
-            pair = reader.as_array(element, "refusal", 2)
-            if len(pair) != 2:
-                raise reader.error("a refusal must be [sequence, reason]")
-            sequence = reader.as_integer(pair[0], "refused sequence", 0, MAX_NUMBER)
-            refusals.append(Refusal(sequence, reader.as_text(pair[1], "reason", MAX_REASON)))
-        watermark = reader.integer("q", 0, MAX_NUMBER)
-        store = reader.integer("s", 0, 2**63 - 1) if reader.has("s") else 0
-        return Ack(reader.map_id("m"), _log_id(reader), watermark, tuple(refusals), store)
+        """With the newest refusals and the beginning of their reasons."""
+        newest = self.refusals[-MAX_REFUSALS:]
+        brief = tuple(Refusal(refusal.sequence, refusal.reason[:MAX_REASON]) for refusal in newest)
+        return LogMessage.encode(msgspec.structs.replace(self, refusals=brief))
 
 
-@dataclass(frozen=True, slots=True)
-class NewestMap:
+class NewestMap(LogMessage, frozen=True):
     """A server's answer to an agent that is about to begin a map: the highest epoch that it has of it.
 
     Attributes:
         epoch: 0 if it has no map of this agent.
     """
 
-    epoch: int
-
-    def encode(self) -> bytes:
-        """Encode."""
-        return pack({"e": self.epoch})
-
-    @staticmethod
-    def decode(data: bytes) -> NewestMap:
-        """Decode; raises InvalidMessage."""
-        return NewestMap(Reader(data, "newest map", MAX_SMALL_BYTES).integer("e", 0, MAX_NUMBER))
+    limit = Limit("newest map", MAX_SMALL_BYTES)
+    epoch: Number = field(name="e")
 
 
-@dataclass(frozen=True, slots=True)
-class LogRequest:
+class LogRequest(LogMessage, frozen=True):
     """A server asks for the changes first to last, both included."""
 
-    first: int
-    last: int
+    limit = Limit("log request", MAX_SMALL_BYTES)
+    first: Sequence = field(name="f")
+    last: Sequence = field(name="q")
 
-    def encode(self) -> bytes:
-        """Encode."""
-        return pack({"f": self.first, "q": self.last})
-
-    @staticmethod
-    def decode(data: bytes) -> LogRequest:
-        """Decode; raises InvalidMessage."""
-        reader = Reader(data, "log request", MAX_SMALL_BYTES)
-        first = reader.integer("f", 1, MAX_NUMBER)
-        return LogRequest(first, reader.integer("q", first, MAX_NUMBER))
+    def __post_init__(self) -> None:
+        """Refuse what is no range (InvalidValue)."""
+        if self.last < self.first:
+            raise InvalidValue(f"there are no changes {self.first} to {self.last}")
 
 
-@dataclass(frozen=True, slots=True)
-class LogAnswer:
+class LogAnswer(LogMessage, frozen=True):
     """A piece of a log.
 
     Attributes:
@@ -183,35 +164,37 @@ class LogAnswer:
         first: as asked.
         covered: how far the answer reaches; less than asked if that would be too much for one answer. What
             is missing up to here was superseded by a later change and is no longer kept.
-        changes: (sequence, encoded change), in order.
+        changes: (sequence, encoded change), in order. They are not looked at.
     """
 
-    log_id: int
-    first: int
-    covered: int
-    changes: tuple[tuple[int, bytes], ...]
+    limit = Limit("log answer", MAX_ROWS * MAX_CHANGE_BYTES + MAX_SMALL_BYTES)
+    log_id: Id = field(name="l")
+    first: Sequence = field(name="f")
+    covered: Number = field(name="q")
+    changes: Annotated[
+        tuple[tuple[Sequence, Annotated[bytes, Meta(max_length=MAX_CHANGE_BYTES)]], ...],
+        Meta(max_length=MAX_ROWS),
+    ] = field(name="c")
 
-    def encode(self) -> bytes:
-        """Encode."""
-        changes = [list(entry) for entry in self.changes]
-        return pack({"l": self.log_id, "f": self.first, "q": self.covered, "c": changes})
+    def __post_init__(self) -> None:
+        """Refuse changes that are not in order, or not of the piece (InvalidValue)."""
+        steps = [self.first - 1, *(sequence for sequence, _ in self.changes), self.covered + 1]
+        if not all(before < after for before, after in pairwise(steps)):
+            raise InvalidValue(f"there are changes out of order, or not of {self.first} to {self.covered}")
 
-    @staticmethod
-    def decode(data: bytes) -> LogAnswer:
-        """Decode; raises InvalidMessage. The changes are not looked at."""
-        reader = Reader(data, "log answer", MAX_ROWS * MAX_CHANGE_BYTES + MAX_SMALL_BYTES)
-        first = reader.integer("f", 1, MAX_NUMBER)
-        covered = reader.integer("q", first - 1, MAX_NUMBER)
-        changes = []
-        lowest = first
-        for value in reader.array("c", MAX_ROWS):
-            pair = reader.as_array(value, "a change", 2)
-            if len(pair) != 2:
-                raise reader.error("a change must be [sequence, change]")
-            sequence = reader.as_integer(pair[0], "a change's sequence", lowest, covered)
-            changes.append((sequence, reader.as_binary(pair[1], "a change", MAX_CHANGE_BYTES)))
-            lowest = sequence + 1
-        return LogAnswer(_log_id(reader), first, covered, tuple(changes))
+
+class _Record(LogMessage, frozen=True):
+    limit = Limit("record", MAX_SMALL_BYTES)
+    values: Annotated[
+        dict[
+            Key,
+            bool
+            | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+            | Annotated[float, Meta(ge=-MAX_FLOAT, le=MAX_FLOAT)]
+            | Annotated[str, Meta(max_length=1024)],
+        ],
+        Meta(max_length=64),
+    ] = field(name="s")
 
 
 def encode_record(values: Mapping[str, Scalar]) -> bytes:
@@ -220,9 +203,9 @@ def encode_record(values: Mapping[str, Scalar]) -> bytes:
     Raises:
         InvalidValue: it would not decode.
     """
-    data = pack({"s": dict(values)})
+    data = _Record(dict(values)).encode()
     try:
-        decode_record(data)
+        _Record.decode(data)
     except InvalidMessage as error:
         raise InvalidValue(str(error)) from None
     return data
@@ -230,19 +213,4 @@ def encode_record(values: Mapping[str, Scalar]) -> bytes:
 
 def decode_record(data: bytes) -> dict[str, Scalar]:
     """Decode a flat record; raises InvalidMessage. What the values mean is the caller's to check."""
-    reader = Reader(data, "record", MAX_SMALL_BYTES)
-    values: dict[str, Scalar] = {}
-    for name, value in reader.table("s", MAX_RECORD_FIELDS).items():
-        if type(value) is bool:
-            values[name] = value
-        elif type(value) is int:
-            values[name] = reader.as_integer(value, name, -MAX_NUMBER * 1024, MAX_NUMBER * 1024)
-        elif type(value) is float:
-            values[name] = reader.as_number(value, name, -1e300, 1e300)
-        else:
-            values[name] = reader.as_text(value, name, 1024)
-    return values
-
-
-def _log_id(reader: Reader) -> int:
-    return reader.integer("l", 0, 2**64 - 1)
+    return _Record.decode(data).values

@@ -137,7 +137,7 @@ class MemoryHub:
                 for service in list(bus._services):
                     if not bus._cut and intersects(service.key, key):
                         asked = key if is_key(key) else service.key
-                        service.deliver(MemoryRequest(asked, payload, bus, asker, collector))
+                        service.deliver(bus._opened(asked, payload, asker, collector))
 
 
 class MemoryBus:
@@ -167,11 +167,13 @@ class MemoryBus:
 
     def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
         """Call the handler with each matching message."""
-        return self._add(self._subscriptions, Subscription(self, check_pattern(pattern), handler))
+        declared = Subscription(check_pattern(pattern), self._dispatcher, self._remove, handler)
+        return self._add(self._subscriptions, declared)
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
         """Answer questions."""
-        return self._add(self._services, Service(self, check_pattern(key), handler))
+        declared = Service(check_pattern(key), self._dispatcher, self._remove, handler)
+        return self._add(self._services, declared)
 
     def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
         """Ask everyone who serves the key (or a key that the pattern matches)."""
@@ -187,11 +189,12 @@ class MemoryBus:
 
     def announce(self, key: str) -> Closing:
         """Be alive under this key."""
-        return self._add(self._tokens, Token(self, check_key(key)))
+        return self._add(self._tokens, Token(check_key(key), self._dispatcher, self._remove))
 
     def watch(self, pattern: str, handler: Callable[[str, bool], None]) -> Closing:
         """Call the handler with who is alive, now and at each change."""
-        return self._add(self._watchers, Watcher(self, check_pattern(pattern), handler))
+        declared = Watcher(check_pattern(pattern), self._dispatcher, self._remove, handler)
+        return self._add(self._watchers, declared)
 
     def connected(self) -> bool:
         """True unless the hub has cut this bus or it is closed."""
@@ -214,6 +217,22 @@ class MemoryBus:
             question.end()
         for request in abandoned:
             request.abandon()
+
+    def _opened(self, key: str, payload: bytes, asker: MemoryBus, collector: Collector) -> MemoryRequest:
+        """A question to a service of this bus. The hub is locked."""
+
+        def finish(request: MemoryRequest, reply: Reply | None) -> None:
+            with self._hub._lock:
+                if request not in self._open_requests:
+                    return
+                self._open_requests.discard(request)
+                lost = self._cut or asker._cut
+            collector.add(None if lost else reply)
+
+        request = MemoryRequest(key, payload, finish)
+        collector.expect()
+        self._open_requests.add(request)
+        return request
 
     def _add(self, declared_of_kind: list[_D], declared: _D) -> _D:
         if self._closed:

@@ -5,27 +5,25 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from mapweave.wire.bus import Reply, Request, Sample
+from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.refusal import decode_refusal, encode_refusal
-
-if TYPE_CHECKING:
-    from mapweave.wire.memory import MemoryBus
 
 
 class Declared:
     """Something that a bus has on the hub until it is closed."""
 
-    def __init__(self, bus: MemoryBus, key: str) -> None:
-        self.bus = bus
+    def __init__(self, key: str, dispatcher: Dispatcher, remove: Callable[[Declared], None]) -> None:
         self.key = key
         self.open = True
+        self._dispatcher = dispatcher
+        self._remove = remove
 
     def close(self) -> None:
         """Take it back. Twice is no error."""
         self.open = False
-        self.bus._remove(self)
+        self._remove(self)
 
     def wanted(self) -> bool:
         """Whether the handler may still be called."""
@@ -39,41 +37,59 @@ class Token(Declared):
 class Subscription(Declared):
     """Messages to a handler."""
 
-    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[Sample], None]) -> None:
-        super().__init__(bus, key)
+    def __init__(
+        self,
+        key: str,
+        dispatcher: Dispatcher,
+        remove: Callable[[Declared], None],
+        handler: Callable[[Sample], None],
+    ) -> None:
+        super().__init__(key, dispatcher, remove)
         self._handler = handler
 
     def deliver(self, sample: Sample) -> None:
         """A message has come."""
-        self.bus._dispatcher.message(self._handler, sample, self.wanted)
+        self._dispatcher.message(self._handler, sample, self.wanted)
 
 
 class Service(Declared):
     """Questions to a handler."""
 
-    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[Request], None]) -> None:
-        super().__init__(bus, key)
+    def __init__(
+        self,
+        key: str,
+        dispatcher: Dispatcher,
+        remove: Callable[[Declared], None],
+        handler: Callable[[Request], None],
+    ) -> None:
+        super().__init__(key, dispatcher, remove)
         self._handler = handler
 
     def deliver(self, request: MemoryRequest) -> None:
         """A question has come."""
-        self.bus._dispatcher.question(self._handler, request, self.wanted)
+        self._dispatcher.question(self._handler, request, self.wanted)
 
 
 class Watcher(Declared):
     """Who is alive, to a handler."""
 
-    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[str, bool], None]) -> None:
-        super().__init__(bus, key)
+    def __init__(
+        self,
+        key: str,
+        dispatcher: Dispatcher,
+        remove: Callable[[Declared], None],
+        handler: Callable[[str, bool], None],
+    ) -> None:
+        super().__init__(key, dispatcher, remove)
         self._handler = handler
         self._seen: set[str] = set()
 
     def see(self, alive: set[str]) -> None:
         """Tell what is different from what was told before."""
         for key in sorted(self._seen - alive):
-            self.bus._dispatcher.presence(self._handler, key, False, self.wanted)
+            self._dispatcher.presence(self._handler, key, False, self.wanted)
         for key in sorted(alive - self._seen):
-            self.bus._dispatcher.presence(self._handler, key, True, self.wanted)
+            self._dispatcher.presence(self._handler, key, True, self.wanted)
         self._seen = alive
 
 
@@ -81,16 +97,12 @@ class MemoryRequest:
     """A question on its way to one service."""
 
     def __init__(
-        self, key: str, payload: bytes, server: MemoryBus, asker: MemoryBus, collector: Collector
+        self, key: str, payload: bytes, finish: Callable[[MemoryRequest, Reply | None], None]
     ) -> None:
+        """Take the question, and who passes the reply on; a second reply is ignored there."""
         self._key = key
         self._payload = payload
-        self._server = server
-        self._asker = asker
-        self._collector = collector
-        self._answered = False
-        collector.expect()
-        server._open_requests.add(self)
+        self._finish = finish
 
     @property
     def key(self) -> str:
@@ -104,24 +116,15 @@ class MemoryRequest:
 
     def reply(self, payload: bytes) -> None:
         """Answer; a second answer is ignored."""
-        self._finish(Reply(payload=bytes(payload)))
+        self._finish(self, Reply(payload=bytes(payload)))
 
     def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         """Answer with an error; a second answer is ignored."""
-        self._finish(decode_refusal(encode_refusal(reason, retry_after)))
+        self._finish(self, decode_refusal(encode_refusal(reason, retry_after)))
 
     def abandon(self) -> None:
         """Nobody will answer: the server has closed."""
-        self._finish(None)
-
-    def _finish(self, reply: Reply | None) -> None:
-        with self._server._hub._lock:
-            if self._answered:
-                return
-            self._answered = True
-            self._server._open_requests.discard(self)
-            lost = self._server._cut or self._asker._cut
-        self._collector.add(None if lost else reply)
+        self._finish(self, None)
 
 
 class Collector:

@@ -1,28 +1,23 @@
-"""MessagePack with a guard at the door: every message is a map with its schema version, read field by field.
+"""MessagePack with a guard at the door: every message is a map with its schema version.
 
-A reader asks for the fields that it knows and says what each must be; other fields are not looked at, so a
-newer program may add some. Whatever is wrong with a message, an InvalidMessage with one line comes out.
+A message has at most the length and the number of values that its kind allows. Its text is printable, on one
+line, and its numbers are finite. `msgspec.convert` checks each field. An invalid message raises
+InvalidMessage with one line.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import msgpack
+import msgspec
 
-from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import MapId, NodeId, check_name
-from mapweave.wire.keys import MAX_EPOCH
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
 
 SCHEMA = 1
 """Version of all messages; raised when a program of the version before would misread one."""
-
-MAX_NUMBER = 2**53
-"""Largest node number, sequence number and the like: exact in every language's numbers."""
-
-MAX_STAMP_NS = 2**63 - 1
 
 MAX_VALUES = 4096
 """Values in one message, unless its kind needs more: maps, lists, keys and what is in them each count as one.
@@ -54,153 +49,77 @@ def pack(fields: Mapping[str, object], *, single_floats: bool = False) -> bytes:
     return packed
 
 
-class Reader:
-    """A message taken apart. Every method raises InvalidMessage if the field is missing or not as asked."""
+class Limit(NamedTuple):
+    """Limits of a kind of message.
 
-    def __init__(self, data: bytes, what: str, limit: int, values: int = MAX_VALUES) -> None:
-        """Take a message apart.
+    Attributes:
+        what: its name, for the reason of a refusal.
+        size: longest message that is read, bytes.
+        values: most values in it, see MAX_VALUES. They are counted before any is created.
+    """
 
-        Args:
-            data: as it came.
-            what: what it should be, for the reason.
-            limit: longest message that is looked at, bytes.
-            values: most values in it, see MAX_VALUES. They are counted before any is made.
+    what: str
+    size: int
+    values: int = MAX_VALUES
 
-        Raises:
-            InvalidMessage: too long, too many values, no MessagePack map with text keys, or another schema.
-        """
-        self._what = what
-        if len(data) > limit:
-            raise self.error(f"{len(data)} bytes, at most {limit} are allowed")
-        # A value takes at least one byte, so short messages need no count.
-        if len(data) > values and _exceeds(data, values):
-            raise self.error(f"more than {values} values")
-        try:
-            # The lengths that a message may claim are bounded by its own, so nothing huge is allocated.
-            fields = msgpack.unpackb(data, strict_map_key=True, max_ext_len=0)
-        except Exception as error:
-            # msgpack raises a dozen types, depending on the byte at which it stumbles.
-            reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
-            raise self.error(f"no MessagePack ({reason})") from error
-        if not isinstance(fields, dict):
-            raise self.error("no map of fields")
-        self._fields: dict[Any, Any] = fields
-        version = self.integer("v", 0, MAX_NUMBER)
-        if version != SCHEMA:
-            raise self.error(f"schema version {version}, this program speaks {SCHEMA}")
 
-    def error(self, reason: str) -> InvalidMessage:
-        """What to raise."""
-        return InvalidMessage(f"{self._what}: {reason}")
+def unpack(data: bytes, kind: Any, limit: Limit, read: Callable[[Any, Any], Any] | None = None) -> Any:
+    """Read a message.
 
-    def has(self, name: str) -> bool:
-        """Whether the field is there."""
-        return name in self._fields
+    Args:
+        data: as received.
+        kind: its type, for `msgspec.convert`.
+        limit: of messages of this kind.
+        read: returns values of types that msgspec does not know.
 
-    def any(self, name: str) -> Any:
-        """Whatever it is; give it to the methods that begin with `as_`."""
-        return self._get(name)
+    Raises:
+        InvalidMessage: the message is invalid; one line says why.
+    """
+    try:
+        return msgspec.convert(_fields(data, limit), kind, builtin_types=(bytes,), dec_hook=read)
+    except (msgspec.ValidationError, MapweaveError) as error:
+        raise InvalidMessage(f"{limit.what}: {str(error).splitlines()[0][:300]}") from None
 
-    def integer(self, name: str, low: int, high: int) -> int:
-        """An integer in a closed range."""
-        return self.as_integer(self._get(name), name, low, high)
 
-    def number(self, name: str, low: float, high: float) -> float:
-        """A finite number in a closed range."""
-        return self.as_number(self._get(name), name, low, high)
+def _fields(data: bytes, limit: Limit) -> dict[str, Any]:
+    if len(data) > limit.size:
+        raise InvalidMessage(f"{len(data)} bytes, at most {limit.size} are allowed")
+    # A value takes at least one byte, so short messages need no count.
+    if len(data) > limit.values and _exceeds(data, limit.values):
+        raise InvalidMessage(f"more than {limit.values} values")
+    try:
+        # The lengths that a message may claim are bounded by its own, so nothing huge is allocated.
+        fields = msgpack.unpackb(data, strict_map_key=True, max_ext_len=0)
+    except Exception as error:
+        # msgpack raises a dozen types, depending on the byte at which it stumbles.
+        reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
+        raise InvalidMessage(f"no MessagePack ({reason})") from error
+    if not isinstance(fields, dict):
+        raise InvalidMessage("no map of fields")
+    if "v" not in fields:
+        raise InvalidMessage("Object missing required field `v`")
+    if type(fields["v"]) is not int or fields["v"] != SCHEMA:
+        raise InvalidMessage(f"schema version {fields['v']!r:.20}, this program speaks {SCHEMA}")
+    _check(fields)
+    return fields
 
-    def text(self, name: str, longest: int) -> str:
-        """Printable text, on one line."""
-        return self.as_text(self._get(name), name, longest)
 
-    def name(self, name: str) -> str:
-        """What an agent, server or fleet may be called."""
-        return self.as_name(self._get(name), name)
-
-    def binary(self, name: str, longest: int) -> bytes:
-        """Bytes."""
-        return self.as_binary(self._get(name), name, longest)
-
-    def array(self, name: str, most: int) -> list[Any]:
-        """A list whose elements nobody has looked at yet; give them to the methods that begin with `as_`."""
-        return self.as_array(self._get(name), name, most)
-
-    def table(self, name: str, most: int) -> dict[str, Any]:
-        """A map with text keys of at most 32 characters whose values nobody has looked at yet."""
-        value = self._get(name)
-        if not isinstance(value, dict) or len(value) > most:
-            raise self.error(f"{name} must be a map of at most {most}")
-        return {self.as_text(key, f"a key of {name}", 32): element for key, element in value.items()}
-
-    def map_id(self, name: str) -> MapId:
-        """[agent, epoch]."""
-        return self.as_map_id(self._get(name), name)
-
-    def node_id(self, name: str) -> NodeId:
-        """[agent, epoch, number]."""
-        return self.as_node_id(self._get(name), name)
-
-    # The same for elements of lists and maps.
-
-    def as_array(self, value: Any, name: str, most: int) -> list[Any]:
-        """See `array`."""
-        if not isinstance(value, list) or len(value) > most:
-            raise self.error(f"{name} must be a list of at most {most}")
-        return value
-
-    def as_map_id(self, value: Any, name: str) -> MapId:
-        """See `map_id`."""
-        parts = self.as_array(value, name, 2)
-        if len(parts) != 2:
-            raise self.error(f"{name} must be [agent, epoch]")
-        return MapId(self.as_name(parts[0], name), self.as_integer(parts[1], f"{name}'s epoch", 0, MAX_EPOCH))
-
-    def as_node_id(self, value: Any, name: str) -> NodeId:
-        """See `node_id`."""
-        parts = self.as_array(value, name, 3)
-        if len(parts) != 3:
-            raise self.error(f"{name} must be [agent, epoch, number]")
-        return NodeId(
-            self.as_name(parts[0], name),
-            self.as_integer(parts[1], f"{name}'s epoch", 0, MAX_EPOCH),
-            self.as_integer(parts[2], f"{name}'s number", 0, MAX_NUMBER),
-        )
-
-    def _get(self, name: str) -> Any:
-        if name not in self._fields:
-            raise self.error(f"{name} is missing")
-        return self._fields[name]
-
-    def as_integer(self, value: Any, name: str, low: int, high: int) -> int:
-        """See `integer`."""
-        if type(value) is not int or not low <= value <= high:
-            raise self.error(f"{name} must be an integer in {low}..{high}")
-        return value
-
-    def as_number(self, value: Any, name: str, low: float, high: float) -> float:
-        """See `number`."""
-        if type(value) not in (int, float) or not math.isfinite(value) or not low <= value <= high:
-            raise self.error(f"{name} must be a number in {low:g}..{high:g}")
-        return float(value)
-
-    def as_text(self, value: Any, name: str, longest: int) -> str:
-        """See `text`."""
-        if type(value) is not str or len(value) > longest or not value.isprintable():
-            raise self.error(f"{name} must be printable text of at most {longest} characters")
-        return value
-
-    def as_name(self, value: Any, name: str) -> str:
-        """See `name`."""
-        try:
-            return check_name(self.as_text(value, name, 32))
-        except InvalidValue as error:
-            raise self.error(str(error)) from None
-
-    def as_binary(self, value: Any, name: str, longest: int) -> bytes:
-        """See `binary`."""
-        if type(value) is not bytes or len(value) > longest:
-            raise self.error(f"{name} must be at most {longest} bytes")
-        return value
+def _check(fields: dict[str, Any]) -> None:
+    """Refuse text that is not printable and numbers that are not finite, at any depth."""
+    left: list[Any] = [fields]
+    while left:
+        value = left.pop()
+        kind = type(value)
+        if kind is list:
+            left += value
+        elif kind is dict:
+            left += value
+            left += value.values()
+        elif kind is str:
+            if not value.isprintable():
+                raise InvalidMessage("text must be one printable line")
+        elif kind is float and not math.isfinite(value):
+            raise InvalidMessage(f"{value:g} is not finite")
 
 
 def _exceeds(data: bytes, most: int) -> bool:

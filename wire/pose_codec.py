@@ -8,14 +8,12 @@ import numpy as np
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
 CAMERA = struct.Struct("<HH6d")
 POSTURE = struct.Struct("<9f")
 UPPER = np.triu_indices(3)
-
-MAX_POSITION = 1e6
-"""Of whatever a message places, m. What a merge places is the sum of what robots measured."""
 
 MAX_MEASURED = 1e5
 """Of what a robot itself places, nodes and ends of edges, m: a day's drive at 1 m/s, where float32 still

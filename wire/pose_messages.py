@@ -4,22 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
+import msgspec
 import numpy as np
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.limits import MAX_POSITION, Name, Number
 from mapweave.hybridmap.node import NodeId, check_name
 from mapweave.hybridmap.pose import Pose2
-from mapweave.wire.packing import MAX_NUMBER, Reader, pack
-from mapweave.wire.pose_codec import MAX_POSITION
+from mapweave.wire.log_messages import Id
+from mapweave.wire.packing import Limit, pack, unpack
 
 MAX_POSTURES = 1 << 18
 """Nodes of one agent in one message."""
-MAX_GROUPS = 1 << 16
-MAX_BYTES = 32 * MAX_POSTURES
+LIMIT = Limit("poses", 32 * MAX_POSTURES, 2 * MAX_POSTURES)
 NUMBERS = np.dtype("<f4")
 PLACE_BYTES = 3 * NUMBERS.itemsize
+
+
+class _Placed(msgspec.Struct, array_like=True):
+    """Nodes of one map in one component."""
+
+    frame: NodeId
+    epoch: Number
+    numbers: list[Number]
+    poses: bytes
+
+
+class _Gone(msgspec.Struct, array_like=True):
+    epoch: Number
+    numbers: list[Number]
+
+
+class _Poses(msgspec.Struct):
+    agent: Name = msgspec.field(name="a")
+    run: Id = msgspec.field(name="l")
+    after: Number = msgspec.field(name="p")
+    sequence: Number = msgspec.field(name="q")
+    placed: list[_Placed] = msgspec.field(name="w")
+    gone: list[_Gone] = msgspec.field(name="g")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +84,14 @@ class PoseNews:
         placed = []
         for (frame, epoch), nodes in sorted(groups.items()):
             places = np.array([self.placed[node].merged_from_node.vector for node in nodes])
-            packed = places.astype(NUMBERS).tobytes()
-            placed.append([list(frame), epoch, [node.number for node in nodes], packed])
+            numbers = [node.number for node in nodes]
+            placed.append(_Placed(frame, epoch, numbers, places.astype(NUMBERS).tobytes()))
         lost: dict[int, list[int]] = {}
         for node in self.gone:
             lost.setdefault(node.epoch, []).append(node.number)
-        gone = [[epoch, numbers] for epoch, numbers in sorted(lost.items())]
-        numbers = {"l": self.run, "p": self.after, "q": self.sequence}
-        data = pack({"a": check_name(agent), **numbers, "w": placed, "g": gone})
+        removed = [_Gone(epoch, numbers) for epoch, numbers in sorted(lost.items())]
+        message = _Poses(check_name(agent), self.run, self.after, self.sequence, placed, removed)
+        data = pack(msgspec.to_builtins(message, builtin_types=(bytes,)))
         try:
             PoseNews.decode(data, agent)
         except InvalidMessage as error:
@@ -77,53 +100,30 @@ class PoseNews:
 
     @staticmethod
     def decode(data: bytes, agent: str) -> PoseNews:
-        """Decode what an agent is told.
+        """Decode what an agent is message.
 
         Raises:
             InvalidMessage: it is damaged, or another agent's.
         """
-        reader = Reader(data, "poses", MAX_BYTES, 2 * MAX_POSTURES)
-        if (told := reader.name("a")) != agent:
-            raise reader.error(f"they are of {told}'s nodes, not of {agent}'s")
+        message: _Poses = unpack(data, _Poses, LIMIT)
+        if message.agent != agent:
+            raise InvalidMessage(f"poses: they are of {message.agent}'s nodes, not of {agent}'s")
+        if message.after > message.sequence:
+            raise InvalidMessage(f"poses: {message.sequence} comes before {message.after}")
         placed: dict[NodeId, MergedPose] = {}
-        for value in reader.array("w", MAX_GROUPS):
-            frame, epoch, numbers, packed = _parts(reader, value, 4)
-            placed |= _places(reader, agent, frame, epoch, numbers, packed)
-        gone = [
-            node
-            for value in reader.array("g", MAX_GROUPS)
-            for node in _nodes(reader, agent, *_parts(reader, value, 2))
-        ]
-        sequence = reader.integer("q", 0, MAX_NUMBER)
-        after = reader.integer("p", 0, sequence)
-        return PoseNews(reader.integer("l", 0, 2**64 - 1), after, sequence, placed, tuple(gone))
+        for group in message.placed:
+            poses = _read_poses(group.poses, len(group.numbers))
+            for number, pose in zip(group.numbers, poses, strict=True):
+                placed[NodeId(agent, group.epoch, number)] = MergedPose(group.frame, pose)
+        gone = tuple(NodeId(agent, group.epoch, number) for group in message.gone for number in group.numbers)
+        return PoseNews(message.run, message.after, message.sequence, placed, gone)
 
 
-def _parts(reader: Reader, value: Any, count: int) -> list[Any]:
-    parts = reader.as_array(value, "group", 32)
-    # More parts than are known here are a newer program's.
-    if len(parts) < count:
-        raise reader.error(f"a group has {len(parts)} parts instead of {count}")
-    return parts[:count]
-
-
-def _places(
-    reader: Reader, agent: str, frame: Any, epoch: Any, numbers: Any, packed: Any
-) -> dict[NodeId, MergedPose]:
-    """Of the nodes of one map in one frame."""
-    nodes, of = _nodes(reader, agent, epoch, numbers), reader.as_node_id(frame, "frame")
-    given = reader.as_binary(packed, "poses", PLACE_BYTES * MAX_POSTURES)
-    if len(given) != PLACE_BYTES * len(nodes):
-        raise reader.error(f"{len(given)} bytes are not the poses of {len(nodes)} nodes")
-    places = np.frombuffer(given, NUMBERS).reshape(-1, 3).astype(np.float64)
+def _read_poses(packed: bytes, count: int) -> list[Pose2]:
+    if len(packed) != PLACE_BYTES * count:
+        raise InvalidMessage(f"poses: {len(packed)} bytes are not those of {count} nodes")
+    places = np.frombuffer(packed, NUMBERS).reshape(-1, 3).astype(np.float64)
     # A comparison with what is no number is false.
     if not (np.abs(places) <= MAX_POSITION).all():
-        raise reader.error("a pose is out of range")
-    poses = map(Pose2.from_vector, places)
-    return {node: MergedPose(of, pose) for node, pose in zip(nodes, poses, strict=True)}
-
-
-def _nodes(reader: Reader, agent: str, epoch: Any, numbers: Any) -> list[NodeId]:
-    of = reader.as_integer(epoch, "epoch", 0, MAX_NUMBER)
-    given = reader.as_array(numbers, "nodes", MAX_POSTURES)
-    return [NodeId(agent, of, reader.as_integer(number, "node", 0, MAX_NUMBER)) for number in given]
+        raise InvalidMessage("poses: a number is out of range")
+    return [Pose2.from_vector(place) for place in places]

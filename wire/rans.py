@@ -24,6 +24,7 @@ from mapweave.hybridmap.landmark_tables import TOTAL_BITS
 
 TOTAL = 1 << TOTAL_BITS
 Ints = Annotated[NDArray[np.int64], 1]
+Table = Annotated[NDArray[np.int64], 2]
 Small = Annotated[NDArray[np.uint16], 2]
 Bytes = Annotated[NDArray[np.uint8], 2]
 Lanes = Ints | slice
@@ -130,6 +131,52 @@ def pop_columns(
     return at
 
 
+class Frequencies(NamedTuple):
+    """Columns that are written one after the other, by symbol; see Column.
+
+    Attributes:
+        frequencies: (K, S).
+        starts: (K, S).
+        most_out: (K, S) bits that leave a state at most before a symbol is pushed to it.
+    """
+
+    frequencies: Table
+    starts: Table
+    most_out: Table
+
+    @staticmethod
+    def of(columns: Sequence[Column]) -> Frequencies:
+        """Some columns of equally many symbols, in the order of reading."""
+        frequencies = np.stack([column.frequencies for column in columns])
+        starts = np.stack([column.starts for column in columns])
+        return Frequencies(frequencies, starts, TOTAL_BITS - log2(np.maximum(frequencies, 1)))
+
+
+@compiled
+def push_columns(
+    columns: Frequencies, size: int, symbols: Bytes, states: Ints, numbers: Table, widths: Table
+) -> None:
+    """Push one symbol to each lane for each of K columns, the last column first: `pop_columns` undone.
+
+    Args:
+        columns: to write.
+        size: m, of the lanes.
+        symbols: (K, N).
+        states: (N,) of the lanes, changed.
+        numbers: (K, N) is filled with the bits that leave the states, in the order of reading.
+        widths: (K, N) is filled: how many bits.
+    """
+    for k in range(len(symbols) - 1, -1, -1):
+        frequencies = columns.frequencies[k][symbols[k]]
+        out = columns.most_out[k][symbols[k]]
+        out -= (states >> out) < (frequencies << (size - TOTAL_BITS))
+        numbers[k] = states & ((1 << out) - 1)
+        widths[k] = out
+        left = states >> out
+        whole = left // frequencies
+        states[:] = (whole << TOTAL_BITS) + columns.starts[k][symbols[k]] + left - whole * frequencies
+
+
 @dataclass(eq=False)
 class LaneWriter:
     """Lanes into which symbols go. What is pushed last is read first.
@@ -143,22 +190,22 @@ class LaneWriter:
     size: int
     _bits: list[tuple[Ints, Ints]] = field(default_factory=list)
 
-    def push(self, symbols: Ints, column: Column, lanes: Lanes = EVERY) -> None:
-        """One symbol of a column for each lane; none may be of frequency 0."""
-        self._push(lanes, column.frequencies[symbols], column.starts[symbols])
+    def push(self, symbols: Bytes, columns: Frequencies, lanes: Lanes = EVERY) -> None:
+        """(K, N) one symbol of each lane for each of K columns; none may be of frequency 0."""
+        states = self.states[lanes]
+        numbers, widths = np.empty(symbols.shape, np.int64), np.empty(symbols.shape, np.int64)
+        push_columns(columns, self.size, np.ascontiguousarray(symbols), states, numbers, widths)
+        self._bits.append((numbers.ravel(), widths.ravel()))
+        self.states[lanes] = states
 
     def push_plain(self, numbers: Ints, widths: Ints, lanes: Lanes = EVERY) -> None:
         """A number of 0 to 12 bits for each lane, all alike likely."""
-        left = TOTAL_BITS - widths
-        self._push(lanes, 1 << left, numbers << left)
-
-    def _push(self, lanes: Lanes, frequencies: Ints, starts: Ints) -> None:
-        states = self.states[lanes]
-        out = TOTAL_BITS - log2(frequencies)
-        out -= (states >> out) < (frequencies << (self.size - TOTAL_BITS))
+        left, states = TOTAL_BITS - widths, self.states[lanes]
+        # A frequency of 2^left: the state is divided by shifting it.
+        out = widths - ((states >> widths) < (1 << left + self.size - TOTAL_BITS))
         self._bits.append((states & ((1 << out) - 1), out))
-        whole, rest = np.divmod(states >> out, frequencies)
-        self.states[lanes] = (whole << TOTAL_BITS) + starts + rest
+        states >>= out
+        self.states[lanes] = (states >> left << TOTAL_BITS) + (numbers << left) + (states & ((1 << left) - 1))
 
     def finish(self) -> tuple[Ints, Ints]:
         """Numbers and their widths in bits in the order of reading: last states, then the rest."""

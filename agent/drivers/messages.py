@@ -10,15 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.observation import (
+    FARTHEST,
+    FASTEST,
+    MAX_RANGERS,
+    Command,
+    Observation,
+    Odometry,
+    Reach,
+    RobotDescription,
+)
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.limits import MAX_NUMBER, Stamp
 from mapweave.storage.image_file import decode_grey, image_size
-from mapweave.wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
-from mapweave.wire.pose_codec import pack_camera, unpack_camera
+from mapweave.wire import typed
+from mapweave.wire.packing import Limit, pack, unpack
 
 ENDED = "the simulation has ended"
 """Refusal: there will be no more observations, and that is no failure."""
@@ -28,22 +41,24 @@ AGAIN = "ask again later"
 
 MAX_IMAGE_BYTES = 16 * 2**20
 MAX_SIDE_PX = 16384
-MAX_RANGERS = 256
 MAX_SMALL_BYTES = 16384
 """Longest message without an image."""
 
-FARTHEST = 1e4
-"""No ranger reaches farther, m."""
 MOST_WAY = 10.0
 """No robot drives farther between two observations, m: 3 m/s over the longest silence before a question is
 asked again."""
 MOST_TURN = 20.0
 """Nor does it turn by more, rad: a turn a second over the same time."""
-FASTEST = 1e3
-"""No robot drives or turns faster, m/s and rad/s."""
-
 RAW = "raw"
 COMPRESSED = ("jpeg", "png")
+
+STEP = Limit("step", MAX_SMALL_BYTES)
+OBSERVATION = Limit("observation", MAX_IMAGE_BYTES + MAX_SMALL_BYTES)
+DESCRIPTION = Limit("robot description", MAX_SMALL_BYTES)
+
+Rate = Annotated[float, Meta(ge=-FASTEST, le=FASTEST)]
+Way = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
+Side = Annotated[int, Meta(ge=1, le=MAX_SIDE_PX)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +75,21 @@ class StepRequest:
     command: Command
 
 
+class _Step(msgspec.Struct):
+    sequence: Annotated[int, Meta(ge=1, le=MAX_NUMBER)] = msgspec.field(name="q")
+    command: tuple[Rate, Rate] = msgspec.field(name="c")
+
+
+class _Observation(msgspec.Struct):
+    stamp_ns: Stamp = msgspec.field(name="t")
+    odometry: tuple[Way, Way] = msgspec.field(name="u")
+    proximity: Annotated[list[Reach], Meta(max_length=MAX_RANGERS)] = msgspec.field(name="r")
+    bumped: bool = msgspec.field(name="b")
+    size: tuple[Side, Side] = msgspec.field(name="s", default=(1, 1))
+    encoding: str = RAW
+    image: bytes | None = msgspec.field(name="i", default=None)
+
+
 def encode_step(step: StepRequest) -> bytes:
     """Encode a step."""
     return pack({"q": step.sequence, "c": [step.command.forward, step.command.turn]})
@@ -71,9 +101,8 @@ def decode_step(data: bytes) -> StepRequest:
     Raises:
         InvalidMessage: anything is wrong with it.
     """
-    reader = Reader(data, "step", MAX_SMALL_BYTES)
-    forward, turn = _numbers(reader, "c", 2, 2, -FASTEST, FASTEST)
-    return StepRequest(reader.integer("q", 1, MAX_NUMBER), Command(forward, turn))
+    step: _Step = unpack(data, _Step, STEP)
+    return StepRequest(step.sequence, Command(*step.command))
 
 
 def encode_observation(observation: Observation) -> bytes:
@@ -103,20 +132,14 @@ def decode_observation(data: bytes) -> Observation:
     Raises:
         InvalidMessage: anything is wrong with it.
     """
-    reader = Reader(data, "observation", MAX_IMAGE_BYTES + MAX_SMALL_BYTES)
-    forward, turn = _numbers(reader, "u", 2, 2, -FARTHEST, FARTHEST)
+    seen: _Observation = unpack(data, _Observation, OBSERVATION)
+    forward, turn = seen.odometry
     if abs(forward) > MOST_WAY or abs(turn) > MOST_TURN:
-        raise reader.error(f"odometry of {forward:g} m and {turn:g} rad in one step is out of range")
-    bumped = reader.any("b")
-    if type(bumped) is not bool:
-        raise reader.error("b must be true or false")
-    return Observation(
-        stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
-        odometry=Odometry(forward, turn),
-        image=_read_image(reader) if reader.has("i") else None,
-        proximity=np.array(_numbers(reader, "r", 0, MAX_RANGERS, 0.0, FARTHEST)),
-        bumped=bumped,
-    )
+        raise InvalidMessage(
+            f"observation: odometry of {forward:g} m and {turn:g} rad in one step is out of range"
+        )
+    image = None if seen.image is None else _image(seen.encoding, seen.size, seen.image)
+    return Observation(seen.stamp_ns, Odometry(forward, turn), image, np.array(seen.proximity), seen.bumped)
 
 
 def check_image(observation: Observation, description: RobotDescription) -> None:
@@ -135,81 +158,37 @@ def check_image(observation: Observation, description: RobotDescription) -> None
 
 
 def encode_description(description: RobotDescription) -> bytes:
-    """Encode a description."""
-    return pack(
-        {
-            "camera": pack_camera(description.camera),
-            "distortion": list(description.distortion),
-            "radius": description.radius,
-            "axle": description.axle,
-            "wheel_noise": description.wheel_noise,
-            "side_slip": description.side_slip,
-            "ranger_bearings": list(description.ranger_bearings),
-            "ranger_reach": description.ranger_reach,
-            "max_forward": description.max_forward,
-            "max_turn": description.max_turn,
-            "tick": description.tick,
-        }
-        | ({"clock": description.clock} if description.clock else {})
-        | ({"ranges_see_robots": True} if description.ranges_see_robots else {})
-    )
+    """Encode a description; raises InvalidValue if it would not decode."""
+    return typed.encode(description, DESCRIPTION)
 
 
 def decode_description(data: bytes) -> RobotDescription:
-    """Decode a description.
-
-    Raises:
-        InvalidMessage: anything is wrong with it.
-    """
-    reader = Reader(data, "robot description", MAX_SMALL_BYTES)
-    k1, k2, p1, p2, k3 = _numbers(reader, "distortion", 5, 5, -FARTHEST, FARTHEST)
-    return RobotDescription(
-        camera=unpack_camera(reader.binary("camera", MAX_SMALL_BYTES)),
-        distortion=(k1, k2, p1, p2, k3),
-        radius=reader.number("radius", 1e-3, 100.0),
-        axle=reader.number("axle", 1e-3, 100.0),
-        wheel_noise=reader.number("wheel_noise", 0.0, 1.0),
-        side_slip=reader.number("side_slip", 0.0, 1.0) if reader.has("side_slip") else 0.005,
-        ranger_bearings=tuple(_numbers(reader, "ranger_bearings", 0, MAX_RANGERS, -7.0, 7.0)),
-        ranger_reach=reader.number("ranger_reach", 0.0, FARTHEST),
-        max_forward=reader.number("max_forward", 0.0, FASTEST),
-        max_turn=reader.number("max_turn", 0.0, FASTEST),
-        tick=reader.number("tick", 1e-4, 3600.0),
-        clock=reader.name("clock") if reader.has("clock") else "",
-        ranges_see_robots=reader.has("ranges_see_robots") and reader.any("ranges_see_robots") is True,
-    )
+    """Decode a description; raises InvalidMessage."""
+    return typed.decode(data, RobotDescription, DESCRIPTION)
 
 
-def _numbers(reader: Reader, name: str, least: int, most: int, low: float, high: float) -> list[float]:
-    values = reader.array(name, most)
-    if len(values) < least:
-        raise reader.error(f"{name} must be a list of at least {least}")
-    return [reader.as_number(value, name, low, high) for value in values]
-
-
-def _read_image(reader: Reader) -> NDArray[np.uint8]:
-    shape = [reader.as_integer(side, "s", 1, MAX_SIDE_PX) for side in reader.array("s", 2)]
-    if len(shape) != 2:
-        raise reader.error("s must be [height, width]")
-    encoding = reader.text("encoding", 16)
-    data = reader.binary("i", MAX_IMAGE_BYTES)
+def _image(encoding: str, size: tuple[int, int], data: bytes) -> NDArray[np.uint8]:
+    height, width = size
     if encoding == RAW:
-        if len(data) != shape[0] * shape[1]:
-            raise reader.error(f"a raw image of {shape[1]}x{shape[0]} px cannot have {len(data)} bytes")
-        return np.frombuffer(data, np.uint8).reshape(shape)
+        if len(data) != height * width:
+            raise InvalidMessage(
+                f"observation: a raw image of {width}x{height} px cannot have {len(data)} bytes"
+            )
+        return np.frombuffer(data, np.uint8).reshape(size)
     if encoding not in COMPRESSED:
-        raise reader.error(f"image encoding {encoding!r} is not {', '.join((RAW, *COMPRESSED))}")
-    if shape[0] * shape[1] > MAX_IMAGE_BYTES:
-        raise reader.error(f"an image of {shape[1]}x{shape[0]} px is too large")
-    return _decompress(reader, encoding, data, shape)
+        names = ", ".join((RAW, *COMPRESSED))
+        raise InvalidMessage(f"observation: image encoding {encoding[:32]!r} is not {names}")
+    if height * width > MAX_IMAGE_BYTES:
+        raise InvalidMessage(f"observation: an image of {width}x{height} px is too large")
+    return _decompress(encoding, data, size)
 
 
-def _decompress(reader: Reader, encoding: str, data: bytes, shape: Sequence[int]) -> NDArray[np.uint8]:
+def _decompress(encoding: str, data: bytes, size: Sequence[int]) -> NDArray[np.uint8]:
     try:
         # An image whose size differs from the one in the message is not decoded.
-        image = decode_grey(data) if sorted(image_size(data)) == sorted(shape) else None
+        image = decode_grey(data) if sorted(image_size(data)) == sorted(size) else None
     except InvalidValue as error:
-        raise reader.error(f"no {encoding} image ({error})") from None
-    if image is None or list(image.shape) != list(shape):
-        raise reader.error(f"no {encoding} image of {shape[1]}x{shape[0]} px")
+        raise InvalidMessage(f"observation: no {encoding} image ({error})") from None
+    if image is None or list(image.shape) != list(size):
+        raise InvalidMessage(f"observation: no {encoding} image of {size[1]}x{size[0]} px")
     return image

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapweave.agent.clearance import clearance
 from mapweave.agent.exploration.phase import Phase
-from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.mapping.episode import Episode, EpisodeRequest, Move
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.image_drive import ImageDrive
 from mapweave.agent.settings import ExplorerSettings
@@ -34,14 +34,15 @@ PATIENCE = 4.0
 
 
 class ExplorationBehaviours:
-    """The behaviours of exploration, one generator each: each `yield` is a command for one tick.
+    """The behaviours of exploration, one generator each: each `yield` is a command for one tick, or a request
+    to the mapper that is met before the generator goes on.
 
     Attributes:
         phase: what it is doing.
         detail: why, in words.
     """
 
-    def __init__(self, description: RobotDescription, mapper: Mapper, settings: ExplorerSettings) -> None:
+    def __init__(self, description: RobotDescription, mapper: Episode, settings: ExplorerSettings) -> None:
         """Take the robot's description, and the mapper that the pipeline keeps up to date."""
         self.phase = Phase.LOOKING
         self.detail = ""
@@ -55,16 +56,16 @@ class ExplorationBehaviours:
         """Begin a tick. The mapper has seen the observation already."""
         self._observation = observation
 
-    def begin(self) -> Iterator[Command]:
+    def begin(self) -> Iterator[Move]:
         """Stand still until there is a first image to map from."""
         self.phase, self.detail = Phase.LOOKING, ""
         while not self._mapper.started:
-            self._mapper.begin(self._now)
+            yield EpisodeRequest.BEGIN
             if not self._mapper.started:
                 self.detail = "no image from the camera yet"
             yield Command()
 
-    def map_view(self) -> Iterator[Command]:
+    def map_view(self) -> Iterator[Move]:
         """Drive back and forth with the view's features visible until their depths have converged."""
         if self._mapper.anchor_features < LEAST_FEATURES:
             self.detail = f"only {self._mapper.anchor_features} features in view: turning on"
@@ -88,12 +89,12 @@ class ExplorationBehaviours:
             self.detail = reason
             if not far_end and abs(since.x) > 0.3 and command.forward * reach < 0:
                 far_end = True
-                self._mapper.leaf(self._now)
+                yield EpisodeRequest.ADD_VIEW
             if done:
                 return
             yield command
 
-    def turn_to_next_view(self, side: float, phase: Phase = Phase.TURNING) -> Generator[Command, None, float]:
+    def turn_to_next_view(self, side: float, phase: Phase = Phase.TURNING) -> Generator[Move, None, float]:
         """Turn on the spot until at most four features of the view are left (paper, section 4.1).
 
         Args:
@@ -117,10 +118,10 @@ class ExplorationBehaviours:
         yield Command()
         yield Command()
         turned = abs(wrap_angle(self._mapper.map_from_robot.mean.heading - start))
-        self.finish()
+        yield EpisodeRequest.FINISH
         return turned
 
-    def travel(self, path: list[Array]) -> Generator[Command, None, bool]:
+    def travel(self, path: list[Array]) -> Generator[Move, None, bool]:
         """Follow the corners of a way: turn toward each, then drive straight to it, adding nodes.
 
         Args:
@@ -134,12 +135,12 @@ class ExplorationBehaviours:
             yield from self._face(corner)
             if not (yield from self.drive_to(corner)):
                 self.detail = "the way is blocked: looking around here"
-                self.finish()
+                yield EpisodeRequest.FINISH
                 return False
-        self.finish()
+        yield EpisodeRequest.FINISH
         return True
 
-    def _face(self, corner: Array) -> Iterator[Command]:
+    def _face(self, corner: Array) -> Iterator[Move]:
         s = self._settings
         for _ in self._ticks(200):
             error = self._bearing_to(corner)
@@ -148,16 +149,16 @@ class ExplorationBehaviours:
             if self._mapper.anchored <= LEFT and abs(self._mapper.anchor_from_robot.heading) > LEAST_TURN:
                 yield Command()
                 yield Command()
-                self.finish()
+                yield EpisodeRequest.FINISH
             self.detail = f"turning {math.degrees(error):+.0f} deg toward the way"
             yield Command(0.0, float(np.clip(2.0 * error, -s.turn_rate, s.turn_rate)))
 
-    def drive_to(self, corner: Array) -> Generator[Command, None, bool]:
+    def drive_to(self, corner: Array) -> Generator[Move, None, bool]:
         """Returns whether the corner was reached."""
         s = self._settings
         if abs(self._mapper.anchor_from_robot.heading) > 0.2 or self._mapper.anchored <= LEFT:
             yield Command()
-            self.finish()
+            yield EpisodeRequest.FINISH
         best, since_best = math.inf, 0.0
         while True:
             distance = float(np.linalg.norm(corner - self.position))
@@ -173,7 +174,7 @@ class ExplorationBehaviours:
             way = math.hypot(anchor_from_start.x, anchor_from_start.y)
             if way > TRAVEL_STEP or (way > 0.3 and self._mapper.anchored < 2 * LEFT):
                 yield Command()
-                self.finish()
+                yield EpisodeRequest.FINISH
             self.detail = f"{distance:.1f} m to the next corner"
             speed = min(s.travel_speed, max(0.6 * distance, 0.05)) * max(0.0, 1.0 - abs(error) / 0.5)
             yield Command(speed, float(np.clip(1.5 * error, -s.turn_rate, s.turn_rate)))
@@ -202,7 +203,3 @@ class ExplorationBehaviours:
     def _ticks(self, most: float) -> range:
         """A bound on the duration of a behaviour."""
         return range(int(most))
-
-    def finish(self) -> None:
-        """End the episode: its views become nodes."""
-        self._mapper.finish(self._now)

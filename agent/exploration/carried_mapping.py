@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
-from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Observation
+from mapweave.agent.mapping.episode import Episode, EpisodeRequest, Move
+from mapweave.agent.observation import Command
 
 CONVERGED = 0.7
 """Share of the landmarks that must have converged before a node is made."""
@@ -22,23 +23,33 @@ LEAST_TURN = 0.35
 
 
 class CarriedMapping:
-    """Makes nodes of a drive that it does not control.
+    """Says when nodes are made of a drive that it does not control.
 
     Attributes:
         detail: in words, for the status line.
     """
 
-    def __init__(self, mapper: Mapper) -> None:
+    def __init__(self, mapper: Episode) -> None:
         """Take the mapper that the pipeline keeps up to date."""
         self.detail = "no image yet"
         self._mapper = mapper
+        self._behaviour = self._watch()
 
-    def step(self, observation: Observation) -> None:
-        """One tick. The mapper has seen the observation already."""
+    def next_move(self) -> Move:
+        """What to do next; a command, always to stand still, ends the tick. The mapper has seen the tick."""
+        return next(self._behaviour)
+
+    def _watch(self) -> Iterator[Move]:
+        while True:
+            if not self._mapper.started:
+                yield EpisodeRequest.BEGIN
+            elif self._is_complete():
+                yield EpisodeRequest.FINISH
+            yield Command()
+
+    def _is_complete(self) -> bool:
+        """Whether the view is known well, or about to be lost."""
         mapper = self._mapper
-        if not mapper.started:
-            mapper.begin(observation)
-            return
         moved = mapper.anchor_from_robot
         way = math.hypot(moved.x, moved.y)
         left = mapper.anchored
@@ -48,5 +59,4 @@ class CarriedMapping:
         if mapper.anchor_features < LEAST_TRACKED:
             self.detail = f"only {mapper.anchor_features} features in view"
         moving = way > 0.02 * mapper.typical_depth or abs(moved.heading) > 0.1
-        if (leaving and moving) or (far and mapper.converged_share >= CONVERGED):
-            mapper.finish(observation)
+        return (leaving and moving) or (far and mapper.converged_share >= CONVERGED)

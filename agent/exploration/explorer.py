@@ -17,7 +17,7 @@ from mapweave.agent.exploration.viewpoint_selection import (
     seen_around,
     views_of,
 )
-from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.mapping.episode import Episode, Move
 from mapweave.agent.mission import Answer, Question
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
@@ -34,8 +34,8 @@ COVERED_SHARE = 0.75
 class Explorer:
     """Drives a robot so that its mapper sees the whole reachable floor.
 
-    Written as one generator a behaviour: each `yield` is a command for one tick, so the order of actions
-    can be read from top to bottom.
+    Written as one generator a behaviour, so the order of actions can be read from top to bottom: each
+    `yield` is a command for one tick, or a request to the mapper.
 
     Attributes:
         places: where it has made a full turn, (x, y) m in map.
@@ -45,7 +45,7 @@ class Explorer:
         self,
         map_id: MapId,
         description: RobotDescription,
-        mapper: Mapper,
+        mapper: Episode,
         floor: OccupancyGrid,
         settings: ExplorerSettings | None = None,
         seed: int = 0,
@@ -64,15 +64,21 @@ class Explorer:
         self._questions: list[Question] = []
         self._behaviour = self._explore()
 
-    def step(
-        self, observation: Observation, answers: tuple[Answer, ...] = ()
-    ) -> tuple[Command, list[Question]]:
-        """One tick. The mapper and the floor have seen the observation already."""
+    def see(self, observation: Observation, answers: tuple[Answer, ...] = ()) -> None:
+        """Begin a tick. The mapper and the floor have seen the observation already."""
         self._moves.see(observation)
         self._questions = []
         for answer in answers:
             self._fleet_coverage.take(answer)
-        return next(self._behaviour), self._questions
+
+    def next_move(self) -> Move:
+        """What to do next; a command ends the tick."""
+        return next(self._behaviour)
+
+    @property
+    def questions(self) -> list[Question]:
+        """For the fleet's map, of this tick."""
+        return self._questions
 
     @property
     def phase(self) -> Phase:
@@ -94,7 +100,7 @@ class Explorer:
         self._moves.phase, self._moves.detail = Phase.LOOKING, ""
         self._behaviour = self._explore()
 
-    def _explore(self) -> Iterator[Command]:
+    def _explore(self) -> Iterator[Move]:
         yield from self._moves.begin()
         self._ask()
         while True:
@@ -113,7 +119,7 @@ class Explorer:
         while True:
             yield Command()
 
-    def _look_around(self) -> Iterator[Command]:
+    def _look_around(self) -> Iterator[Move]:
         """Map view after view, turning on the spot between them, all the way around."""
         turned = 0.0
         while True:
@@ -127,7 +133,7 @@ class Explorer:
                 yield from self._moves.map_view()
                 return
 
-    def _scan(self) -> Iterator[Command]:
+    def _scan(self) -> Iterator[Move]:
         """Turn until the rangers have swept all around: the views are mapped, the floor is unknown."""
         self._ask()
         bearings = np.sort(np.array(self._description.ranger_bearings))

@@ -39,7 +39,7 @@ class FleetCoverage:
     def take(self, answer: Answer) -> None:
         """Take an answer. A missing answer leaves the earlier coverage as it is."""
         if isinstance(answer.content, KnownAnswer):
-            self.views = answer.content.views
+            self.views = answer.content.views.astype(np.float64)
 
     def places(self, views: Array, reach: float, covered_share: float) -> Array:
         """Places that others have covered, so that this robot need not: (M, 2) m, in map.

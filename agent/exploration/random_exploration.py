@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from mapweave.agent.exploration.explorer import Explorer
-from mapweave.agent.observation import Command
+from mapweave.agent.mapping.episode import Move
 
 SHORTEST = 0.3
 """m; with less room ahead the robot turns on."""
@@ -21,7 +21,7 @@ class RandomExploration(Explorer):
     for a random part of the free room.
     """
 
-    def _explore(self) -> Iterator[Command]:
+    def _explore(self) -> Iterator[Move]:
         yield from self._moves.begin()
         while True:
             yield from self._moves.map_view()

@@ -9,6 +9,7 @@ import numpy as np
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.mapping.anchored_keyframe import HERE
+from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
@@ -60,7 +61,7 @@ class Mapper:
         self._anchor: View | None = None
         self._leaves: list[View] = []
 
-    # What an explorer or a passenger needs to know
+    # What behaviours read, see `Episode`
 
     @property
     def map(self) -> HybridMap:
@@ -80,14 +81,15 @@ class Mapper:
     @property
     def doubtful(self) -> bool:
         """Whether the last image shows nothing of what it should, or none comes: no time to map."""
-        return self._tracking.doubtful
+        return self._tracking.acceptance.doubtful
 
     @property
     def doubt(self) -> str:
         """Why, in words."""
-        if self._tracking.strange:
+        images = self._tracking.acceptance
+        if images.strange:
             return "the image shows something else than a moment ago"
-        if self._tracking.blank:
+        if images.blank:
             return "the image shows nothing: is it dark, or the lens covered?"
         return "the camera gives no new image" if self.doubtful else ""
 
@@ -153,11 +155,21 @@ class Mapper:
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
         self._tracking.step(observation)
-        if self._tracking.carried_off or self._tracking.disputed:
+        if self._tracking.acceptance.carried_off or self._tracking.disputed:
             self.lose()
             self._tracking.step(observation)
         elif self._anchor is not None and not self.doubtful:
             self._wayside.step(observation, self._tracking.pose.mean)
+
+    def meet(self, request: EpisodeRequest, observation: Observation) -> None:
+        """Do what a behaviour asks for, with the observation of the last step."""
+        match request:
+            case EpisodeRequest.BEGIN:
+                self.begin(observation)
+            case EpisodeRequest.ADD_VIEW:
+                self.leaf(observation)
+            case EpisodeRequest.FINISH:
+                self.finish(observation)
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""

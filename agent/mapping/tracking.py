@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,9 +10,10 @@ from numpy.typing import NDArray
 
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.ekf.mapping_filter import MappingFilter
-from mapweave.agent.ekf.triangulation import triangulate
 from mapweave.agent.ekf.update_report import Health
-from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit, turned
+from mapweave.agent.mapping.image_acceptance import ImageAcceptance
+from mapweave.agent.mapping.initial_depth import initial_inverse_depths
+from mapweave.agent.mapping.kidnap_detection import KidnapDetector, turned
 from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.agent.mapping.prediction_offset import PredictionOffset
 from mapweave.agent.mapping.track_history import TrackHistory
@@ -25,21 +25,62 @@ from mapweave.agent.vision.rejection_counter import RejectionCounter
 from mapweave.agent.vision.template import HALF_PX, Templates
 from mapweave.agent.vision.track_quality import TrackQuality
 from mapweave.agent.vision.tracker import BORDER_PX, Tracker
-from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
 
+# What each stage of a step gives to the next. A stage takes the value that only the one before makes.
 
-class LostTracks(NamedTuple):
-    """Landmarks of the filter that were not followed into an image.
+
+class FollowedImage(NamedTuple):
+    """An image that is believed, and the filter's landmarks that were not followed into it.
 
     Attributes:
-        ids: (N,) of the tracks.
-        templates: what they looked like.
+        image: of the camera.
+        lost: (N,) tracks.
+        templates: what these looked like.
+    """
+
+    image: NDArray[np.uint8]
+    lost: NDArray[np.int64]
+    templates: Templates
+
+
+class LiveTracks(NamedTuple):
+    """Tracks in the image, and those that wait behind what hides them.
+
+    Attributes:
+        ids: (N,) of both.
     """
 
     ids: NDArray[np.int64]
-    templates: Templates
+
+
+class HeldTracks(NamedTuple):
+    """Tracks in the image that the filter holds.
+
+    Attributes:
+        ids: (N,) of the tracks.
+        pixels: (N, 2) px in the ideal image.
+    """
+
+    ids: NDArray[np.int64]
+    pixels: Array
+
+
+class Correction(NamedTuple):
+    """How the filter was corrected by the tracks that it holds.
+
+    Attributes:
+        misses_px: (N, 2) px, innovations that were accepted.
+        unused: tracks held, if they were too few to correct by; None if they were not.
+    """
+
+    misses_px: Array
+    unused: int | None
+
+
+NO_CORRECTION = Correction(np.zeros((0, 2)), None)
 
 
 LEAST_SPREAD = 0.2
@@ -52,33 +93,14 @@ ASSOCIATE_PX = 1.5
 """A feature this near to a track is the same point."""
 STRIKES = 3
 """A track that the filter refuses this often in a row is given up."""
-PRIOR_SPREAD = 0.6
-"""Sigma of a new landmark's inverse depth, as a share of the expected one."""
-PRIOR_NEAR = 0.45
-"""The same sigma is at least this over the camera's height: a landmark may always be about as near as the
-floor. A robot before a bare wall would else take its nearness for a slip of the wheels."""
-DOUBT = 2.0
-"""Factor by which sigmas of triangulated depths are enlarged."""
-MOST_CHI2 = 4.0
-"""Triangulated depths of tracks whose mean squared residual is above this are not used; 1 is expected."""
-DROPPED = 3
-"""Images that may be missing, one after the other, before the robot should wait for the next."""
-STALE = (0.4, 0.5)
-"""Once the wheels have moved this much, nothing can be said of an image before, m and rad."""
 
 
 class Tracking:
     """Follows image points and filters an even choice of them.
 
-    An image that shows nothing of what the image before leads to expect is not believed: the tracks wait
-    where they were last seen, for the light to come back or somebody to step aside. If that does not happen
-    while the wheels stand, the robot was carried off.
-
     Attributes:
         history: where each track was seen from.
-        strange: how many images in a row were not believed because they show other things.
-        blank: likewise because they show nothing.
-        missing: how many images in a row did not come, or came a second time.
+        acceptance: which images are believed.
     """
 
     def __init__(self, description: RobotDescription, lens: Lens, settings: AgentSettings) -> None:
@@ -95,14 +117,11 @@ class Tracking:
         self._filter = MappingFilter(d.camera, d.axle, d.wheel_noise, settings.filter, d.side_slip)
         # Two images are compared by points that live for one step: nothing to hold them to.
         once = replace(settings.tracker, anchored=False)
-        self._continuity = KidnapDetector(lens, description.camera, once)
-        self.strange = self.blank = self.missing = 0
+        detector = KidnapDetector(lens, description.camera, once)
+        self.acceptance = ImageAcceptance(detector, settings.tracking)
         self._dispute = OdometryConsistency()
-        self._believed: NDArray[np.uint8] | None = None
-        self._since_believed = Pose2()
-        self._misses_px: Array = np.zeros((0, 2))
         self._strikes = RejectionCounter(STRIKES)
-        self._unused: int | None = None
+        self._correction = NO_CORRECTION
         self._expected_depth = 1.0
         self._next_track = 1
 
@@ -120,7 +139,9 @@ class Tracking:
     def report(self) -> TrackQuality:
         """What the tracks are worth after the last image that was believed."""
         tracker = self._tracker
-        return TrackQuality.of(self._camera, tracker.pixels, tracker.ages, tracker.held, self._misses_px)
+        return TrackQuality.of(
+            self._camera, tracker.pixels, tracker.ages, tracker.held, self._correction.misses_px
+        )
 
     @property
     def pose(self) -> PoseGaussian:
@@ -130,30 +151,20 @@ class Tracking:
     @property
     def health(self) -> tuple[Health, str]:
         """What holds the pose up, and in words what is wrong; empty if nothing is."""
-        told = self._filter.health
-        if self.missing or self.strange or self.blank:
+        told, images, unused = self._filter.health, self.acceptance, self._correction.unused
+        if images.missing or images.strange or images.blank:
             return told
-        if self._unused is None:
+        if unused is None:
             # Images came, but showed nothing to go by; a new view's landmarks are seen in the next.
             return (Health.GOOD, "") if told[0] is Health.NO_IMAGE else told
-        if not self._unused:
+        if not unused:
             return Health.BLIND, "no landmark in view"
-        return Health.FEW, f"{self._unused} landmarks in view are too few or too near to each other to go by"
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the last image was not believed, or the last images were missing."""
-        return bool(self.strange or self.blank) or self.missing > DROPPED
+        return Health.FEW, f"{unused} landmarks in view are too few or too near to each other to go by"
 
     @property
     def disputed(self) -> bool:
         """Whether wheels and images tell stories since the anchor that cannot both be true."""
         return self._dispute.with_filter(self._filter.pose.mean)
-
-    @property
-    def carried_off(self) -> bool:
-        """Whether images have shown something else for so long that the robot must be elsewhere."""
-        return self.strange >= self._settings.patience or self.blank >= self._settings.blank_patience
 
     @property
     def converged_share(self) -> float:
@@ -168,21 +179,17 @@ class Tracking:
     def step(self, observation: Observation) -> None:
         """Predict by the wheels, follow the tracks, correct by what they show.
 
-        Each stage takes what the one before gives: what was lost on the way into the image, what is alive
-        after hidden landmarks were sought, which of that the filter holds, and whether it was corrected.
+        Each stage takes the value that the one before gives, so they cannot change places.
         """
         self._predict(observation.odometry)
-        image = self._new_image(observation)
-        if image is None:
+        followed = self._follow(self.acceptance.new_image(observation))
+        if followed is None:
             return
-        lost = self._follow(image)
-        if lost is None:
-            return
-        alive = self._seek_hidden(image, lost)
-        corrected = self._correct(self._held(alive))
-        if len(self._filter.ids) - len(self._hidden.ids) < self._settings.refill:
-            self._fill()
-        self._note_unheld(corrected)
+        alive = self._seek_hidden(followed)
+        held = self._hold(alive)
+        self._correction = self._correct(held)
+        self._refill()
+        self._note_unheld(self._correction)
         self.remember()
 
     def remember(self, force: bool = False) -> None:
@@ -203,7 +210,7 @@ class Tracking:
         self._tracker.add(ids, view.features.raw[new])
         self._strikes.forget()
         self._expected_depth = expected_depth
-        self._unused = None if len(ids) else 0
+        self._correction = self._correction._replace(unused=None if len(ids) else 0)
         self._fill(first=int(ids[0]) if len(ids) else self._next_track)
         self.remember(force=True)
 
@@ -220,43 +227,24 @@ class Tracking:
         """Move by the wheels."""
         self._filter.predict(odometry)
         self._dispute.step(odometry)
-        self._since_believed = self._since_believed @ odometry.motion()
+        self.acceptance.predict(odometry.motion())
 
-    def _new_image(self, observation: Observation) -> NDArray[np.uint8] | None:
-        """The image, unless none came or the last one came again."""
-        if observation.image is None or self._frozen(observation.image):
-            self.missing += self._believed is not None
+    def _follow(self, image: NDArray[np.uint8] | None) -> FollowedImage | None:
+        """Follow the tracks into a new image; None without one that is believed: then they stay."""
+        if image is None:
             return None
-        self.missing = 0
-        return observation.image
-
-    def _follow(self, image: NDArray[np.uint8]) -> LostTracks | None:
-        """Follow the tracks into an image; None if it is not believed: then they stay where they were."""
         ids, templates = self._tracker.ids, self._tracker.templates
-        believed, moved, (way, turn) = self._believed, self._since_believed, STALE
-        if believed is None or np.hypot(moved.x, moved.y) > way or abs(moved.heading) > turn:
-            self._tracker.track(image, self._expected())
-        else:
-            sight = self._see(image, believed)
-            if (
-                sight is not FrameOverlap.SAME
-                and self._see(relit(image, believed), believed) is FrameOverlap.SAME
-            ):
-                # The next image will be in the same light as this one really is.
-                self._tracker.relight(image)
-            elif sight is not FrameOverlap.SAME:
-                self.strange += sight is FrameOverlap.STRANGE
-                self.blank += sight is FrameOverlap.BLANK
-                return None
-        self.strange = self.blank = 0
-        self._believed, self._since_believed = image, Pose2()
-        lost = ~np.isin(ids, self._tracker.ids) & np.isin(ids, self._filter.ids)
-        return LostTracks(ids[lost], templates.chosen(lost))
+        tracker = self.acceptance.followed(self._tracker, image, self._expected())
+        if tracker is None:
+            return None
+        self._tracker = tracker
+        lost = ~np.isin(ids, tracker.ids) & np.isin(ids, self._filter.ids)
+        return FollowedImage(image, ids[lost], templates.chosen(lost))
 
-    def _seek_hidden(self, image: NDArray[np.uint8], lost: LostTracks) -> NDArray[np.int64]:
-        """Hide landmarks just lost, find others again; returns the ids of all that are tracked or hidden."""
+    def _seek_hidden(self, followed: FollowedImage) -> LiveTracks:
+        """Hide landmarks just lost, and find others again."""
         if self._anchored:
-            self._hidden.take(lost.ids, lost.templates)
+            self._hidden.take(followed.lost, followed.templates)
         self._hidden.keep(np.isin(self._hidden.ids, self._filter.ids))
         if len(self._hidden.ids):
             expected = self._filter.predict_pixels(self._hidden.ids)
@@ -265,37 +253,39 @@ class Tracking:
             far_in = np.array([self._camera.width, self._camera.height]) - margin
             inside: NDArray[np.bool_] = np.asarray(((expected >= margin) & (expected < far_in)).all(axis=1))
             self._hidden.keep(inside)
-            found, raw, patches = self._hidden.seek(image, self._lens.distort(expected[inside]))
+            found, raw, patches = self._hidden.seek(followed.image, self._lens.distort(expected[inside]))
             if len(found):
                 self._tracker.add(found, raw, patches)
-        return np.concatenate([self._tracker.ids, self._hidden.ids])
+        return LiveTracks(np.concatenate([self._tracker.ids, self._hidden.ids]))
 
-    def _held(self, alive: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(N,) which tracks the filter holds. A landmark that is gone is taken out of it, and stays out.
+    def _hold(self, alive: LiveTracks) -> HeldTracks:
+        """Take landmarks that are gone out of the filter, for good.
 
-        What it has taught is in the pose already.
+        What they have taught is in the pose already.
         """
-        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, alive)])
-        return np.isin(self._tracker.ids, self._filter.ids)
+        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, alive.ids)])
+        held = np.isin(self._tracker.ids, self._filter.ids)
+        return HeldTracks(self._tracker.ids[held], self._tracker.pixels[held])
 
-    def _correct(self, held: NDArray[np.bool_]) -> bool:
-        """Correct the filter by the tracks that it holds; returns whether they were enough for that."""
-        ids, pixels = self._tracker.ids[held], self._tracker.pixels[held]
-        trusted = self._trusted(pixels)
-        self._misses_px = np.zeros((0, 2))
-        self._unused = None if trusted else len(pixels)
-        if trusted:
-            update = self._filter.update(ids, pixels)
-            self._misses_px = update.innovations_px[update.accepted]
-            refused = self._strikes.judge(ids, update.accepted)
-            self._filter.remove(refused)
-            self._tracker.keep(~np.isin(self._tracker.ids, refused))
-        return trusted
+    def _correct(self, held: HeldTracks) -> Correction:
+        """Correct the filter, if the tracks are enough for that; those that it refuses often are given up."""
+        if not self._trusted(held.pixels):
+            return Correction(NO_CORRECTION.misses_px, len(held.ids))
+        update = self._filter.update(held.ids, held.pixels)
+        refused = self._strikes.judge(held.ids, update.accepted)
+        self._filter.remove(refused)
+        self._tracker.keep(~np.isin(self._tracker.ids, refused))
+        return Correction(update.innovations_px[update.accepted], None)
 
-    def _note_unheld(self, corrected: bool) -> None:
+    def _refill(self) -> None:
+        """When few landmarks are left in view, let further tracks take their place."""
+        if len(self._filter.ids) - len(self._hidden.ids) < self._settings.refill:
+            self._fill()
+
+    def _note_unheld(self, correction: Correction) -> None:
         """While the wheels are trusted alone, note how far the tracks are from where the filter has them."""
         ids, pixels = self._tracker.ids, self._tracker.pixels
-        if corrected:
+        if correction.unused is None:
             ids, pixels = ids[:0], pixels[:0]
         self._unheld.note(ids, pixels, self._filter.predict_pixels(ids))
 
@@ -311,52 +301,19 @@ class Tracking:
             return
         ids, pixels = self._tracker.ids[candidates], self._tracker.pixels[candidates]
         chosen = even_choice(pixels, self._tracker.pixels[inside], room)
-        inverse_depths, sigmas = self._first_depths(ids[chosen])
+        inverse_depths, sigmas = initial_inverse_depths(
+            ids[chosen],
+            self.history,
+            self._camera,
+            self.pose.mean,
+            self._expected_depth,
+            self._pixel_sigma,
+        )
         self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
-
-    def _first_depths(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
-        """(N,) inverse depths 1/m with which tracks come into the filter, and their sigmas.
-
-        Tracks that were followed outside of it are triangulated against its trajectory. Its errors enter all
-        of them alike, which their covariances do not know.
-        """
-        inverse_depths = np.full(len(ids), 1.0 / self._expected_depth)
-        nearest = PRIOR_NEAR / max(self._camera.mount_height, 0.05)
-        sigmas = np.maximum(PRIOR_SPREAD * inverse_depths, nearest)
-        poses, pixels = self.history.sightings(ids)
-        if len(poses) >= 2:
-            solved = triangulate(poses, pixels, self._camera, self._pixel_sigma, self.pose.mean.vector)
-            better = DOUBT * np.sqrt(solved.ray_covariances[:, 2, 2])
-            fits = (solved.chi2 < MOST_CHI2) & (better < sigmas)
-            inverse_depths[fits], sigmas[fits] = solved.rays[fits, 2], better[fits]
-        return inverse_depths, sigmas
-
-    def _frozen(self, image: NDArray[np.uint8]) -> bool:
-        """Whether an image is the last one again, to the last grey level, although the wheels have moved.
-
-        Only an image with nothing in it is the same from everywhere.
-        """
-        moved = self._since_believed
-        stands = max(abs(moved.x), abs(moved.y), abs(moved.heading)) < 1e-3
-        if stands or self._believed is None or not np.array_equal(image, self._believed):
-            return False
-        return int(image.min()) < int(image.max())
-
-    def _see(self, image: NDArray[np.uint8], believed: NDArray[np.uint8]) -> FrameOverlap:
-        """Follow the tracks into an image; if it does not continue the one before, they stay behind."""
-        tracker, expected = copy.copy(self._tracker), self._expected()
-        tracker.track(image, expected)
-        found = np.full(expected.shape, np.nan)
-        found[np.isin(self._tracker.ids, tracker.ids)] = tracker.pixels
-        turn = self._since_believed.heading
-        sight = self._continuity.compare(believed, image, turn, expected, found)
-        if sight is FrameOverlap.SAME:
-            self._tracker = tracker
-        return sight
 
     def _expected(self) -> Array:
         """(N, 2) px where the tracks should be now: by the filter, else by the turn alone."""
-        expected = turned(self._camera, self._tracker.pixels, self._since_believed.heading)
+        expected = turned(self._camera, self._tracker.pixels, self.acceptance.moved.heading)
         ids = self._filter.ids
         if len(ids):
             order = np.argsort(ids)

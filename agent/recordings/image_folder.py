@@ -13,8 +13,8 @@ import numpy as np
 
 from mapweave.agent.recordings.camera_file import number, whole
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.storage.atomic_file import read_whole
-from mapweave.wire.packing import MAX_STAMP_NS
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 

@@ -7,18 +7,9 @@ import math
 from mapweave.agent.mission import Question, WhatIsKnown, WhereAmI
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import KnownAnswer, RelocalizeAnswer, RouteAnswer
+from mapweave.hybridmap.query import KnownAnswer, KnownRequest, RelocalizeAnswer, RouteAnswer, RouteRequest
 from mapweave.wire.keys import Keys
-from mapweave.wire.messages import (
-    KnownRequest,
-    RouteRequest,
-    decode_known_answer,
-    decode_relocalize_answer,
-    decode_route_answer,
-    encode_known_request,
-    encode_route_request,
-    encode_view,
-)
+from mapweave.wire.messages import decode, encode, encode_view
 
 FARTHEST = 100.0
 """m; no robot sees a node, or drives from one node to the next, from further away. Nodes of recordings from
@@ -39,9 +30,9 @@ def encode_query(keys: Keys, question: Question) -> tuple[str, bytes]:
         return keys.any_relocalize(), encode_view(question.view)
     if isinstance(question, WhatIsKnown):
         around = KnownRequest(question.map, question.x, question.y, question.reach)
-        return keys.any_known(), encode_known_request(around)
+        return keys.any_known(), encode(around)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
-    return keys.any_route(), encode_route_request(request)
+    return keys.any_route(), encode(request)
 
 
 def decode_answer(question: Question, payload: bytes) -> RelocalizeAnswer | RouteAnswer | KnownAnswer:
@@ -51,13 +42,13 @@ def decode_answer(question: Question, payload: bytes) -> RelocalizeAnswer | Rout
         InvalidMessage: it is no answer to it, or one that no robot can act on.
     """
     if isinstance(question, WhereAmI):
-        answer = decode_relocalize_answer(payload)
+        answer = decode(payload, RelocalizeAnswer)
         for best in answer.candidates[:1]:
             _check_near(best.node_from_robot.mean, f"whereabouts: the robot, seen from node {best.node},")
         return answer
     if isinstance(question, WhatIsKnown):
-        return decode_known_answer(payload)
-    route = decode_route_answer(payload)
+        return decode(payload, KnownAnswer)
+    route = decode(payload, RouteAnswer)
     for leg in route.legs:
         _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
     if route.legs and route.legs[-1].node.id != question.goal:

@@ -25,11 +25,9 @@ from benchmarks.relocalize.score import RIGHT_DEG, RIGHT_M, errors
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.mapserver.relocalization.calibration import COEFFICIENTS, HypothesisSupport, probabilities
+from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, Candidates
 from mapweave.mapserver.relocalization.place_hypotheses import supported
-from mapweave.mapserver.relocalization.relocalizer import (
-    MOST_COMPARED,
-    Relocalizer,
-)
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
 PULL = 1.0
@@ -61,12 +59,8 @@ def gather(seed: int, nodes: int, queries: int, bar: Progress) -> Seen:
     found: Seen = []
     for query in asked:
         ranked = index.query(query.picture.view, MOST_COMPARED)
-        sightings = relocalizer.look(query.picture.view, ranked)[0]
-        doubled = []
-        if sightings:
-            best = max(sightings, key=lambda one: one.recognition.inliers)
-            doubled = relocalizer.doubled(query.picture.view, best, ranked)
-        seen = relocalizer.judge.places([*sightings, *doubled])
+        registration = relocalizer.registration.register(Candidates(query.picture.view, ranked))
+        seen = relocalizer.selection.places(registration)
         off = [errors(query, truth.get(place.best.node), place.best_from_robot) for place in seen]
         found.append((supported(seen), [m <= RIGHT_M and deg <= RIGHT_DEG for m, deg in off]))
     bar.update(task, completed=nodes + (len(KINDS) + 2) * queries)

@@ -221,8 +221,9 @@ class _Run:
             self.wheels = self.wheels @ observation.odometry.motion()
             self._write(observation, step_ms)
             progress()
-            if self.tracking.carried_off or self.tracking.disputed:
-                self.given_up = "carried off" if self.tracking.carried_off else "wheels against image"
+            if self.tracking.acceptance.carried_off or self.tracking.disputed:
+                carried_off = self.tracking.acceptance.carried_off
+                self.given_up = "carried off" if carried_off else "wheels against image"
                 return
 
     def recorded(self, name: str) -> MappingDrive:
@@ -252,7 +253,7 @@ class _Run:
         moment = Moment(
             observation.odometry, self.world_from_anchor.inverse() @ world_from_robot, self.wheels,
             self.tracking.pose, self.tracking.landmarks(), self.tracking.ids.copy(),
-            self.tracking.pixels.copy(), not self.tracking.doubtful,
+            self.tracking.pixels.copy(), not self.tracking.acceptance.doubtful,
             self._person(world_from_robot), step_ms,
         )  # fmt: skip
         self.moments.append(moment)

@@ -86,7 +86,7 @@ class Scene:
         for change in self.own_map.contents():
             merger.apply(self.goal.id.map, change)
         merged = merger.merged()
-        self._relocalizer = Relocalizer(merger.index, merger.node, merged)
+        self._relocalizer = Relocalizer(merger.places, merger.node, merged)
         self._router = Router(merged)
 
     def simulate(self, world_from_robot: Pose2) -> Simulation:

@@ -46,7 +46,8 @@ from benchmarks.relocalize.peer import WordIndex
 from benchmarks.relocalize.queries import KINDS
 from benchmarks.relocalize.score import figures, recall_by_kind, spent, wrong_by_kind
 from mapweave.hybridmap.node import Node
-from mapweave.mapserver.relocalization.relocalizer import MOST_COMPARED, Relocalizer
+from mapweave.mapserver.relocalization.candidates import MOST_COMPARED
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
 REAL = 1000

@@ -14,11 +14,10 @@ from benchmarks.relocalize.queries import Query
 from benchmarks.relocalize.score import Reply
 from mapweave.hybridmap.descriptor import root_sift
 from mapweave.hybridmap.query import RelocalizeAnswer
+from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, Candidates
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, is_lonely
-from mapweave.mapserver.relocalization.relocalizer import (
-    MOST_COMPARED,
-    Relocalizer,
-)
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.registration.matching import match_vectors, squared_distances
 from mapweave.registration.recognition import Recognition, RecognitionSettings, examine_matches
 
@@ -75,7 +74,8 @@ class Exhaustive:
                 sightings.append(NodeMatch(place.node.id, verdict, lonely=lonely))
         most = np.argsort(-counts, kind="stable")[:RIVALS].tolist()
         ranked = [(self._place_of(k).node.id, float(counts[k])) for k in most]
-        return self._relocalizer.conclude(view, sightings, ranked)
+        matches = self._relocalizer.registration.refined(view, sightings)
+        return self._relocalizer.conclude(Registration(Candidates(view, ranked), matches))
 
     def may_match(
         self, views: Sequence[NDArray[np.float32]], progress: Callable[[], None] = lambda: None

@@ -35,7 +35,7 @@ from rich.table import Table
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
-from mapweave.hybridmap.query import View
+from mapweave.hybridmap.query import RelocalizeAnswer, RouteRequest, View
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
 from mapweave.scenarios.children import Children, free_port
@@ -43,7 +43,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
-from mapweave.wire.messages import RouteRequest, decode_relocalize_answer, encode_route_request, encode_view
+from mapweave.wire.messages import decode, encode, encode_view
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.world import World, room, take_map, take_view
 
@@ -146,7 +146,7 @@ def ask_on(bus: ZenohBus, building: Building, queries: list[tuple[View, MapId, P
 
 def is_right(building: Building, query: tuple[View, MapId, Pose2], payload: bytes) -> bool:
     """Whether the best candidate is within 0.25 m and 5 degrees."""
-    candidates = decode_relocalize_answer(payload).candidates
+    candidates = decode(payload, RelocalizeAnswer).candidates
     if not candidates:
         return False
     _, _, true = query
@@ -159,7 +159,7 @@ def is_right(building: Building, query: tuple[View, MapId, Pose2], payload: byte
 def ask_routes(bus: ZenohBus, building: Building, stop: threading.Event) -> list[float]:
     """Ten routes a second; how long each took, s."""
     ids = sorted(building.truth)
-    payload = encode_route_request(RouteRequest(ids[0], ids[min(ROOM_NODES, len(ids)) - 1]))
+    payload = encode(RouteRequest(ids[0], ids[min(ROOM_NODES, len(ids)) - 1]))
     times = []
     while not stop.wait(0.1):
         asked = time.monotonic()

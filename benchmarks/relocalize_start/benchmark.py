@@ -34,12 +34,12 @@ from benchmarks.relocalize.queries import Query, known
 from benchmarks.relocalize.score import judged, share
 from benchmarks.relocalize_start.store import fill
 from mapweave.hybridmap.query import RelocalizeAnswer
-from mapweave.mapserver.retrieval.index_keeper import SUFFIX
+from mapweave.mapserver.retrieval.place_database import SUFFIX
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
-from mapweave.wire.messages import decode_relocalize_answer, encode_view
+from mapweave.wire.messages import decode, encode_view
 from mapweave.wire.zenoh_bus import ZenohBus
 
 REAL, DONORS = 1000, 800
@@ -107,7 +107,7 @@ def _ask(bus: ZenohBus, query: Query) -> RelocalizeAnswer | None:
     """The answer; None while the server does not listen yet, or is busy."""
     replies = bus.ask(Keys(FLEET).any_relocalize(), encode_view(query.picture.view), PATIENCE)
     good = [reply for reply in replies if not reply.error]
-    return decode_relocalize_answer(good[0].payload) if good else None
+    return decode(good[0].payload, RelocalizeAnswer) if good else None
 
 
 def _cpu(pid: int) -> float:

@@ -1,37 +1,76 @@
 """Fleets with one robot whose map has wrong geometry and true views: answers to lost robots then.
 
-    python -m benchmarks.wrong_geometry --seeds 0 1 2 --kinds slip carried long turns
+    python -m benchmarks.wrong_geometry [--runs N] [--kinds slip carried long turns] [--seed N] [--json]
 
-Nothing is rendered (see benchmarks.synthetic). Three sound robots map a house; a fourth maps the same house
-with one of four faults of its odometry. Lost robots then ask where they are, with and without the fourth
-robot's map. The house may have two rooms that look the same: answers there must not become more certain.
+Nothing is rendered (see `synthetic.wrong_geometry`). Three sound robots map a house; a fourth maps the same
+house with one of four faults of its odometry. Lost robots then ask where they are: without the fourth robot's
+map, with it, and with it while no map is looked for that has wrong geometry. The house may have two rooms
+that look the same: answers there must not become more certain.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections import Counter
 from itertools import product
 
-from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import View
-from synthetic.wrong_geometry import ODD, SCENES, Fault, draw_fleet, lost_views, outcome
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.rules.switches import Switch, switched_off
+from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
+from synthetic.wrong_geometry import ODD, SCENES, AnswerOutcome, Fault, draw_fleet, lost_views, outcome
+
+WITHOUT, WITH, UNSEARCHED = "without_the_map", "with_the_map", "rule_off"
+NO_SEARCH: tuple[Switch, ...] = ((WrongGeometrySearch, "wrong", lambda *_: {}),)
+
+
+def measured(
+    seed: int, runs: int, kinds: list[str], scenes: list[str], queries: int, progress: Progress
+) -> dict[str, dict[str, int]]:
+    """Answers of each sort; fleets; those whose sound maps are in pieces; maps that are found wrong."""
+    out: dict[str, Counter[str]] = {name: Counter() for name in (WITHOUT, WITH, UNSEARCHED)}
+    task = progress.add_task("fleets", total=runs * len(kinds) * len(scenes))
+    for name, run, kind in product(scenes, range(runs), kinds):
+        fleet = draw_fleet(seed + run, SCENES[name], Fault(kind))
+        views = lost_views(fleet, SCENES[name], queries, seed + run)
+        told = {WITHOUT: outcome(fleet, views, frozenset({ODD})), WITH: outcome(fleet, views)}
+        with switched_off(NO_SEARCH):
+            told[UNSEARCHED] = outcome(fleet, views)
+        for way, one in told.items():
+            answers = {str(sort): one[str(sort)] for sort in AnswerOutcome}
+            out[way].update(
+                answers | {"fleets": 1, "in_pieces": int(one["parts"] > 1), "found": len(one["found"])}
+            )
+        progress.advance(task)
+    return {way: dict(figures) for way, figures in out.items()}
 
 
 def main() -> None:
-    """Print a line of JSON for each fleet."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--kinds", nargs="+", default=[str(one) for one in Fault if one is not Fault.NONE])
-    parser.add_argument("--scenes", nargs="+", default=["room", "house"], choices=SCENES)
-    parser.add_argument("--queries", type=int, default=24)
-    args = parser.parse_args()
-    for name, seed in product(args.scenes, args.seeds):
-        scene, views, row = SCENES[name], list[tuple[View, Pose2]](), {"scene": name, "seed": seed}
-        for kind in args.kinds:
-            fleet = draw_fleet(seed, scene, Fault(kind))
-            if not views:
-                # Whatever is wrong with the fourth map, the others are the same.
-                views = lost_views(fleet, scene, args.queries, seed)
-                print(json.dumps({**row, "without": outcome(fleet, views, frozenset({ODD}))}), flush=True)
-            print(json.dumps({**row, "fault": kind, "with": outcome(fleet, views)}), flush=True)
+    """Run and print."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.wrong_geometry", description=__doc__.splitlines()[0]
+    )
+    faults = [str(one) for one in Fault if one is not Fault.NONE]
+    parser.add_argument("--seed", type=int, default=0, help="of the first fleet (default 0)")
+    parser.add_argument("--runs", type=int, default=3, help="fleets of each kind and scene (default 3)")
+    parser.add_argument("--kinds", nargs="+", default=faults, choices=faults)
+    parser.add_argument("--scenes", nargs="+", default=["room", "house"], choices=list(SCENES))
+    parser.add_argument("--queries", type=int, default=24, help="of lost robots, each fleet (default 24)")
+    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
+    arguments = parser.parse_args()
+    if min(arguments.runs, arguments.queries) < 1 or arguments.seed < 0:
+        parser.error("--runs and --queries must be at least 1, --seed at least 0")
+    console = Console(stderr=arguments.json)
+    with Progress(console=console) as progress:
+        found = measured(
+            arguments.seed, arguments.runs, arguments.kinds, arguments.scenes, arguments.queries, progress
+        )
+    table = Table("figure", *found, title="three sound robots and one with a fault")
+    for figure in found[WITH]:
+        table.add_row(figure, *(str(one[figure]) for one in found.values()))
+    console.print(table)
+    if arguments.json:
+        print(json.dumps({"seed": arguments.seed, "runs": arguments.runs, **found}))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import json
 import logging
 import socket
 import threading
@@ -20,6 +19,7 @@ from types import TracebackType
 from typing import Any
 
 import h11
+import msgspec
 import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -68,7 +68,7 @@ class Limits:
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
     """One line."""
-    return json.dumps(content).encode() + b"\n"
+    return msgspec.json.encode(content) + b"\n"
 
 
 class Connection(H11Protocol):

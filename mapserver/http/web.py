@@ -35,14 +35,12 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.manual_constraint import EXAMPLE, read_ends
-from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.query import RelocalizeAnswer, View
-from mapweave.mapserver.http.answer_json import answer_record
-from mapweave.mapserver.http.explanation_json import explanation_record, history_record
+from mapweave.hybridmap.map_event import History, MapEvent
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.http.form import read_photo
+from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
-from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.log_messages import Scalar
 
 log = logging.getLogger(__name__)
@@ -224,7 +222,7 @@ class Questions:
         return await run_in_threadpool(self._server.status)
 
     async def _history(self, _: Request) -> Mapping[str, Any]:
-        return await run_in_threadpool(lambda: history_record(self._server.history()))
+        return await run_in_threadpool(lambda: json_values(History(self._server.history())))
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
         ends, path, query = None, request.url.path, dict(request.query_params)
@@ -235,7 +233,7 @@ class Questions:
             ends = read_ends(query["a"].strip(), query["b"].strip())
         asked = ExplainRequest(ends, route)
         explanation = await self._result(lambda: self._server.explain(asked))
-        return await run_in_threadpool(explanation_record, explanation)
+        return await run_in_threadpool(json_values, explanation)
 
     async def _relocalize(self, request: Request) -> Mapping[str, Any]:
         body = await self._body(request)
@@ -243,7 +241,7 @@ class Questions:
         photo = await run_in_threadpool(read_photo, content_type, body, query)
         photo.check()
         ticket = hash(photo.data)
-        return answer_record(await self._result(lambda: self._server.locate(photo.view, ticket)))
+        return json_values(await self._result(lambda: self._server.locate(photo.view, ticket)))
 
     async def _result(self, ask: Callable[[], Future[Any]]) -> Any:
         """Ask on a thread, since in lock-step the asker does the work; then wait for the answer."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,22 +12,15 @@ from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.aliased_landmarks import (
+    EXPLAINED_PX,
     AliasedLandmarks,
     same_place,
     unchanged,
     unexplained,
 )
+from mapweave.mapserver.relocalization.candidates import Retrieval
 from mapweave.registration.matching import match
 from mapweave.registration.recognition import Recognition, RecognitionSettings
-
-
-class Retrieval(Protocol):
-    """Finds nodes that look like a view, for example mapweave.mapserver.retrieval.place_index.PlaceIndex."""
-
-    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
-        """At most k nodes with how much they look like it, best first."""
-        ...
-
 
 Between = Callable[[NodeId, NodeId], Pose2 | None]
 """Pose `a_from_b` of two nodes on the merged map; None if that does not join them."""
@@ -170,7 +162,3 @@ class AliasCache:
                 more = {**known.found, node.id: one.turned_round(node)}
                 self._known[one.other.id] = replace(known, found=more)
         return entry
-
-
-EXPLAINED_PX = 12.0
-"""A match nearer than this to where the map expects it speaks for the map."""

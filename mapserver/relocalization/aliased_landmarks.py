@@ -35,6 +35,9 @@ VAGUE: dict[str, Any] = {
 """What a node that looks like another need not hold: a poster seen from near fills few cells and tells no
 pose well, and its double in the next room is one all the same."""
 
+EXPLAINED_PX = 12.0
+"""A match nearer than this to where a pose expects it speaks for that pose."""
+
 NEAR_M, NEAR_HEADING = 0.5, 0.35
 """Two nodes see the same place, and are no doubles, if the map has them about where they see each
 other, m and rad."""

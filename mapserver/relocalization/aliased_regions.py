@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
-from mapweave.mapserver.relocalization.alias_cache import AliasCache, AliasedNode, Retrieval
+from mapweave.mapserver.relocalization.alias_cache import AliasCache, AliasedNode
 from mapweave.mapserver.relocalization.aliased_landmarks import between, same_place
+from mapweave.mapserver.relocalization.candidates import Retrieval
 from mapweave.mapserver.relocalization.place_hypotheses import THING_SIGMA, NodeMatch, extent
 from mapweave.merge.pose_graph.merged_map import MergedMap
 

@@ -15,6 +15,11 @@ from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.calibration import HypothesisSupport
 from mapweave.registration.recognition import Recognition
 
+ALONE = 18
+"""Landmarks that must agree if one node speaks alone. Two nodes that say the same, found each by its own,
+are much better evidence than one: parts of unlike places look alike."""
+SLIGHT = 0.25
+"""A place that explains less than this share of what the best one explains is no rival."""
 THING_SIGMA = 0.35
 """Largest standard deviation of the landmarks on one thing, seen from above, m: of a table of 1.2 m."""
 BESIDE = 0.35

@@ -1,23 +1,26 @@
-"""What follows from the nodes that were recognised in a view: places, rivals, and an answer in words."""
+"""The verdict: at which places the view may have been taken, and whether one is certain. The last step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, Whereabouts
-from mapweave.mapserver.relocalization.aliased_landmarks import between
-from mapweave.mapserver.relocalization.calibration import probabilities
-from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, PlaceHypothesis, fuse, supported
+from mapweave.mapserver.relocalization.perceptual_aliasing import PerceptualAliasing
+from mapweave.mapserver.relocalization.place_hypotheses import (
+    ALONE,
+    SLIGHT,
+    NodeMatch,
+    PlaceHypothesis,
+    fuse,
+    supported,
+)
+from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.merge.pose_graph.merged_map import MergedMap
-
-ALONE = 18
-"""Landmarks that must agree if one node speaks alone. Two nodes that say the same, found each by its own,
-are much better evidence than one: parts of unlike places look alike."""
-
 
 GATE = 16.3
 """Chi-square with 3 degrees of freedom within which two estimates agree."""
@@ -28,34 +31,107 @@ FLOOR_HEADING = 0.03
 COMPARABLE = 0.6
 """A second place is a rival if it explains so much of what the best one explains, or if so much of what it
 should see is seen, as compared with the best one."""
-SLIGHT = 0.25
-"""A place that explains less of what the best one explains is no rival in any case."""
 
 
-Elsewhere = Callable[[PlaceHypothesis], PlaceHypothesis | None]
-"""Where a robot may be as well that seems to be at a place."""
+class Outcome(Enum):
+    """What a verdict comes to: one place, several, or why none."""
 
-NOWHERE = -1
-"""Component of a node that is not in the merged map yet."""
+    FOUND = auto()
+    AMBIGUOUS = auto()
+    FEW_FEATURES = auto()
+    NO_CANDIDATE = auto()
+    NOT_RECOGNISED = auto()
+    ONE_WEAK_NODE = auto()
+    """One node speaks alone, by few landmarks."""
+    ONE_THING = auto()
+    """All landmarks that agree are on one thing, which may have been moved."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What follows from a registration.
+
+    Attributes:
+        outcome: of it.
+        registration: the grounds.
+        places: that come into question, best supported first.
+        rivals: more than one if ambiguous: places that explain the view about as well as the first.
+    """
+
+    outcome: Outcome
+    registration: Registration
+    places: Sequence[PlaceHypothesis] = ()
+    rivals: Sequence[PlaceHypothesis] = ()
 
 
 class HypothesisSelector:
-    """Puts what was recognised together, and answers. It stands for one merged map."""
+    """Groups what was recognised into places, and decides between them. It stands for one merged map."""
 
-    def __init__(self, merged: MergedMap) -> None:
-        """Take where nodes are, and how strict to be."""
-        self._merged = merged
+    def __init__(self, merged: MergedMap, aliasing: PerceptualAliasing, least_features: int) -> None:
+        """Take where nodes are, and which places look alike.
 
-    def places(self, sightings: Sequence[NodeMatch]) -> list[PlaceHypothesis]:
-        """Group the sightings by agreement, best supported place first."""
-        left = sorted(sightings, key=lambda one: (-one.recognition.inliers, one.node))
+
+        Args:
+            merged: where nodes are.
+            aliasing: which other places look like one that was recognised.
+            least_features: a view with fewer has no candidates.
+        """
+        self._merged, self._aliasing = merged, aliasing
+        self._least_features = least_features
+
+    def decide(self, registration: Registration) -> Verdict:
+        """Say where the robot is if only one place comes into question, or why not."""
+        places = self.places(registration)
+        rivals = self._rivals(places)
+        outcome = self._refusal(registration, places, rivals)
+        if outcome is None:
+            ranked = [node for node, _ in registration.candidates.ranked]
+            counterpart = self._aliasing.counterpart(places[0], ranked)
+            if counterpart is None:
+                outcome = Outcome.FOUND
+            else:
+                outcome, rivals = Outcome.AMBIGUOUS, [places[0], counterpart]
+                places = [*places, counterpart]
+        return Verdict(outcome, registration, places, rivals)
+
+    def _refusal(
+        self,
+        registration: Registration,
+        places: Sequence[PlaceHypothesis],
+        rivals: Sequence[PlaceHypothesis],
+    ) -> Outcome | None:
+        """Why no single place is certain, the first reason that holds; None if none does."""
+        matches, ranked = places[0].sightings if places else [], registration.candidates.ranked
+        reasons = (
+            (Outcome.FEW_FEATURES, not ranked and len(registration.candidates.view) < self._least_features),
+            (Outcome.NO_CANDIDATE, not ranked),
+            (Outcome.NOT_RECOGNISED, not matches),
+            (Outcome.AMBIGUOUS, len(rivals) > 1),
+            (
+                Outcome.ONE_WEAK_NODE,
+                len(matches) == 1 and matches[0].recognition.inliers < ALONE,
+            ),
+            (Outcome.ONE_THING, all(one.lonely for one in matches)),
+        )
+        return next((outcome for outcome, holds in reasons if holds), None)
+
+    def places(self, registration: Registration) -> list[PlaceHypothesis]:
+        """Group the nodes that were recognised, and those that look like the best of them, into places.
+
+        Nodes agree if their poses do, within what the map and the recognitions are certain of. The best
+        supported place is the first.
+        """
+        matches, candidates = list(registration.matches), registration.candidates
+        if matches:
+            matches += self._aliasing.matches(candidates.view, matches[0], candidates.ranked)
+        left = sorted(matches, key=lambda one: (-one.recognition.inliers, one.node))
         places = []
         while left:
             best, left = left[0], left[1:]
             combined, agreeing, others = best.recognition.node_from_robot, [best], []
             for one in left:
                 estimate = self._in_frame_of(best.node, one)
-                if estimate is None or not self._agree(best.recognition.node_from_robot, estimate):
+                if estimate is None or not _agree(best.recognition.node_from_robot, estimate):
                     others.append(one)
                     continue
                 agreeing.append(one)
@@ -66,80 +142,27 @@ class HypothesisSelector:
         return sorted(places, key=lambda place: (-len(place.features), place.best.node))
 
     def _in_frame_of(self, node: NodeId, one: NodeMatch) -> PoseGaussian | None:
-        """A sighting's estimate in another node's frame; None if the map does not join the two."""
+        """A match's estimate in another node's frame; None if the map does not join the two."""
         if node == one.node:
             return one.recognition.node_from_robot
         relative = self._merged.relative(node, one.node)
         return None if relative is None else relative @ one.recognition.node_from_robot
 
-    def _agree(self, first: PoseGaussian, second: PoseGaussian) -> bool:
-        between = first.inverse() @ second
-        floor = np.diag([FLOOR_XY**2, FLOOR_XY**2, FLOOR_HEADING**2])
-        d = between.mean.vector
-        return float(d @ np.linalg.solve(between.covariance + floor, d)) < GATE
-
-    def answer(self, places: Sequence[PlaceHypothesis], elsewhere: Elsewhere) -> RelocalizeAnswer:
-        """Say where the robot is, if only one place comes into question.
-
-        Args:
-            places: that were recognised, best supported first.
-            elsewhere: finds where a robot may be as well that seems to be at the first of them.
-        """
-        first = places[0]
+    def _rivals(self, places: Sequence[PlaceHypothesis]) -> list[PlaceHypothesis]:
+        """Places that explain the view about as well as the first, which is among them."""
         supports = supported(places)
-        rivals = [
+        return [
             place for place, support in zip(places, supports, strict=True)
-            if len(place.features) >= COMPARABLE * len(first.features)
+            if len(place.features) >= COMPARABLE * len(places[0].features)
             or (
-                len(place.features) >= SLIGHT * len(first.features)
+                len(place.features) >= SLIGHT * len(places[0].features)
                 and support.seen >= COMPARABLE * supports[0].seen
             )
         ]  # fmt: skip
-        if len(rivals) > 1:
-            return self._ambiguous(places, rivals)
-        best = first.best
-        words = f"{best.recognition.inliers} landmarks of {best.node} agree"
-        if len(first.sightings) == 1 and best.recognition.inliers < ALONE:
-            return unknown(f"not sure: {words}, and no other node says the same")
-        if all(one.lonely for one in first.sightings):
-            return unknown(f"not sure: {words}, all on one thing, and nothing of what should be beside it")
-        counterpart = elsewhere(first)
-        if counterpart is not None:
-            return self._ambiguous([*places, counterpart], [first, counterpart])
-        if len(first.sightings) > 1:
-            words += f", and {len(first.sightings) - 1} more nodes with them"
-        return RelocalizeAnswer(Certainty.FOUND, self._candidates(places), words)
-
-    def _ambiguous(
-        self, places: Sequence[PlaceHypothesis], rivals: Sequence[PlaceHypothesis]
-    ) -> RelocalizeAnswer:
-        names = " or ".join(str(place.best.node) for place in rivals)
-        most, least = len(rivals[0].features), len(rivals[-1].features)
-        words = f"it may be {names}: they explain {most} to {least} features"
-        if any(place.is_double for place in rivals):
-            words += ", and look alike on the map"
-        if any(place.nodes_around for place in rivals):
-            words += f", and so do {max(place.nodes_around for place in rivals)} nodes around them"
-        if any(between(self._merged, rivals[0].best.node, place.best.node) is None for place in rivals):
-            words += ", and nothing joins their parts of the map yet"
-        return RelocalizeAnswer(Certainty.AMBIGUOUS, self._candidates(places), words)
-
-    def _candidates(self, places: Sequence[PlaceHypothesis]) -> tuple[Whereabouts, ...]:
-        return tuple(map(self._whereabouts, places, probabilities(supported(places))))
-
-    def _whereabouts(self, place: PlaceHypothesis, probability: float) -> Whereabouts:
-        best = place.best
-        placement = self._merged.poses.get(best.node)
-        return Whereabouts(
-            best.node,
-            place.best_from_robot,
-            None if placement is None else placement.merged_from_robot @ place.best_from_robot,
-            NOWHERE if placement is None else placement.component,
-            best.recognition.inliers,
-            probability,
-        )
 
 
-def unknown(reason: str) -> RelocalizeAnswer:
-    """No place, for a reason."""
-    return RelocalizeAnswer(Certainty.UNKNOWN, (), reason)
+def _agree(first: PoseGaussian, second: PoseGaussian) -> bool:
+    difference = first.inverse() @ second
+    floor = np.diag([FLOOR_XY**2, FLOOR_XY**2, FLOOR_HEADING**2])
+    d = difference.mean.vector
+    return float(d @ np.linalg.solve(difference.covariance + floor, d)) < GATE

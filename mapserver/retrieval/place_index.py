@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.node import CODE_BYTES, Node, NodeId
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import voting
+from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS, bounded
 from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
 from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
@@ -20,8 +21,6 @@ SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
 FEW_GONE = 20
 """Of more nodes that go at once, the index is read through once for where they lie."""
-MOST_LANDMARKS = 400
-"""Of a node with more the first ones are compared, see `bounded`: a robot's nodes have up to 150."""
 AT_ONCE = 1024
 """Nodes that are taken in at once."""
 
@@ -39,16 +38,6 @@ class PlaceIndexSettings:
     landmarks: LandmarkIndexSettings = field(default_factory=LandmarkIndexSettings)
     votes: int = 16
     compared: int = 64
-
-
-def bounded(node: Node) -> Node:
-    """A node with at most `MOST_LANDMARKS`, the very same one if it has no more.
-
-    Two nodes take as much time to compare as the product of their landmarks.
-    """
-    if len(node.landmarks) <= MOST_LANDMARKS:
-        return node
-    return replace(node, landmarks=node.landmarks.take(np.arange(MOST_LANDMARKS)))
 
 
 REACH = 0.6

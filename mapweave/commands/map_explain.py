@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
-    from mapweave.hybridmap.explanation import MapsExplanation, PairExplanation
+    from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation
     from mapweave.hybridmap.node import MapId, NodeId
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.merge.settings import MergeSettings
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.manual_constraint import EXAMPLE
     from mapweave.hybridmap.node import MapId, NodeId
-    from mapweave.mapserver.http.explanation_json import explanation_record
+    from mapweave.mapserver.http.json_values import json_values
 
     if arguments.draw is not None:
         need("viz")
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     first, second = ends or (None, None)
     if isinstance(first, NodeId) and isinstance(second, NodeId):
         pair = explained_nodes(arguments, first, second)
-        values, lines = explanation_record(pair), pair_words(pair)
+        values, lines = json_values(pair), pair_words(pair)
         if arguments.draw is not None:
             from mapweave.drawing.link_picture import draw_link
 
@@ -62,8 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
             raise InvalidValue(f"--draw needs two nodes: {EXAMPLE}")
         maps = None if ends is None else (MapId(*ends[0][:2]), MapId(*ends[1][:2]))
         told = explained_maps(arguments, maps)
-        values = explanation_record(told)
-        lines = [line for one in told for line in maps_words(one)] or ["there are no two maps"]
+        values = json_values(told)
+        lines = [line for one in told.maps for line in maps_words(one)] or ["there are no two maps"]
     print(json.dumps(values) if arguments.json else "\n".join(lines))
     return 0
 
@@ -71,38 +71,37 @@ def run(arguments: argparse.Namespace) -> int:
 def explained_nodes(arguments: argparse.Namespace, a: NodeId, b: NodeId) -> PairExplanation:
     """Two nodes of a map file, or of what a server has."""
     from mapweave.commands.map_ends import ask
-    from mapweave.wire.explanation_messages import ExplainRequest, decode_pair, encode_explain_request
+    from mapweave.hybridmap.explanation import PairExplanation
+    from mapweave.hybridmap.query import ExplainRequest
     from mapweave.wire.keys import Keys
+    from mapweave.wire.messages import decode, encode
 
     if arguments.map is None:
-        request = encode_explain_request(ExplainRequest((a, b)))
-        return decode_pair(ask(arguments, Keys.any_explain, request)[0].payload)
+        request = encode(ExplainRequest((a, b)))
+        return decode(ask(arguments, Keys.any_explain, request)[0].payload, PairExplanation)
     from mapweave.merge.explanation.node_explanation import explain_nodes
 
     merged, settings = _merged(arguments)
     return explain_nodes(merged, a, b, None, settings.consistency)
 
 
-def explained_maps(
-    arguments: argparse.Namespace, ends: tuple[MapId, MapId] | None
-) -> tuple[MapsExplanation, ...]:
+def explained_maps(arguments: argparse.Namespace, ends: tuple[MapId, MapId] | None) -> FleetExplanation:
     """Two maps of a map file, or of what a server has; each two of them without ends."""
     from mapweave.commands.map_ends import ask
-    from mapweave.wire.explanation_messages import (
-        MAX_MAPS_TOLD,
-        ExplainRequest,
-        decode_maps,
-        encode_explain_request,
-    )
+    from mapweave.hybridmap.explanation import MAX_MAPS_TOLD, FleetExplanation
+    from mapweave.hybridmap.query import ExplainRequest
     from mapweave.wire.keys import Keys
+    from mapweave.wire.messages import decode, encode
 
     if arguments.map is None:
-        request = encode_explain_request(ExplainRequest(ends))
-        return decode_maps(ask(arguments, Keys.any_explain, request)[0].payload)
+        request = encode(ExplainRequest(ends))
+        return decode(ask(arguments, Keys.any_explain, request)[0].payload, FleetExplanation)
     from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
 
     merged, _ = _merged(arguments)
-    return explain_fleet(merged, MAX_MAPS_TOLD) if ends is None else (explain_maps(merged, *ends),)
+    if ends is None:
+        return FleetExplanation(explain_fleet(merged, MAX_MAPS_TOLD))
+    return FleetExplanation((explain_maps(merged, *ends),))
 
 
 def _merged(arguments: argparse.Namespace) -> tuple[MergedMap, MergeSettings]:

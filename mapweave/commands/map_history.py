@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
-    from mapweave.hybridmap.map_event import MapEvent
+    from mapweave.hybridmap.map_event import History
 
 
 def add_to(actions: Any) -> None:
@@ -34,14 +34,15 @@ def add_to(actions: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from mapweave.hybridmap.errors import InvalidValue
-    from mapweave.mapserver.http.explanation_json import history_record, time_of
+    from mapweave.mapserver.http.json_values import json_values, time_of
 
     if arguments.most < 1:
         raise InvalidValue(f"--most {arguments.most}: give 1 or more")
-    happenings = _history(arguments)
+    told = _history(arguments)
     if arguments.json:
-        print(json.dumps(history_record(happenings)))
+        print(json.dumps(json_values(told)))
         return 0
+    happenings = told.history
     left_out = len(happenings) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
     lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:10}  {h.words}" for h in happenings[-arguments.most :]]
@@ -49,15 +50,16 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _history(arguments: argparse.Namespace) -> tuple[MapEvent, ...]:
+def _history(arguments: argparse.Namespace) -> History:
     from mapweave.commands.map_ends import ask
     from mapweave.hybridmap.manual_constraint import ManualConstraints
+    from mapweave.hybridmap.map_event import History
     from mapweave.mapserver.ruling_history import with_rulings
     from mapweave.storage.map_file import read_map_file
-    from mapweave.wire.history_codec import decode_history
     from mapweave.wire.keys import Keys
+    from mapweave.wire.messages import decode
 
     if arguments.map is None:
-        return decode_history(ask(arguments, Keys.any_history, b"")[0].payload)
+        return decode(ask(arguments, Keys.any_history, b"")[0].payload, History)
     content = read_map_file(arguments.map)
-    return with_rulings(content.history, ManualConstraints(content.rulings))
+    return History(with_rulings(content.history, ManualConstraints(content.rulings)))

@@ -44,14 +44,14 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.commands.map_ends import node_of
     from mapweave.explanation_text import route_words
     from mapweave.extras import need
-    from mapweave.mapserver.http.explanation_json import route_values
+    from mapweave.mapserver.http.json_values import json_values
 
     if arguments.draw is not None:
         need("viz")
     start, goal = node_of(arguments.start), node_of(arguments.goal)
     blocked = tuple((node_of(a), node_of(b)) for a, b in arguments.blocked)
     told = explained_route(arguments, start, goal, blocked)
-    values, lines = route_values(told), route_words(told)
+    values, lines = json_values(told), route_words(told)
     if arguments.draw is not None and told.found:
         draw_route(arguments, told)
         values["picture"] = str(arguments.draw)
@@ -91,14 +91,15 @@ def explained_route(
 ) -> RouteExplanation:
     """A route through a map file, or through what a server has."""
     from mapweave.commands.map_ends import ask
-    from mapweave.wire.explanation_messages import ExplainRequest, encode_explain_request
+    from mapweave.hybridmap.explanation import RouteExplanation
+    from mapweave.hybridmap.query import ExplainRequest
     from mapweave.wire.keys import Keys
-    from mapweave.wire.route_explanation import decode_route_explanation
+    from mapweave.wire.messages import decode, encode
 
     if arguments.map is None:
         request = ExplainRequest((start, goal), True, blocked)
-        replies = ask(arguments, Keys.any_explain, encode_explain_request(request))
-        return decode_route_explanation(replies[0].payload)
+        replies = ask(arguments, Keys.any_explain, encode(request))
+        return decode(replies[0].payload, RouteExplanation)
     from mapweave.commands.network import settings_of
     from mapweave.mapserver.map_files import merged_of
     from mapweave.mapserver.route_explaining import explain_route

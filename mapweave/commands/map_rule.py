@@ -55,11 +55,11 @@ def _login() -> str:
 
 def _tell_server(arguments: argparse.Namespace, ruling: ManualConstraint) -> None:
     from mapweave.commands.map_ends import ask
-    from mapweave.wire.explanation_messages import encode_ruling
     from mapweave.wire.keys import Keys
     from mapweave.wire.log_messages import decode_record
+    from mapweave.wire.messages import encode
 
-    for reply in ask(arguments, Keys.any_rule, encode_ruling(ruling)):
+    for reply in ask(arguments, Keys.any_rule, encode(ruling)):
         print(decode_record(reply.payload)["said"])
     _settled(arguments)
 

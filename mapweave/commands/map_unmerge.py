@@ -36,6 +36,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidValue(f"{ends[0]} twice: give two different nodes or two different maps")
     rule(arguments, ends)
     if first != second:
-        for explanation in explained_maps(arguments, (first, second)):
+        for explanation in explained_maps(arguments, (first, second)).maps:
             print(explanation.reason)
     return 0

@@ -48,12 +48,12 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.recordings.camera_file import read_camera
     from mapweave.drawing.match_picture import draw_matches
     from mapweave.hybridmap.errors import DeviceError
-    from mapweave.hybridmap.query import Certainty
-    from mapweave.mapserver.http.answer_json import answer_record
+    from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
+    from mapweave.mapserver.http.json_values import json_values
     from mapweave.storage.image_file import read_grey
     from mapweave.vision.lens import Lens
     from mapweave.vision.sift import Sift
-    from mapweave.wire.messages import decode_relocalize_answer, encode_view
+    from mapweave.wire.messages import decode, encode_view
 
     if not arguments.image.exists():
         raise DeviceError(f"{arguments.image}: no such file")
@@ -74,13 +74,13 @@ def run(arguments: argparse.Namespace) -> int:
     node: Node | None = None
     try:
         payload = _ask(bus, network, keys.any_relocalize(), encode_view(view), arguments.timeout)
-        answer = decode_relocalize_answer(payload)
+        answer = decode(payload, RelocalizeAnswer)
         if arguments.draw is not None and answer.candidates:
             node = _node(bus, keys, network, answer.candidates[0].node, arguments.timeout)
     finally:
         bus.close()
     if arguments.json:
-        print(json.dumps(answer_record(answer)))
+        print(json.dumps(json_values(answer)))
     else:
         _print(answer)
     if node is not None:
@@ -116,10 +116,11 @@ def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, pati
 def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, patience: float) -> Node:
     """A node of the merged map: the beginning of the way from itself to itself."""
     from mapweave.hybridmap.errors import NotConnected
-    from mapweave.wire.messages import RouteRequest, decode_route_answer, encode_route_request
+    from mapweave.hybridmap.query import RouteAnswer, RouteRequest
+    from mapweave.wire.messages import decode, encode
 
-    request = encode_route_request(RouteRequest(node_id, node_id))
-    way = decode_route_answer(_ask(bus, network, keys.any_route(), request, patience))
+    request = encode(RouteRequest(node_id, node_id))
+    way = decode(_ask(bus, network, keys.any_route(), request, patience), RouteAnswer)
     if not way.legs or way.legs[0].node.id != node_id:
         raise NotConnected(f"the map server did not give node {node_id}: {way.reason}")
     return way.legs[0].node

@@ -210,7 +210,7 @@ def run_serve(arguments: argparse.Namespace) -> int:
         bus = ZenohBus(BusSettings(mode="client", endpoints=network.endpoints))
         warn_without_router(bus, "the simulator")
     try:
-        run_sim(bus, network.fleet, scenario, seed, stop, arguments.held)
+        run_sim(bus, network.fleet, scenario.world(seed), scenario.robots, seed, stop, arguments.held)
     finally:
         bus.close()
     return 0

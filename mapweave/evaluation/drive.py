@@ -115,7 +115,7 @@ class DriveMap:
         self.nodes = len(merged.poses)
         self._truth = truth
         self._merger = merger
-        self._relocalizer = Relocalizer(merger.index, merger.node, merged)
+        self._relocalizer = Relocalizer(merger.places, merger.node, merged)
         self._sift = Sift(Lens(self.description.camera, self.description.distortion))
 
     def questions(self, robot: Replay) -> Iterator[Verdict]:

@@ -27,11 +27,7 @@ FRAME = "map"
 
 
 def export_g2o(part: MapPart, out: Path) -> list[Path]:
-    """The pose graph whose optimum is the map. Comments give the node of each vertex.
-
-    g2o knows no robust weights: here links pull as hard as they can, so where one strains by more than two
-    standard deviations the optimum of the file is not quite the map's.
-    """
+    """The pose graph whose optimum is the map. Comments give the node of each vertex."""
     numbers = part.numbers
     edges = [
         G2oEdge.measured(numbers[m.a], numbers[m.b], m.a_from_b.mean, m.covariance) for m in part.measurements

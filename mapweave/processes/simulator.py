@@ -1,12 +1,14 @@
-"""The simulator as a process: a scenario's world, its robots, and the bridge to the bus."""
+"""The simulator as a process: a world, its robots, and the bridge to the bus."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 
-from mapweave.scenarios.scenario import Scenario
 from mapweave.sim.bridge import SimBridge
+from mapweave.sim.robots import RobotSetup
 from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import World
 from mapweave.wire.bus import Bus
 
 PATIENCE = 60.0
@@ -14,15 +16,29 @@ PATIENCE = 60.0
 
 
 def run_sim(
-    bus: Bus, fleet: str, scenario: Scenario, seed: int, stop: threading.Event, held: bool = False
+    bus: Bus,
+    fleet: str,
+    world: World,
+    robots: Sequence[RobotSetup],
+    seed: int,
+    stop: threading.Event,
+    held: bool = False,
 ) -> None:
-    """Serve the simulated bodies of a scenario until told to stop; `held`: time passes only when asked for.
+    """Serve simulated bodies in a world until `stop` is set.
+
+    Args:
+        bus: the connection.
+        fleet: its name.
+        world: already built.
+        robots: in it.
+        seed: of everything random.
+        stop: ends it.
+        held: time passes only when somebody asks for it.
 
     Raises:
-        MapweaveError: the world cannot be built, or holds no place for so many robots.
+        MapweaveError: the world holds no place for so many robots.
     """
-    world = scenario.world(seed)
-    with Simulation(world, scenario.robots, seed) as simulation:
+    with Simulation(world, robots, seed) as simulation:
         bridge = SimBridge(simulation, bus, fleet, PATIENCE, held=held)
         try:
             names = ", ".join(simulation.robots)

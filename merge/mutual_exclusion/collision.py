@@ -18,7 +18,6 @@ class Collision:
         time: when that was, s.
         evidence: natural logarithm of the odds against the merge.
         where: the first would have seen the second, in words; empty if they would have been in one place.
-        blank: views that show nothing of what the other one has mapped there, if that was decisive.
     """
 
     first: str
@@ -29,21 +28,18 @@ class Collision:
     time: float
     evidence: float
     where: str = ""
-    blank: int = 0
 
     @property
     def reason(self) -> str:
         """In words."""
-        views = f"; {self.blank} views of theirs show nothing of what the other one mapped there"
-        views = views if self.blank else ""
         if self.where:
             return (
                 f"{self.first} would have seen {self.second} {self.nearest:.1f} m {self.where} "
                 f"at {self.time:.1f} s of clock {self.clock}; its sensors saw nothing there, "
-                f"{self.moments} such moments{views}"
+                f"{self.moments} such moments"
             )
         return (
             f"{self.first} and {self.second} would have been at the same place at the same time: "
             f"{self.nearest:.2f} m apart at {self.time:.1f} s of clock {self.clock}, "
-            f"{self.moments} such moments{views}"
+            f"{self.moments} such moments"
         )

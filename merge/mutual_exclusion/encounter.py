@@ -77,9 +77,7 @@ class Encounter:
         out: Array = np.log(np.where(counts > 0, sums / np.maximum(counts, 1), 1.0))
         return out
 
-    def refuses(
-        self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings, prior: float = 0.0
-    ) -> bool:
+    def refuses(self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings) -> bool:
         """Whether that is enough to refuse a merge.
 
         Args:
@@ -87,12 +85,11 @@ class Encounter:
             odds: as in `by_sight`.
             weights: (S,) how probable each way is in which poses may be wrong.
             s: what is enough.
-            prior: log odds against the merge by other evidence.
         """
         by_window, total = self.added(clear, odds, weights, s)
         # What was enough at any time is enough: later meetings do not make it possible.
         windows = np.cumsum(by_window > math.log(2.0))
-        return bool(((windows >= s.least_witnesses) & (total + prior >= -math.log(s.doubt))).any())
+        return bool(((windows >= s.least_witnesses) & (total >= -math.log(s.doubt))).any())
 
     def added(self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings) -> tuple[Array, Array]:
         """(W,) logarithms of the odds against the merge that each window adds to those before, and (W,) sums.

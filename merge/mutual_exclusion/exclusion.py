@@ -10,8 +10,7 @@ independent moments multiply, and under a true merge their product exceeds N wit
 1/N, however often it is tested (Ville's inequality; Grünwald et al., "Safe testing", 2024).
 
 Robots are also seen: the odds of `mapweave.merge.mutual_exclusion.mutual_visibility` are multiplied with
-these. So is the negative evidence of their cameras (`mapweave.merge.mutual_exclusion.negative_evidence`),
-where the footprints are evidence against the merge, but not enough.
+these.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.encounter import Encounter
 from mapweave.merge.mutual_exclusion.mutual_visibility import errors_in_common, none_wrong, odds_against
-from mapweave.merge.mutual_exclusion.negative_evidence import MOST, negative_evidence
 from mapweave.merge.mutual_exclusion.quadrature import SAMPLES, quadrature_points
 from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, Stay, stay
 from mapweave.merge.mutual_exclusion.visibility_intervals import visibility_intervals
@@ -56,10 +54,9 @@ def clash_of(
     met = _met(graph, first, second, s)
     if met is None:
         return None
-    # Covariances cost more than all the rest, and views more than the sensors: they are computed only if the
-    # poses as they are collide, and could be enough.
+    # Covariances cost more than all the rest: they are computed only if the poses as they are collide.
     meeting, clear, odds, still = met.meeting, met.clear, met.odds, np.ones(1)
-    if not meeting.refuses(clear, odds, still, s, math.log(MOST)):
+    if not meeting.refuses(clear, odds, still, s):
         return None
     # Nor for all observations, where the first of them are enough.
     ample = meeting.ample(clear, odds, s)
@@ -76,17 +73,7 @@ def clash_of(
             return _clash(
                 graph, (first, second), meeting, odds[0] if by_visibility > by_footprints else None, evidence
             )
-    if not part.refuses(clear, moved, errors.weights, s, math.log(MOST)):
-        return None
-    views = negative_evidence(graph, first, second)
-    absent = views.evidence()
-    if not part.refuses(clear, moved, errors.weights, s, absent):
-        return None
-    evidence = sum(part.evidence(clear, moved, errors.weights, s)) + absent
-    clash = _clash(
-        graph, (first, second), meeting, odds[0] if by_visibility > by_footprints else None, evidence
-    )
-    return replace(clash, blank=int(views.show_nothing().sum()))
+    return None
 
 
 @dataclass(frozen=True, eq=False)

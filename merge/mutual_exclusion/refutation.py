@@ -12,8 +12,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory
-from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
+from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, TrajectoryCache
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
 from mapweave.merge.pose_graph.links import Link
@@ -34,7 +33,7 @@ class Refutation:
         maps: Mapping[MapId, HybridMap],
         fragments: Sequence[Fragment],
         exclusion: ExclusionSettings,
-        memory: DecisionCache | None = None,
+        trajectories: TrajectoryCache | None = None,
     ) -> None:
         """Read the trails.
 
@@ -42,12 +41,12 @@ class Refutation:
             maps: with the nodes of all fragments.
             fragments: pieces of map.
             exclusion: when two robots clash.
-            memory: of merges before.
+            trajectories: kept from merges before.
         """
         self._by_node = fragment_by_node(fragments)
         self._exclusion = exclusion
-        memory = memory or DecisionCache()
-        trails = ((f.name, memory.trails(f, maps[f.name.map])) for f in fragments)
+        cache = trajectories or TrajectoryCache()
+        trails = ((f.name, cache.trajectories(f, maps[f.name.map])) for f in fragments)
         self._trails: dict[NodeId, tuple[BodyTrajectory, ...]] = {name: some for name, some in trails if some}
 
     def verdict(self, story: Sequence[Link]) -> str:

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.range_scans import RangeScans
+from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 NANOSECONDS = 1e9
@@ -29,7 +31,6 @@ class BodyTrajectory:
         times: (N,) s, ascending.
         radius: of the robot, m; 0 if not all nodes tell.
         looks: what its proximity sensors saw at each moment.
-        views: what its camera saw: the nodes themselves, in the order of time.
     """
 
     clock: str
@@ -38,17 +39,11 @@ class BodyTrajectory:
     times: Array
     radius: float
     looks: RangeScans
-    views: tuple[Node, ...]
 
     @property
     def agent(self) -> str:
         """Whose it is."""
         return self.nodes[0].agent
-
-    @property
-    def view_times(self) -> Array:
-        """(V,) s, ascending."""
-        return _seconds(self.views)
 
     @property
     def drifts(self) -> Array:
@@ -86,8 +81,24 @@ def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
         order = np.argsort(times, kind="stable")
         looks = RangeScans.of([node.ranges for node in known], [node.wake for node in known]).take(order)
         ids = tuple(known[k].id for k in teller[order])
-        trails.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, looks, tuple(known)))
+        trails.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, looks))
     return tuple(trails)
+
+
+class TrajectoryCache:
+    """The trajectories of fragments, read once. Fragments are never changed, only replaced."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._known: dict[NodeId, tuple[Fragment, tuple[BodyTrajectory, ...]]] = {}
+
+    def trajectories(self, fragment: Fragment, one: HybridMap) -> tuple[BodyTrajectory, ...]:
+        """See `trajectories_of`; `one` holds the fragment's nodes."""
+        known = self._known.get(fragment.name)
+        if known is None or known[0] is not fragment:
+            found = trajectories_of([one.nodes[node] for node in fragment.nodes])
+            known = self._known[fragment.name] = fragment, found
+        return known[1]
 
 
 def _seconds(nodes: Sequence[Node]) -> Array:

@@ -1,4 +1,4 @@
-"""Pieces of map and sorted groups of links become components with optimised poses."""
+"""Joins pieces of map by sorted groups of links; how far a link is from a solved graph."""
 
 from __future__ import annotations
 
@@ -64,36 +64,3 @@ def misfits(links: Sequence[Link], graph: PoseGraph, s: ConsistencySettings) -> 
     )
     back = graph.relative([link.b for link in links], [link.a for link in links])
     return (measured @ back).distances2()
-
-
-def optimise(
-    solver: ComponentSolver, links: Sequence[Link], strain: float, whole: bool = True
-) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
-    """Optimise; refuse links that strain too much, worst first.
-
-    It never cuts a piece off: a link that is all that holds two pieces together has no strain.
-
-    Args:
-        solver: of the fragments.
-        links: that join them.
-        strain: chi-square with 3 degrees of freedom above which a link is refused.
-        whole: whether large components are at last optimised as a whole.
-
-    Returns:
-        The components, the links that are kept, and those that were refused.
-    """
-    left = list(links)
-    refusals: list[RefusedLink] = []
-    # Limited pull lets the wrong ones stand out; where all are right it is not the best estimate.
-    passes = ((False, False), (True, False), (True, True)) if whole else ((True, False),)
-    while True:
-        for believed, last in passes:
-            solved = solver.solve(left, believed=believed, whole=last)
-            worst, strain2 = solver.worst()
-            if worst is not None and strain2 > strain:
-                break
-        else:
-            return solved, left, refusals
-        reason = f"strains the joined map: {strain2**0.5:.1f} standard deviations from where it ended"
-        refusals.append(refuse(worst, reason))
-        left = [link for link in left if link.key != worst.key]

@@ -1,17 +1,15 @@
 """What a merge has found out that the next one need not find out again.
 
 Everything kept here depends on nothing but what it is kept with, compared by identity: maps, fragments and
-links are never changed, only replaced. So a merge with a memory is the merge without one.
+links are never changed, only replaced. So a merge with a cache is the merge without one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, trajectories_of
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup, Verdict
 from mapweave.merge.outlier_rejection.pairwise_consistency import group_links
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
@@ -19,7 +17,6 @@ from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.settings import ConsistencySettings
 
-T = TypeVar("T")
 Key = tuple[NodeId, NodeId]
 """Names of two fragments, or two nodes, smaller first."""
 
@@ -32,11 +29,8 @@ class DecisionCache:
         self._maps: dict[MapId, tuple[HybridMap, list[Fragment]]] = {}
         self._groups: dict[Key, LinkGroup] = {}
         self._weighed: dict[Key, tuple[Link, Link]] = {}
-        self._trails: dict[NodeId, tuple[Fragment, tuple[BodyTrajectory, ...]]] = {}
 
-    def fragments(
-        self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings, strain: float
-    ) -> list[Fragment]:
+    def fragments(self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings) -> list[Fragment]:
         """See `mapweave.merge.outlier_rejection.segmentation.fragments_of`; only maps that have changed are
         cut.
         """
@@ -44,7 +38,7 @@ class DecisionCache:
         for map_id, one in maps.items():
             known = self._maps.get(map_id)
             if known is None or known[0] is not one:
-                known = self._maps[map_id] = one, fragments_of({map_id: one}, s, strain)
+                known = self._maps[map_id] = one, fragments_of({map_id: one}, s)
             found += known[1]
         return sorted(found, key=lambda fragment: fragment.name)
 
@@ -94,25 +88,6 @@ class DecisionCache:
                 known = self._groups[a, b] = LinkGroup.of(some, first, second, s, verdict)
             out[a, b] = known
         return out
-
-    def trails(self, fragment: Fragment, one: HybridMap) -> tuple[BodyTrajectory, ...]:
-        """See `trails_of`; those of a fragment are read once."""
-        known = self._trails.get(fragment.name)
-        if known is None or known[0] is not fragment:
-            found = trajectories_of([one.nodes[node] for node in fragment.nodes])
-            known = self._trails[fragment.name] = fragment, found
-        return known[1]
-
-    def forget(self, maps: set[MapId]) -> None:
-        """Drop what is known of maps that are gone."""
-        self._maps = {k: v for k, v in self._maps.items() if k not in maps}
-        self._groups = _among(self._groups, maps)
-        self._weighed = _among(self._weighed, maps)
-
-
-def _among(known: dict[Key, T], gone: set[MapId]) -> dict[Key, T]:
-    """What is known between two nodes of maps that are not gone."""
-    return {k: v for k, v in known.items() if k[0].map not in gone and k[1].map not in gone}
 
 
 def _same(one: Sequence[Link], other: Sequence[Link]) -> bool:

@@ -108,20 +108,19 @@ def standpoints(links: Sequence[Link], graph: PoseGraph, *, kept: bool) -> list[
             link,
             PoseGaussian(Pose2.from_vector(mean), nearest_covariance(covariance)),
             area,
-            graph.huber if kept else None,
+            kept,
         )
         for link, mean, covariance in zip(links, merged.means, merged.covariances, strict=True)
     ]
 
 
-def _standpoint(link: Link, merged: PoseGaussian, area: float, huber: float | None) -> Standpoint:
+def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> Standpoint:
     off = (link.a_from_b.mean.inverse() @ merged.mean).vector
     own = believable(link.a_from_b.covariance)
     strain2 = float(off @ np.linalg.solve(own, off))
     rest, moved = merged.covariance, off
-    if huber is not None:
-        # The solver let a robust link pull less where it is far off.
-        weight = np.linalg.inv(own) * min(1.0, huber / max(math.sqrt(strain2), 1e-12))
+    if kept:
+        weight = np.linalg.inv(own)
         information = np.linalg.inv(merged.covariance) - weight
         scale = np.linalg.inv(np.linalg.cholesky(weight))
         if np.linalg.eigvalsh(scale @ information @ scale.T)[0] < NO_INFORMATION:

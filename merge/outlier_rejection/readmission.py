@@ -40,7 +40,7 @@ def readmitted(
     out: list[Link] = []
     if not refused:
         return out
-    for graph in solver.solve(kept, believed=True):
+    for graph in solver.solve(kept):
         inside = [link for link in refused if link.a in graph.rows and link.b in graph.rows]
         here = [link for link in kept if link.a in graph.rows] if inside else []
         if not inside or len(inside) > FEW * (len(here) + len(inside)):
@@ -62,7 +62,7 @@ def readmitted(
 
 def _cost(solver: ComponentSolver, links: Sequence[Link]) -> float:
     """Chi-square of all measurements of the one component that links make."""
-    solver.solve(links, believed=True)
+    solver.solve(links)
     graph = solver.graph_of(links[0].a)
     assert isinstance(graph, Component)
     return graph.chi2

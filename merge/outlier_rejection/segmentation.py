@@ -3,9 +3,9 @@
 A drive or turn from one node to the next while mapping was measured all the way. A recognised place (`loop`)
 is less certain: in a warehouse the next bay looks like this one. So is a drive between two places that were
 recognised later (`driven`). So a robot's own loop closures join the pieces of its drive just as links join
-maps: sorted by consistency, then optimised, and one that strains is left out. Two things differ. A single one
-is enough, since the drive supports it. And a map is never torn apart: where a robot resumed its map
-elsewhere, loop closures alone connect the new part with the old one.
+maps: sorted by consistency. Two things differ. A single one is enough, since the drive supports it. And a map
+is never torn apart: where a robot resumed its map elsewhere, loop closures alone connect the new part with
+the old one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import networkx as nx
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
-from mapweave.merge.outlier_rejection.closing_links import join, optimise
+from mapweave.merge.outlier_rejection.closing_links import join
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS, sort_loop_closures
 from mapweave.merge.outlier_rejection.pairwise_consistency import group_links, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
@@ -31,7 +31,7 @@ WORDS = {EdgeKind.LOOP: "loop", EdgeKind.MERGED: "link", EdgeKind.DRIVEN: "drive
 
 
 def fragments_of(
-    maps: Mapping[MapId, HybridMap], consistency: ConsistencySettings | None = None, strain: float = 25.0
+    maps: Mapping[MapId, HybridMap], consistency: ConsistencySettings | None = None
 ) -> list[Fragment]:
     """Cut maps into connected pieces, each solved by itself, in the order of names.
 
@@ -39,14 +39,13 @@ def fragments_of(
         maps: by id. Edges whose ends are not both nodes of the same map are left
             out: maps are joined by links alone.
         consistency: when a robot's own loop closures are accepted.
-        strain: chi-square with 3 degrees of freedom above which one is refused after all.
     """
     s = consistency or ConsistencySettings()
-    fragments = [piece for map_id in sorted(maps) for piece in _pieces(maps[map_id], s, strain)]
+    fragments = [piece for map_id in sorted(maps) for piece in _pieces(maps[map_id], s)]
     return sorted(fragments, key=lambda fragment: fragment.name)
 
 
-def _pieces(hybrid_map: HybridMap, s: ConsistencySettings, strain: float) -> list[Fragment]:
+def _pieces(hybrid_map: HybridMap, s: ConsistencySettings) -> list[Fragment]:
     """The fragments of one map."""
     own = sorted(
         (
@@ -71,15 +70,13 @@ def _pieces(hybrid_map: HybridMap, s: ConsistencySettings, strain: float) -> lis
         refused += groups[first, second].refused
     kept, more = join(solver, groups, s)
     refused += more
-    graphs, kept, more = optimise(solver, kept, strain)
-    refused += more
     refusals += [
         replace(r, reason=f"the robot's own {WORDS[edge.kind]} {r.reason}", edge=edge.id)
         for r in refused
         for edge in claims[r.pair]
     ]
     pieces = []
-    for graph in graphs:
+    for graph in solver.solve(kept, whole=True):
         inside = [strand for strand in strands if strand.name in graph.rows]
         measurements = [m for strand in inside for m in strand.measurements]
         measurements += [Measurement(*k.pair, k.a_from_b, robust=True) for k in kept if k.a in graph.rows]

@@ -96,14 +96,13 @@ class _Tie:
 class WrongGeometrySearch:
     """Finds maps with wrong geometry. What was found out of maps and links that did not change is kept."""
 
-    def __init__(self, consistency: ConsistencySettings, strain: float) -> None:
+    def __init__(self, consistency: ConsistencySettings) -> None:
         """Nothing is known yet.
 
         Args:
             consistency: when links agree.
-            strain: see `mapweave.merge.outlier_rejection.segmentation.fragments_of`.
         """
-        self._s, self._strain = consistency, strain
+        self._s = consistency
         self._memory = DecisionCache()
         self._ties: dict[MapPair, _Tie] = {}
         self._checked: dict[tuple[MapId, tuple[MapId, ...]], bool] = {}
@@ -161,7 +160,7 @@ class WrongGeometrySearch:
 
     def _main(self, map_id: MapId, one: HybridMap) -> Fragment | None:
         """The largest piece of a map."""
-        pieces = self._memory.fragments({map_id: one}, self._s, self._strain)
+        pieces = self._memory.fragments({map_id: one}, self._s)
         return max(pieces, key=len, default=None)
 
     def _tie(self, pair: MapPair, maps: Mapping[MapId, HybridMap], links: Sequence[Link]) -> None:
@@ -193,7 +192,7 @@ class WrongGeometrySearch:
         assert placed is not None, "a map with links has nodes"
         pairs = [(a, b) for a in agreeing for b in agreeing if a < b and (a, b) in self._ties]
         held = [link for pair in pairs if self._ties[pair].agrees for link in self._ties[pair].best]
-        graph = ComponentSolver(pieces).solve(held, believed=True)[0]
+        graph = ComponentSolver(pieces).solve(held)[0]
         across = [
             link if link.a.map == one else link.turned()
             for other in agreeing

@@ -15,7 +15,7 @@ from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.factors import Factors, Measurement, Rows
 from mapweave.merge.pose_graph.optimization import ANCHOR_SIGMA, optimized
-from mapweave.merge.pose_graph.solved_graph import HUBER, PoseGraph, factorized
+from mapweave.merge.pose_graph.solved_graph import PoseGraph, factorized
 from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
 EXACT = 1000
@@ -53,7 +53,6 @@ class Component(PoseGraph):
         nodes: tuple[NodeId, ...],
         means: Array,
         factors: Factors,
-        huber: float,
         unsettled: int = 0,
     ) -> None:
         """Take a solution.
@@ -63,10 +62,9 @@ class Component(PoseGraph):
             nodes: of one connected component.
             means: (N, 3) m, m, rad.
             factors: between rows of the nodes.
-            huber: normalised residual from which a robust measurement pulled no harder.
             unsettled: measurements that have come or gone since all of it was optimised at once.
         """
-        values = {"anchor": anchor, "nodes": nodes, "means": means, "factors": factors, "huber": huber}
+        values = {"anchor": anchor, "nodes": nodes, "means": means, "factors": factors}
         for name, value in {**values, "unsettled": unsettled}.items():
             object.__setattr__(self, name, value)
 
@@ -75,7 +73,7 @@ class Component(PoseGraph):
         """(3N, 3N) sparse, of the right perturbations of all nodes, anchor held."""
         held = np.zeros((len(self.nodes), 3))
         held[self.rows[self.anchor]] = ANCHOR_SIGMA**-2
-        whole = self.factors.information(self.means, self.huber)
+        whole = self.factors.information(self.means)
         return sparse.csc_matrix(whole + sparse.diags(held.ravel()))
 
     @cached_property
@@ -130,7 +128,7 @@ class Component(PoseGraph):
         # Only differences count: one node of each piece is held.
         held = np.zeros((len(rows), 3))
         held[np.unique(piece, return_index=True)[1]] = ANCHOR_SIGMA**-2
-        information = part.information(self.means[rows], self.huber) + sparse.diags(held.ravel())
+        information = part.information(self.means[rows]) + sparse.diags(held.ravel())
         columns = (3 * order[seats][:, None] + np.arange(3)).ravel()
         right = np.zeros((3 * len(rows), len(columns)))
         right[columns, np.arange(len(columns))] = 1.0
@@ -174,16 +172,13 @@ def _pieces(part: Factors, count: int) -> Rows:
     return out
 
 
-def solve_graph(
-    anchor: NodeId, anchor_pose: Pose2, measurements: Iterable[Measurement], huber: float = HUBER
-) -> Component:
+def solve_graph(anchor: NodeId, anchor_pose: Pose2, measurements: Iterable[Measurement]) -> Component:
     """Optimise one connected component, from along a tree of the most certain measurements.
 
     Args:
         anchor: the node that is held.
         anchor_pose: where.
         measurements: what is known; those that do not connect to the anchor are left out.
-        huber: normalised residual from which a robust measurement pulls no harder; inf: plain least squares.
 
     Returns:
         The solved graph. It depends on the set of measurements, not on their order.
@@ -197,8 +192,8 @@ def solve_graph(
     factors = Factors.of(ordered, [row[m.a] for m in ordered], [row[m.b] for m in ordered])
     if len(ordered) >= len(nodes):
         # A tree is at its optimum already.
-        means = optimized(factors, means, np.arange(len(nodes)), np.array([row[anchor]]), huber)
-    return Component(anchor, nodes, means, factors, huber)
+        means = optimized(factors, means, np.arange(len(nodes)), np.array([row[anchor]]))
+    return Component(anchor, nodes, means, factors)
 
 
 def along_tree(

@@ -6,7 +6,6 @@ come or gone, only the nodes around them are moved, further out until those at t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 
 import networkx as nx
@@ -22,7 +21,7 @@ from mapweave.merge.pose_graph.factors import Factors, Rows
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.optimization import optimized
-from mapweave.merge.pose_graph.solved_graph import HUBER, PoseGraph
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.pose_arrays import compose_poses, inverse_poses
 
 WHOLE = 1000
@@ -39,16 +38,10 @@ Pair = tuple[NodeId, NodeId]
 class ComponentSolver:
     """Pieces of map, and the links between them that hold at present."""
 
-    def __init__(self, fragments: Sequence[Fragment], huber: float = HUBER) -> None:
-        """Nothing joins the pieces yet.
-
-        Args:
-            fragments: pieces of map.
-            huber: normalised residual from which a link pulls no harder, as long as it is not believed.
-        """
+    def __init__(self, fragments: Sequence[Fragment]) -> None:
+        """Nothing joins the pieces yet."""
         self.fragments = fragments
         self.by_node = fragment_by_node(fragments)
-        self._huber = huber
         self._nodes = sorted(self.by_node)
         self._row = {node: k for k, node in enumerate(self._nodes)}
         rows = [self._rows(fragment.nodes) for fragment in fragments]
@@ -63,7 +56,6 @@ class ComponentSolver:
         self._links: list[Link] = []
         self._active = np.zeros(0, np.int64)
         self._touched, self._ever = np.zeros((2, len(self._nodes)), np.bool_)
-        self._believed = self._resumed = False
         self._settled = True
 
     @property
@@ -78,7 +70,7 @@ class ComponentSolver:
         links: Sequence[Link],
         gone: Iterable[Link],
     ) -> None:
-        """Go on from an earlier solution, in which all links were believed.
+        """Go on from an earlier solution.
 
         Args:
             graphs: its components.
@@ -100,7 +92,6 @@ class ComponentSolver:
         ends = {node for a, b, _ in said[0] ^ said[1] for node in (a, b)}
         ends |= {node for link in gone for node in link.pair}
         self._touched[self._rows(node for node in ends if node in self._row)] = True
-        self._believed = self._resumed = True
         self._settled = False
 
     def _place(
@@ -129,24 +120,15 @@ class ComponentSolver:
             step = compose_poses(inverse_poses(own[near]), own[new])
             self._means[at[new]] = compose_poses(self._means[at[near]], step)
 
-    def solve(self, links: Sequence[Link], *, believed: bool = False, whole: bool = False) -> list[PoseGraph]:
+    def solve(self, links: Sequence[Link], *, whole: bool = False) -> list[PoseGraph]:
         """Each component that some links make, largest first, then by name.
 
         Args:
             links: at most one between two nodes.
-            believed: whether all of them are, and none is held back: plain least squares.
             whole: whether large components are optimised as a whole if anything of them is not settled.
         """
-        self._move_on(np.sort(self._index(links)), believed or self._resumed, whole)
+        self._move_on(np.sort(self._index(links)), whole)
         return sorted(self._graphs.values(), key=lambda graph: (-len(graph.nodes), graph.anchor))
-
-    def worst(self) -> tuple[Link | None, float]:
-        """The link that holds and strains most, and by how much: chi-square with 3 degrees of freedom."""
-        strains = self._table.take(self._active).strains(self._means)
-        if not len(strains):
-            return None, 0.0
-        worst = int(strains.argmax())
-        return self._links[self._active[worst]], float(strains[worst])
 
     def graph_of(self, node: NodeId) -> PoseGraph:
         """The component of a node, as it was solved last."""
@@ -170,10 +152,10 @@ class ComponentSolver:
             seats = [self._seats[link.key] for link in links]
         return np.array(seats, np.int64)
 
-    def _move_on(self, index: Rows, believed: bool, whole: bool) -> None:
-        """Let other links hold, or the same ones otherwise, and optimise what that changes."""
+    def _move_on(self, index: Rows, whole: bool) -> None:
+        """Let other links hold, and optimise what that changes."""
         difference = np.setxor1d(index, self._active, assume_unique=True)
-        settled = not len(difference) and believed == self._believed and self._settled
+        settled = not len(difference) and self._settled
         if settled and not (whole and any(map(_unsettled, self._graphs.values()))):
             return
         factors = Factors.together([self._own, self._table.take(index)])
@@ -183,22 +165,16 @@ class ComponentSolver:
         ties = sparse.coo_matrix((np.ones(len(factors), np.int8), (factors.a, factors.b)), (count, count))
         labels = connected_components(ties, directed=False)[1].astype(np.int64)
         self._lay_together(index)
-        huber = math.inf if believed else self._huber
-        if believed != self._believed:
-            # Only what is far off pulls otherwise now.
-            far = factors.robust & (factors.strains(self._means) > self._huber**2)
-            far[: len(self._own)] = False
-            self._touched[factors.a[far]] = self._touched[factors.b[far]] = True
         graphs: dict[int, PoseGraph] = {}
         for label, (rows, inside) in enumerate(_parts(labels, factors)):
             before = self._graphs.get(int(self._labels[rows[0]]))
             touched = self._touched[rows].any()
             if touched or not self._same(before, rows) or (whole and _unsettled(before)):
-                graphs[label] = self._solved(rows, factors.take(inside), huber, whole)
+                graphs[label] = self._solved(rows, factors.take(inside), whole)
             else:
                 assert before is not None
                 graphs[label] = before
-        self._graphs, self._labels, self._active, self._believed = graphs, labels, index, believed
+        self._graphs, self._labels, self._active = graphs, labels, index
         self._touched[:], self._settled = False, True
 
     def _same(self, graph: PoseGraph | None, rows: Rows) -> bool:
@@ -233,7 +209,7 @@ class ComponentSolver:
         self._means[some] = compose_poses(motion, self._means[some])
         self._means[row] = wanted[0]
 
-    def _solved(self, rows: Rows, factors: Factors, huber: float, whole: bool) -> Component:
+    def _solved(self, rows: Rows, factors: Factors, whole: bool) -> Component:
         """A component, its smallest node where its own map has it."""
         nodes = tuple(self._nodes[k] for k in rows.tolist())
         pose: Pose2 = self.by_node[nodes[0]].graph.pose(nodes[0])
@@ -246,11 +222,11 @@ class ComponentSolver:
         before = {int(label) for label in np.unique(self._labels[rows])}
         unsettled = len(touched) + sum(_unsettled(self._graphs.get(label)) for label in before)
         if whole or len(rows) <= WHOLE or unsettled > UNSETTLED * len(factors):
-            means, unsettled = optimized(inside, means, np.arange(len(rows)), anchor, huber), 0
+            means, unsettled = optimized(inside, means, np.arange(len(rows)), anchor), 0
         else:
-            means = _followed(inside, means, touched, anchor, huber)
+            means = _followed(inside, means, touched, anchor)
         self._means[rows] = means
-        return Component(nodes[0], nodes, means, inside, huber, unsettled)
+        return Component(nodes[0], nodes, means, inside, unsettled)
 
 
 def _unsettled(graph: PoseGraph | None) -> int:
@@ -267,11 +243,11 @@ def _parts(labels: Rows, factors: Factors) -> list[tuple[Rows, Rows]]:
     return list(zip(*parts, strict=True)) if len(labels) else []
 
 
-def _followed(factors: Factors, means: Array, touched: Rows, held: Rows, huber: float) -> Array:
+def _followed(factors: Factors, means: Array, touched: Rows, held: Rows) -> Array:
     """Optimise around some rows, further and further out until the nodes at the rim stay where they are."""
     before, rows = means, factors.around(touched, LEAST, len(means))
     while True:
-        means = optimized(factors, means, rows, held, huber)
+        means = optimized(factors, means, rows, held)
         inside = np.zeros(len(means), np.bool_)
         inside[rows] = True
         index = factors.at(rows)

@@ -30,7 +30,7 @@ class Measurement:
         a: one node.
         b: another one.
         a_from_b: pose of b in a.
-        robust: whether it may be wrong: then its pull is limited (Huber).
+        robust: whether it may be wrong: a link, or a robot's own claim.
     """
 
     a: NodeId
@@ -61,14 +61,12 @@ class Factors:
         b: (M,) row of the other.
         means: (M, 3) m, m, rad, `a_from_b`.
         weights: (M, 3, 3) information.
-        robust: (M,) whether a measurement may be wrong: then its pull is limited (Huber).
     """
 
     a: Rows
     b: Rows
     means: Array
     weights: Array
-    robust: NDArray[np.bool_]
 
     @staticmethod
     def of(measurements: Sequence[Measurement], a: Sequence[int], b: Sequence[int]) -> Factors:
@@ -80,13 +78,12 @@ class Factors:
             np.array(b, np.int64),
             np.array(means).reshape(-1, 3),
             np.asarray(np.linalg.inv(believable(covariances)), np.float64),
-            np.array([m.robust for m in measurements], np.bool_),
         )
 
     @staticmethod
     def together(parts: Sequence[Factors]) -> Factors:
         """Of all parts, which have the same rows."""
-        columns = ("a", "b", "means", "weights", "robust")
+        columns = ("a", "b", "means", "weights")
         return Factors(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
     def __len__(self) -> int:
@@ -98,7 +95,7 @@ class Factors:
         a, b = self.a[index], self.b[index]
         if row_of is not None:
             a, b = row_of[a], row_of[b]
-        return Factors(a, b, self.means[index], self.weights[index], self.robust[index])
+        return Factors(a, b, self.means[index], self.weights[index])
 
     @cached_property
     def _by_row(self) -> tuple[Rows, Rows]:
@@ -143,20 +140,17 @@ class Factors:
         out: Array = np.einsum("ni,nij,nj->n", off, self.weights, off)
         return out
 
-    def information(self, means: Array, huber: float) -> sparse.csc_matrix:
+    def information(self, means: Array) -> sparse.csc_matrix:
         """(3N, 3N) of the right perturbations of all nodes.
 
         A residual's derivative is (-Ad(b_from_a), identity), to first order in the residual.
 
         Args:
             means: (N, 3) where the nodes are.
-            huber: normalised residual from which a robust measurement pulls no harder.
         """
-        size = np.sqrt(self.strains(means))
-        pull = np.where(self.robust & (size > huber), huber / np.maximum(size, 1e-12), 1.0)
-        weights = self.weights * pull[:, None, None]
         by_a = -adjoints(compose_poses(inverse_poses(means[self.b]), means[self.a]))
         transposed = by_a.transpose(0, 2, 1)
+        weights = self.weights
         blocks = np.concatenate([transposed @ weights @ by_a, transposed @ weights, weights @ by_a, weights])
         rows = np.concatenate([self.a, self.a, self.b, self.b])
         columns = np.concatenate([self.a, self.b, self.a, self.b])

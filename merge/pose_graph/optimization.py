@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import gtsam
@@ -17,7 +16,7 @@ TOLERANCE = 1e-9
 """The solver stops when a step makes the cost smaller by less than this, absolutely or as a share of it."""
 
 
-def optimized(factors: Factors, means: Array, free: Rows, held: Rows, huber: float) -> Array:
+def optimized(factors: Factors, means: Array, free: Rows, held: Rows) -> Array:
     """Levenberg-Marquardt on some nodes; all others stay where they are.
 
     Args:
@@ -25,7 +24,6 @@ def optimized(factors: Factors, means: Array, free: Rows, held: Rows, huber: flo
         means: (N, 3) m, m, rad, where they are.
         free: rows of nodes that move.
         held: those of them that do not.
-        huber: normalised residual from which a robust measurement pulls no harder; inf: plain least squares.
 
     Returns:
         (N, 3) where they are then.
@@ -44,7 +42,7 @@ def optimized(factors: Factors, means: Array, free: Rows, held: Rows, huber: flo
         values.insert(row, gtsam.Pose2(*pose))
         if not inside[row]:
             graph.add(gtsam.PriorFactorPose2(row, gtsam.Pose2(*pose), tight))
-    add_measurements(graph, part, huber)
+    add_measurements(graph, part)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(TOLERANCE)
     parameters.setAbsoluteErrorTol(TOLERANCE)
@@ -56,20 +54,15 @@ def optimized(factors: Factors, means: Array, free: Rows, held: Rows, huber: flo
     return out
 
 
-def add_measurements(graph: Any, part: Factors, huber: float) -> None:
+def add_measurements(graph: Any, part: Factors) -> None:
     """Put measurements into a GTSAM graph; its keys are their rows.
 
     Args:
         graph: a NonlinearFactorGraph.
         part: the measurements.
-        huber: normalised residual from which a robust one pulls no harder; inf: plain least squares.
     """
-    limit = gtsam.noiseModel.mEstimator.Huber.Create(huber) if math.isfinite(huber) else None
     # W = R' R
     roots = np.linalg.cholesky(part.weights).transpose(0, 2, 1)
-    columns = part.a.tolist(), part.b.tolist(), part.means.tolist(), roots, part.robust.tolist()
-    for a, b, mean, root, robust in zip(*columns, strict=True):
-        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-        if robust and limit is not None:
-            noise = gtsam.noiseModel.Robust.Create(limit, noise)
+    for a, b, mean, root in zip(part.a.tolist(), part.b.tolist(), part.means.tolist(), roots, strict=True):
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
         graph.add(gtsam.BetweenFactorPose2(a, b, gtsam.Pose2(*mean), noise))

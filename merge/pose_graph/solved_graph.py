@@ -16,9 +16,6 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
 from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
-HUBER = 2.0
-"""Normalised residual from which a measurement that may be wrong pulls no harder."""
-
 AT_ONCE = 256
 """Nodes whose marginal covariances are solved for together: all at once would take memory by the square."""
 
@@ -35,14 +32,12 @@ class PoseGraph:
         nodes: in the order of ids.
         means: (N, 3) m, m, rad, poses of the nodes.
         information: (3N, 3N) sparse, of the right perturbations of all nodes, anchor held.
-        huber: normalised residual from which a robust measurement pulled no harder; inf: none did.
     """
 
     anchor: NodeId
     nodes: tuple[NodeId, ...]
     means: Array
     information: sparse.csc_matrix
-    huber: float = HUBER
 
     @cached_property
     def rows(self) -> dict[NodeId, int]:

@@ -278,7 +278,7 @@ def test_the_end_of_the_simulation_is_no_failure(body: Body, bus: MemoryBus) -> 
 
 def test_a_broken_answer_is_a_device_error(body: Body, bus: MemoryBus) -> None:
     body.answers = [lambda r: r.reply(b"\x80")] * 2
-    with pytest.raises(DeviceError, match="robot/r0/step: observation: v is missing"):
+    with pytest.raises(DeviceError, match="robot/r0/step: observation: Object missing required field `v`"):
         RemoteRobot(bus, "test", "r0").sense()
 
 

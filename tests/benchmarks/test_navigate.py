@@ -27,7 +27,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.floorplan import FloorPlan, Rectangle
-from mapweave.sim.ground_truth_client import RobotStatus, SimStatus
+from mapweave.sim.ground_truth_messages import RobotStatus, SimStatus
 from mapweave.sim.snapshot import Snapshot
 from synthetic.world import room, take_map
 

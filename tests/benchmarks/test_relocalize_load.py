@@ -15,7 +15,7 @@ from benchmarks.relocalize_load.benchmark import Building, Tally, figures, is_ri
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, Whereabouts
-from mapweave.wire.messages import encode_relocalize_answer
+from mapweave.wire.messages import encode
 
 
 def test_figures_by_hand() -> None:
@@ -39,13 +39,13 @@ def test_an_answer_is_right_where_it_was_taken(tmp_path: Path) -> None:
     def answer(off: Pose2) -> bytes:
         told = building.truth[node].inverse() @ (query[2] @ off)
         place = Whereabouts(node, PoseGaussian.from_sigmas(told, 0.1, 0.1), None, 0, 20, 0.9)
-        return encode_relocalize_answer(RelocalizeAnswer(Certainty.FOUND, (place,), ""))
+        return encode(RelocalizeAnswer(Certainty.FOUND, (place,), ""))
 
     assert is_right(building, query, answer(Pose2()))
     assert is_right(building, query, answer(Pose2(0.2, 0.0, 0.05)))
     assert not is_right(building, query, answer(Pose2(0.3, 0.0, 0.0)))
     assert not is_right(building, query, answer(Pose2(0.0, 0.0, 0.1)))
-    nothing = encode_relocalize_answer(RelocalizeAnswer(Certainty.UNKNOWN, (), ""))
+    nothing = encode(RelocalizeAnswer(Certainty.UNKNOWN, (), ""))
     assert not is_right(building, query, nothing)
 
 

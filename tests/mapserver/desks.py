@@ -11,18 +11,17 @@ import numpy as np
 
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import Busy
-from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.explanation import Explanation, FleetExplanation
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
+from mapweave.hybridmap.query import Certainty, ExplainRequest, RelocalizeAnswer, View, Whereabouts
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.log_messages import Scalar
 from synthetic.world import room, take_map
 
@@ -83,13 +82,13 @@ class Desk:
 def _explained(request: ExplainRequest) -> Explanation:
     merged = two_maps()
     if request.ends is None:
-        return explain_fleet(merged, 10)
+        return FleetExplanation(explain_fleet(merged, 10))
     first, second = request.ends
     if isinstance(first, NodeId) and isinstance(second, NodeId):
         if request.route:
             return explain_route(Router(merged), first, second)
         return explain_nodes(merged, first, second)
-    return (explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),)
+    return FleetExplanation((explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),))
 
 
 @cache

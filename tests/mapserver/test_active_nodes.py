@@ -100,7 +100,7 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     told(merger, views)
     merger.rule(ManualConstraints([retired, replace(retired, apart=False)]))
     assert told(merger, views) == with_it
-    alike = merger.alike.of(late[0], merger.index, merger.node, lambda a, b: None)
+    alike = merger.alike.of(late[0], merger.places, merger.node, lambda a, b: None)
     assert any(one.other.id.map == maps[2] for one in alike)
 
 
@@ -111,10 +111,10 @@ def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
     nodes, _ = take_map(two.worlds[THERE], THERE, [Pose2(2.0, 2.0, 0.1)], rng)
     late = replace(nodes[0], id=NodeId("b", 1, 99))
     two.merger.on_change(Change(THERE, 99, 0, NodePut(late)))
-    places = ActiveNodes(two.merger.index, two.merger.node, merged)
+    places = ActiveNodes(two.merger.places, two.merger.node, merged)
     assert all(node.map == HERE for node, _ in places.query(two.view(THERE), 5))
     two.merger.rule(ManualConstraints())
-    assert any(node == late.id for node, _ in two.merger.index.query(two.view(THERE), 5))
+    assert any(node == late.id for node, _ in two.merger.places.query(two.view(THERE), 5))
 
 
 def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
@@ -130,6 +130,6 @@ def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
     answers = Answers.of(two.merger, faded, two.merger.node)
     legs = answers.router.route(NodeId("a", 1, 1), NodeId("a", 1, 5)).legs
     assert [len(leg.node.landmarks) for leg in legs if leg.node.id == one] == [len(shown.landmarks)]
-    assert ActiveNodes(two.merger.index, two.merger.node, merged).node(one) is node
+    assert ActiveNodes(two.merger.places, two.merger.node, merged).node(one) is node
     anew = replace(node, landmarks=node.landmarks.take(np.arange(len(gone) - 1)))
     assert without_faded(anew, faded) is anew, "it is known better than what was found out"

@@ -12,7 +12,7 @@ from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
-from mapweave.hybridmap.query import KnownAnswer
+from mapweave.hybridmap.query import MAX_KNOWN, KnownAnswer, KnownRequest
 from mapweave.mapserver.coverage import Coverage
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.schedule import LockstepSchedule
@@ -20,7 +20,7 @@ from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import MAX_KNOWN, KnownRequest, decode_known_answer, encode_known_request
+from mapweave.wire.messages import decode, encode
 from synthetic.world import room, take_map
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
@@ -65,7 +65,7 @@ def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
         nearest = min(told, key=pose.distance)
         assert pose.distance(nearest) < 0.3
         assert abs(wrap_angle(nearest.heading - pose.heading)) < 0.2
-    assert set(answer.views[:, 3]) == {beside.camera.semi_aperture}
+    assert set(answer.views[:, 3]) == {np.float32(beside.camera.semi_aperture)}
     assert "14 of 14 views" in answer.reason
 
 
@@ -123,8 +123,8 @@ def test_the_server_answers_over_the_bus(scene: Scene, tmp_path) -> None:
     hub, keys = MemoryHub(), Keys("fleet")
     bus, asker = MemoryBus(hub), MemoryBus(hub)
     with MapServer(bus, keys, tmp_path / "s0.sqlite", "s0", schedule=LockstepSchedule()):
-        (reply,) = asker.ask(keys.any_known(), encode_known_request(KnownRequest(A, 0.0, 0.0, 9.0)), 5.0)
-        assert "map a.1 is not in the merged map" in decode_known_answer(reply.payload).reason
+        (reply,) = asker.ask(keys.any_known(), encode(KnownRequest(A, 0.0, 0.0, 9.0)), 5.0)
+        assert "map a.1 is not in the merged map" in decode(reply.payload, KnownAnswer).reason
         (reply,) = asker.ask(keys.any_known(), b"garbage", 5.0)
         assert "known request" in reply.error
     asker.close()

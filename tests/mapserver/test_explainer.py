@@ -14,10 +14,17 @@ import pytest
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.explanation import MapsExplanation, RouteExplanation, Standing
+from mapweave.hybridmap.explanation import (
+    FleetExplanation,
+    MapsExplanation,
+    PairExplanation,
+    RouteExplanation,
+    Standing,
+)
 from mapweave.hybridmap.manual_constraint import Ends, ManualConstraint
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import ExplainRequest, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.explainer import Explainer, RulingBook
 from mapweave.mapserver.log.entry import Entry
@@ -32,18 +39,10 @@ from mapweave.merge.settings import ConsistencySettings, MergeSettings
 from mapweave.storage.map_file import MapFile, pack_map_file, unpack_map_file
 from mapweave.wire.bus import Reply
 from mapweave.wire.codec import encode_change
-from mapweave.wire.explanation_messages import (
-    ExplainRequest,
-    decode_maps,
-    decode_pair,
-    encode_explain_request,
-    encode_ruling,
-)
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import RouteRequest, encode_route_request
-from mapweave.wire.route_explanation import decode_route_explanation
+from mapweave.wire.messages import decode, encode
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -95,13 +94,13 @@ class Asker:
         return reply
 
     def maps(self) -> MapsExplanation:
-        request = encode_explain_request(ExplainRequest((A, B)))
-        (told,) = decode_maps(self.ask(KEYS.explain("s0"), request).payload)
+        request = encode(ExplainRequest((A, B)))
+        (told,) = decode(self.ask(KEYS.explain("s0"), request).payload, FleetExplanation).maps
         return told
 
     def rule(self, ends: Ends, apart: bool = True) -> Reply:
         return self.ask(
-            KEYS.rule("s0"), encode_ruling(ManualConstraint(ends, apart, "anna", 10**18, "two kitchens"))
+            KEYS.rule("s0"), encode(ManualConstraint(ends, apart, "anna", 10**18, "two kitchens"))
         )
 
     def status(self) -> dict[str, object]:
@@ -148,17 +147,17 @@ def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
     with serving(path) as asker:
         content = asker.merged()
         pair = min(pair for pair in links(content) if pair[0].map != pair[1].map)
-        reply = asker.ask(KEYS.explain("s0"), encode_explain_request(ExplainRequest(pair)))
-        told = decode_pair(reply.payload)
+        reply = asker.ask(KEYS.explain("s0"), encode(ExplainRequest(pair)))
+        told = decode(reply.payload, PairExplanation)
         assert told.standing is Standing.LINKED and (told.a.id, told.b.id) == pair
         assert len(told.shared) == told.evidence["inliers"] and told.witnesses
         assert asker.maps().joined
-        everything = decode_maps(
-            asker.ask(KEYS.explain("s0"), encode_explain_request(ExplainRequest())).payload
-        )
+        everything = decode(
+            asker.ask(KEYS.explain("s0"), encode(ExplainRequest())).payload, FleetExplanation
+        ).maps
         assert everything == (asker.maps(),)
         unknown = ExplainRequest((NodeId("z", 1, 1), pair[0]))
-        reply = asker.ask(KEYS.explain("s0"), encode_explain_request(unknown))
+        reply = asker.ask(KEYS.explain("s0"), encode(unknown))
         assert "there is no map z.1; known are: a.1, b.1" in reply.error
 
 
@@ -167,12 +166,12 @@ def test_blocked_edges_are_used_in_route_explanations(path: Path) -> None:
     with serving(path) as asker:
 
         def way() -> RouteExplanation:
-            request = encode_explain_request(ExplainRequest((one, two), route=True))
-            return decode_route_explanation(asker.ask(KEYS.explain("s0"), request).payload)
+            request = encode(ExplainRequest((one, two), route=True))
+            return decode(asker.ask(KEYS.explain("s0"), request).payload, RouteExplanation)
 
         free = way()
         assert free.found and not free.gaps and [hop.b for hop in free.hops] == [two]
-        blocked = encode_route_request(RouteRequest(one, two, ((one, two),)))
+        blocked = encode(RouteRequest(one, two, ((one, two),)))
         assert not asker.ask(KEYS.route("s0"), blocked).error
         told = way()
         assert told.found and any(
@@ -280,10 +279,10 @@ def test_an_incomplete_merge_is_reported(stored: bytes, path: Path) -> None:
     for request in (*map(ExplainRequest, ((A, B), pair, None)), ExplainRequest(pair, route=True)):
         settled = False
         told = explainer.explain(request)
-        early = told[0] if isinstance(told, tuple) else told
+        early = told.maps[0] if isinstance(told, FleetExplanation) else told
         settled = True
         told = explainer.explain(request)
-        late = told[0] if isinstance(told, tuple) else told
+        late = told.maps[0] if isinstance(told, FleetExplanation) else told
         assert early.reason == f"{late.reason} (still merging: ask again)"
     explainer.close()
     desk.close()
@@ -298,8 +297,8 @@ def test_other_links_use_the_gate_of_the_merge(path: Path) -> None:
     hub = MemoryHub()
     bus, asking = MemoryBus(hub), MemoryBus(hub)
     with MapServer(bus, KEYS, path, "s0", strict, LockstepSchedule()):
-        reply = Asker(asking).ask(KEYS.explain("s0"), encode_explain_request(ExplainRequest(pair)))
-        assert not any(witness.agrees for witness in decode_pair(reply.payload).witnesses)
+        reply = Asker(asking).ask(KEYS.explain("s0"), encode(ExplainRequest(pair)))
+        assert not any(witness.agrees for witness in decode(reply.payload, PairExplanation).witnesses)
     asking.close()
     bus.close()
 

@@ -12,7 +12,7 @@ import pytest
 from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.store import Store
@@ -22,13 +22,7 @@ from mapweave.mapserver.ruling_history import with_rulings
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.pose_graph.links import refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.history_codec import (
-    KeptHistory,
-    decode_history,
-    decode_kept_history,
-    encode_history,
-    encode_kept_history,
-)
+from mapweave.wire.messages import KeptHistory, decode, encode
 from mapweave.wire.packing import pack
 from synthetic.world import room, take_map
 
@@ -215,12 +209,22 @@ def test_constraints_are_listed_in_the_history() -> None:
 
 def test_it_comes_through_bytes() -> None:
     happenings = (MapEvent(5, MapEventKind.PARTED, "a and b"), MapEvent(6, MapEventKind.FAILED, "no"))
-    assert decode_history(encode_history(happenings)) == happenings
+    assert decode(encode(History(happenings)), History).history == happenings
     kept = KeptHistory(happenings, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
-    assert decode_kept_history(encode_kept_history(kept)) == kept
+    assert decode(encode(kept), KeptHistory) == kept
     with pytest.raises(InvalidValue, match="printable"):
-        encode_history([MapEvent(5, MapEventKind.PARTED, "two\nlines")])
-    assert decode_history(pack({"h": [[1, "danced", "x"], [6, "failed", "no"]]})) == happenings[1:]
-    for fields in ({"h": [[1, "joined"]]}, {"h": [[1, 2, "x"]]}, {"h": 5}, {}):
+        encode(History((MapEvent(5, MapEventKind.PARTED, "two\nlines"),)))
+    newer = [
+        {"stamp_ns": 1, "kind": "danced", "words": "x"},
+        {"stamp_ns": 6, "kind": "failed", "words": "no"},
+    ]
+    assert decode(pack({"history": newer}), History).history == happenings[1:]
+    wrong: list[object] = [
+        [{"stamp_ns": 1, "kind": "joined"}],
+        [{**newer[1], "kind": 2}],
+        5,
+        [[1, "joined", "x"]],
+    ]
+    for fields in ({}, *({"history": one} for one in wrong)):
         with pytest.raises(InvalidMessage):
-            decode_history(pack(fields))
+            decode(pack(fields), History)

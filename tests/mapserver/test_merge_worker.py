@@ -14,11 +14,10 @@ from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, Node
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import Certainty
+from mapweave.hybridmap.query import NO_COMPONENT, Certainty
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.relocalization.verdict import NOWHERE
-from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.world import World, room, take_map, take_view
@@ -122,7 +121,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
     answer = upkeep.answers.relocalizer.answer(view)
     assert time.monotonic() - began < 1.0 and answer.certainty is Certainty.FOUND
     best = answer.candidates[0]
-    assert best.component == NOWHERE and best.merged_from_robot is None
+    assert best.component == NO_COMPONENT and best.merged_from_robot is None
     go.set()
     assert upkeep.settle(20)
     merged = upkeep.answers.relocalizer.answer(view).candidates[0]
@@ -139,7 +138,7 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
         assert go.wait(20)
         real(merger, most)
 
-    monkeypatch.setattr(Merger, "look_around", held)
+    monkeypatch.setattr(Merger, "search_pairs", held)
     upkeep = MergeWorker(LiveSchedule(), 1.0)
     upkeep.start()
     upkeep.read(iter(changes))
@@ -158,23 +157,23 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
 
 def test_in_lockstep_all_changes_are_merged_before_an_answer() -> None:
     _, _, changes = mapped_room(("a",))
-    index, schedule = PlaceIndex(), LockstepSchedule()
-    upkeep = MergeWorker(schedule, 1.0, index=index)
+    places, schedule = PlaceDatabase(), LockstepSchedule()
+    upkeep = MergeWorker(schedule, 1.0, places=places)
     upkeep.start()
     for change in changes:
         upkeep.take(replace(change, stamp_ns=change.sequence))
     assert len(upkeep.answers.merged.poses) == 0
-    assert len(upkeep.current().merged.poses) == len(index) == 4 and upkeep.settled
+    assert len(upkeep.current().merged.poses) == len(places) == 4 and upkeep.settled
     assert schedule.time_ns() == len(changes)
     upkeep.close()
 
 
-def test_an_index_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
-    """The owner of the index saves it: a server's first start must leave a saved index, too."""
+def test_a_database_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
+    """The owner of the database saves it: a server's first start must leave a saved index, too."""
     _, _, changes = mapped_room(("a",))
-    index = PlaceIndex()
-    upkeep = MergeWorker(LiveSchedule(), 1.0, index=index)
+    places = PlaceDatabase()
+    upkeep = MergeWorker(LiveSchedule(), 1.0, places=places)
     upkeep.start()
     upkeep.read(iter(changes))
-    assert len(index) == 4
+    assert len(places) == 4
     upkeep.close()

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.query import RouteAnswer, RouteRequest
 from mapweave.mapserver import packed_map
 from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import unpack_map_file
@@ -17,7 +18,7 @@ from mapweave.wire.bus import Reply
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import RouteRequest, decode_route_answer, encode_route_request
+from mapweave.wire.messages import decode, encode
 from tests.waiting import eventually
 
 KEYS = Keys("fleet")
@@ -69,8 +70,8 @@ def test_everything_else_is_answered_while_the_map_is_packed(served: Served) -> 
         eventually(lambda: served.packs == 1)
         begin = time.monotonic()
         assert decode_record(served.ask(KEYS.server_status("s0")).payload)["nodes"] == len(served.nodes)
-        route = encode_route_request(RouteRequest(served.nodes[0], served.nodes[-1]))
-        assert decode_route_answer(served.ask(KEYS.route("s0"), route).payload).legs
+        route = encode(RouteRequest(served.nodes[0], served.nodes[-1]))
+        assert decode(served.ask(KEYS.route("s0"), route).payload, RouteAnswer).legs
         assert time.monotonic() < begin + 10.0 and not asked.done()
         served.go_on.set()
         assert unpack_map_file(asked.result(30).payload).kind == "merged"

@@ -16,14 +16,14 @@ from mapweave.hybridmap.explanation import RouteExplanation
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import ExplainRequest
 from mapweave.hybridmap.reachability import RECOGNISED, reachability_of
-from mapweave.mapserver.http.explanation_json import route_values
+from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import NEAR, WARY_COST, Router
-from mapweave.wire.explanation_messages import ExplainRequest, decode_explain_request, encode_explain_request
+from mapweave.wire.messages import decode, encode
 from mapweave.wire.packing import pack
-from mapweave.wire.route_explanation import decode_route_explanation, encode_route_explanation
 from synthetic.world import Sensing, room, take_map
 
 ME, OTHER, FAR = MapId("a", 1), MapId("b", 1), MapId("c", 1)
@@ -129,12 +129,12 @@ def test_recently_blocked_edges_are_reported(router: Router) -> None:
 def test_unconnected_maps_are_explained_instead_of_a_route(router: Router, sent: bool) -> None:
     told = explain_route(router, nodes_of(ME)[0], nodes_of(FAR)[0])
     if sent:
-        told = decode_route_explanation(encode_route_explanation(told))
+        told = decode(encode(told), RouteExplanation)
     assert not told.found and "in parts of the map that nothing joins yet" in told.reason
     assert told.apart is not None and not told.apart.joined
     assert told.apart.second == FAR and "are not one map" in told.apart.reason
     assert any("are not one map" in line for line in route_words(told))
-    assert route_values(told)["apart"]["second"] == "c.1"
+    assert json_values(told)["apart"]["second"] == "c.1"
 
 
 def test_pieces_of_one_map_are_not_joined_as_maps() -> None:
@@ -185,13 +185,13 @@ def test_unknown_ids_are_refused_with_the_known_range(router: Router) -> None:
 def test_questions_and_answers_come_through_the_wire(router: Router) -> None:
     one, two, three = nodes_of(ME)
     request = ExplainRequest((one, three), True, ((one, two), (two, three)))
-    assert decode_explain_request(encode_explain_request(request)) == request
+    assert decode(encode(request), ExplainRequest) == request
     told = explain_route(router, one, three, blocked=[(one, two)])
-    again = decode_route_explanation(encode_route_explanation(told))
+    again = decode(encode(told), RouteExplanation)
     assert isinstance(again, RouteExplanation) and again == told
     with pytest.raises(InvalidValue, match="from node to node"):
         ExplainRequest((ME, OTHER), True)
     with pytest.raises(InvalidMessage, match="from node to node"):
-        decode_explain_request(pack({"e": [list(ME), list(OTHER)], "w": 1}))
+        decode(pack({"e": [list(ME), list(OTHER)], "w": 1}), ExplainRequest)
     with pytest.raises(InvalidMessage):
-        decode_route_explanation(pack({"a": list(one), "b": list(two), "f": 1, "r": "", "h": [[1]], "g": []}))
+        decode(pack({"a": list(one), "b": list(two), "f": 1, "r": "", "h": [[1]], "g": []}), RouteExplanation)

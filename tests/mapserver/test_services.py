@@ -13,7 +13,14 @@ import pytest
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
+from mapweave.hybridmap.query import (
+    Certainty,
+    KnownRequest,
+    RelocalizeAnswer,
+    RouteAnswer,
+    RouteRequest,
+    View,
+)
 from mapweave.mapserver.admission_control import AdmissionSettings
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
@@ -25,15 +32,7 @@ from mapweave.wire.bus import Reply
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import (
-    KnownRequest,
-    RouteRequest,
-    decode_relocalize_answer,
-    decode_route_answer,
-    encode_known_request,
-    encode_route_request,
-    encode_view,
-)
+from mapweave.wire.messages import decode, encode, encode_view
 from synthetic.world import take_node
 
 KEYS = Keys("fleet")
@@ -68,12 +67,10 @@ class Served:
 
     def quick_ones(self) -> None:
         """Everything but where a view was taken, with its answer looked at."""
-        request = encode_route_request(RouteRequest(self.nodes[0], self.nodes[-1]))
+        request = encode(RouteRequest(self.nodes[0], self.nodes[-1]))
         (route,) = self.asker.ask(KEYS.route("s0"), request, 5.0)
-        assert decode_route_answer(route.payload).legs
-        (known,) = self.asker.ask(
-            KEYS.known("s0"), encode_known_request(KnownRequest(self.nodes[0].map, 0, 0, 9)), 5.0
-        )
+        assert decode(route.payload, RouteAnswer).legs
+        (known,) = self.asker.ask(KEYS.known("s0"), encode(KnownRequest(self.nodes[0].map, 0, 0, 9)), 5.0)
         assert not known.error
         (status,) = self.asker.ask(KEYS.server_status("s0"), b"", 5.0)
         assert decode_record(status.payload)["nodes"] == len(self.nodes)
@@ -123,7 +120,7 @@ def test_slow_questions_block_no_other_and_excess_is_refused(
         assert 0.0 < reply.retry_after < 1.0
     for reply in replies:
         if not reply.error:
-            assert decode_relocalize_answer(reply.payload).certainty is Certainty.FOUND
+            assert decode(reply.payload, RelocalizeAnswer).certainty is Certainty.FOUND
     assert served.server.status()["answered"] == 6
 
 
@@ -133,7 +130,7 @@ def test_a_long_merge_holds_up_no_question(served: Served, monkeypatch: pytest.M
     settling = threading.Thread(target=served.server.settle, args=(20.0,))
     settling.start()
     assert gate.entered.acquire(timeout=30)
-    assert decode_relocalize_answer(served.where().payload).certainty is Certainty.FOUND
+    assert decode(served.where().payload, RelocalizeAnswer).certainty is Certainty.FOUND
     served.quick_ones()
     assert settling.is_alive()
     gate.open.set()
@@ -148,7 +145,7 @@ def test_every_node_is_found_by_many_at_once(served: Served) -> None:
         together = [reply.payload for reply in askers.map(lambda q: served.where(*q), questions)]
     assert together == alone
     for (node, _), payload in zip(questions, alone, strict=True):
-        answer = decode_relocalize_answer(payload)
+        answer = decode(payload, RelocalizeAnswer)
         assert answer.certainty is Certainty.FOUND
         best = answer.candidates[0]
         true = served.room.truth[best.node].inverse() @ served.room.truth[node]

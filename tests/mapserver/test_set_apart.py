@@ -34,11 +34,10 @@ from mapweave.merge.outlier_rejection import decision_cache
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Reply, Request
 from mapweave.wire.codec import decode_change, encode_body, encode_change, wrap_body
-from mapweave.wire.explanation_messages import encode_ruling
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import decode_relocalize_answer, encode_view
+from mapweave.wire.messages import decode, encode, encode_view
 from synthetic.world import World, room, take_map, take_view
 from tests.mapserver.contents import content
 from tests.waiting import eventually
@@ -137,7 +136,7 @@ class Fleet:
     def where(self) -> list[RelocalizeAnswer]:
         """Answers to lost robots."""
         replies = [self.ask(KEYS.relocalize("s0"), encode_view(view)) for view in views()]
-        return [decode_relocalize_answer(reply.payload) for reply in replies]
+        return [decode(reply.payload, RelocalizeAnswer) for reply in replies]
 
     def tell(self, map_id: MapId, log: list[bytes]) -> None:
         """Have the server pull a log, and wait until it has."""
@@ -234,16 +233,14 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
         # It was said before.
         assert [one.words for one in fleet.server.history()].count(words) == 1
         retire = ManualConstraint((BAD, BAD), True, "anna", 10**18, "it is mad")
-        reply = fleet.ask(KEYS.rule("s0"), encode_ruling(retire))
+        reply = fleet.ask(KEYS.rule("s0"), encode(retire))
         assert not reply.error
         assert fleet.server.settle(30)
         status = fleet.status()
         assert (status["set_apart"], status["links"], status["rulings"]) == (0, links, 1)
         assert status["event"] == "map bad.1 is no longer set apart"
         assert told(fleet.where()) == places
-        never = fleet.ask(
-            KEYS.rule("s0"), encode_ruling(ManualConstraint((MapId("x", 9),) * 2, True, "anna", 1))
-        )
+        never = fleet.ask(KEYS.rule("s0"), encode(ManualConstraint((MapId("x", 9),) * 2, True, "anna", 1)))
         assert "there is no map x.9" in never.error
 
 
@@ -261,9 +258,7 @@ def test_a_map_can_be_retired_when_nothing_can_be_merged(
         patch.setattr(Merger, "apart", fails)
         with serving(path) as fleet:
             assert not fleet.status()["nodes"]
-            reply = fleet.ask(
-                KEYS.rule("s0"), encode_ruling(ManualConstraint((BAD, BAD), True, "anna", 10**18))
-            )
+            reply = fleet.ask(KEYS.rule("s0"), encode(ManualConstraint((BAD, BAD), True, "anna", 10**18)))
             assert not reply.error, reply.error
     with serving(path) as fleet:
         assert fleet.status()["rulings"] == 1

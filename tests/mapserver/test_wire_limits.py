@@ -14,12 +14,7 @@ from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, R
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.wire_limits import Pairs, drivable, said
-from mapweave.wire.messages import (
-    decode_relocalize_answer,
-    encode_known_answer,
-    encode_relocalize_answer,
-    encode_route_answer,
-)
+from mapweave.wire.messages import decode, encode
 from synthetic.world import take_map
 from tests.mapserver.test_active_nodes import HERE, Two
 
@@ -50,7 +45,7 @@ def test_values_out_of_range_are_left_out(
 ) -> None:
     candidates = tuple(place(k, *poses) for k, poses in enumerate(places, start=1))
     answer = said(RelocalizeAnswer(certainty, candidates, "words"))
-    back = decode_relocalize_answer(encode_relocalize_answer(answer))
+    back = decode(encode(answer), RelocalizeAnswer)
     assert (back.certainty, [one.node.number for one in back.candidates]) == left
     assert all((one.merged_from_robot is None) == (one.component < 0) for one in back.candidates)
 
@@ -68,7 +63,7 @@ def test_a_node_where_no_robot_can_be_is_no_second_place() -> None:
         two.merger.on_change(Change(C, number, 0, body))
     answer = two.answers().relocalizer.answer(two.view(HERE))
     assert answer.certainty is Certainty.FOUND and answer.candidates[0].node.map == HERE
-    encode_relocalize_answer(said(answer))
+    encode(said(answer))
 
 
 def test_a_view_without_a_heading_is_not_published() -> None:
@@ -88,7 +83,7 @@ def test_a_view_without_a_heading_is_not_published() -> None:
     merged = merger.merged()
     assert merged.joined(HERE, C)
     told = Answers.of(merger, merged, merger.node).known.answer(HERE, (0.0, 0.0), 50.0)
-    encode_known_answer(told)
+    encode(told)
     assert len(told.views) == 3
 
 
@@ -110,7 +105,7 @@ def test_a_route_goes_around_legs_that_no_robot_drives() -> None:
         return RouteAnswer(tuple(legs), "words")
 
     answer = drivable(route, [(goal, start)])
-    assert [leg.node.id for leg in answer.legs] == [start, goal] and encode_route_answer(answer)
+    assert [leg.node.id for leg in answer.legs] == [start, goal] and encode(answer)
     assert asked == [((goal, start),), ((goal, start), (middle, goal))]
     never = drivable(lambda blocked: route(()), ())
-    assert not never.legs and "no robot drives" in never.reason and encode_route_answer(never)
+    assert not never.legs and "no robot drives" in never.reason and encode(never)

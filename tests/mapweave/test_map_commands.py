@@ -96,7 +96,7 @@ def test_how_maps_are_merged_can_be_chosen(files: list[Path], said: Said, tmp_pa
     path.write_text("[merge.consistency]\nleast_links = 1000\noverwhelming_inliers = 1000\n")
     told = said("map", "merge", *files[:3], "-o", out, "--json", "--settings", path)
     assert json.loads(told)["links"] == 0
-    path.write_text("[merge]\nstrain = 'least squares'\n")
+    path.write_text("[merge.consistency]\ngate = 'much'\n")
     assert main(["map", "merge", *map(str, files[:3]), "-o", str(out), "--settings", str(path)]) == 1
 
 

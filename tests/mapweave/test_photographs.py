@@ -10,17 +10,21 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.cli import main
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty
+from mapweave.offline_relocalization import relocalizer_of, view_of
 from mapweave.photographs import SCALE_SHARE, map_of_photographs
 from mapweave.sim.camera import CAMERAS
 from mapweave.sim.photographer import walk
 from mapweave.sim.worlds.catalog import world_from_table
-from mapweave.storage.map_file import read_map_file
+from mapweave.storage.image_file import read_grey
+from mapweave.storage.map_file import MapFile, read_map_file
 from mapweave.wire.codec import encode_body
 from tests.mapweave.command_line import complaint
 
@@ -69,6 +73,19 @@ def test_nodes_are_where_the_photographs_were_taken_up_to_scale(stretch) -> None
         # The same points look alike in both.
         assert np.median(np.abs(a.codes[edge.shared[:, 0]].astype(int) - b.codes[edge.shared[:, 1]])) < 12
         assert edge.a_from_b.covariance[0, 0] > (0.8 * SCALE_SHARE * edge.a_from_b.mean.x) ** 2
+
+
+def test_a_map_file_says_where_a_photograph_was_taken(stretch) -> None:
+    folder, _ = stretch
+    images = [folder / f"{number}.png" for number in range(COUNT)]
+    camera, distortion = read_camera(folder / "camera.toml")
+    changes = map_of_photographs(images, camera, distortion, SPACING, MapId("hall", 1))
+    relocalizer = relocalizer_of(MapFile("agent", "hall", tuple(changes)))
+    view = view_of(read_grey(images[3]), camera, distortion)
+    answer = relocalizer.answer(view)
+    # Nobody has measured the scale.
+    assert answer.certainty is Certainty.PLACE, answer.reason
+    assert answer.candidates[0].node.number == 4
 
 
 def test_the_command_writes_a_map_file(stretch, tmp_path: Path, capfd) -> None:

@@ -106,7 +106,7 @@ def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Pat
     answer = json.loads(capfd.readouterr().out)
     assert answer["certainty"] == "found"
     (place,) = answer["candidates"]
-    assert place["node_from_robot"] == pytest.approx([MOVED.x, MOVED.y, MOVED.heading], abs=0.03)
+    assert place["node_from_robot"]["mean"] == pytest.approx([MOVED.x, MOVED.y, MOVED.heading], abs=0.03)
     image = cv2.imread(str(drawn))
     assert image.shape[1] > 2 * 320
     # Lines are smoothed.

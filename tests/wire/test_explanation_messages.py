@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from typing import Any
 
 import msgpack
@@ -11,33 +12,35 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.explanation import (
+    FleetExplanation,
+    Hop,
     MapsExplanation,
     Misfit,
     NearMiss,
     PairExplanation,
+    RouteExplanation,
     Standing,
     Witness,
 )
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.wire.explanation_messages import (
-    ExplainRequest,
-    decode_explain_request,
-    decode_maps,
-    decode_pair,
-    decode_ruling,
-    encode_explain_request,
-    encode_maps,
-    encode_pair,
-    encode_ruling,
-)
+from mapweave.hybridmap.query import ExplainRequest
+from mapweave.wire.codec import encode_body
+from mapweave.wire.messages import decode, encode
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 2)
 NODE_A, NODE_B = NodeId("a", 1, 3), NodeId("b", 2, 5)
+
+
+MISFIT = {
+    "merged_a_from_b": struct.pack("<9f", 0, 0, 0, 1, 0, 0, 1, 0, 1), "off": ["f8", [3], bytes(24)],
+    "strain2": 4.5, "alone": True,
+}  # fmt: skip
 
 
 def nodes() -> tuple[Node, Node]:
@@ -58,7 +61,7 @@ def explanation() -> PairExplanation:
 
 
 def test_two_nodes_come_back() -> None:
-    told, back = explanation(), decode_pair(encode_pair(explanation()))
+    told, back = explanation(), decode(encode(explanation()), PairExplanation)
     assert (back.a.id, back.b.id, back.standing, back.reason) == (
         told.a.id,
         told.b.id,
@@ -72,14 +75,14 @@ def test_two_nodes_come_back() -> None:
     assert back.misfit is not None and np.allclose(back.misfit.off, [0.1, 0.2, -0.3])
     assert (back.misfit.strain2, back.misfit.alone) == (4.5, False)
     assert (back.claims, back.rulings) == (told.claims, told.rulings)
-    assert np.array_equal(back.a.landmarks.pixels, decode_pair(encode_pair(back)).a.landmarks.pixels)
+    assert np.array_equal(back.a.landmarks.pixels, decode(encode(back), PairExplanation).a.landmarks.pixels)
 
 
 def test_nothing_but_words_comes_back_too() -> None:
     a, b = nodes()
     nothing = np.zeros((0, 2), np.int64)
-    back = decode_pair(
-        encode_pair(PairExplanation(a, b, Standing.REFUSED, "no", nothing, nothing, np.zeros(0)))
+    back = decode(
+        encode(PairExplanation(a, b, Standing.REFUSED, "no", nothing, nothing, np.zeros(0))), PairExplanation
     )
     assert back.a_from_b is None and back.misfit is None and back.probability is None and not back.witnesses
 
@@ -89,6 +92,7 @@ words = st.text(st.characters(codec="utf-8", categories=["L", "N", "P", "Zs"]), 
     str.isprintable
 )
 counts = st.integers(0, 2**40)
+amounts = st.floats(0, 1e9)
 rulings = st.builds(
     ManualConstraint,
     st.tuples(ids, ids).filter(lambda e: e[0] != e[1])
@@ -102,49 +106,78 @@ maps = st.builds(
 )  # fmt: skip
 
 
-@given(st.lists(maps, max_size=4).map(tuple))
-def test_maps_come_back(told: tuple[MapsExplanation, ...]) -> None:
-    assert decode_maps(encode_maps(told)) == told
+hops = st.builds(
+    Hop, ids, ids, st.sampled_from(["driven", "near"]), amounts, st.floats(-6, 6), amounts, words
+)
+routes = st.builds(
+    RouteExplanation, ids, ids, st.booleans(), words, st.lists(hops, max_size=3).map(tuple),
+    st.lists(hops, max_size=3).map(tuple), st.none() | maps,
+)  # fmt: skip
+
+
+@given(routes)
+def test_routes_come_back(told: RouteExplanation) -> None:
+    assert decode(encode(told), RouteExplanation) == told
+
+
+@given(st.lists(maps, max_size=4).map(lambda some: FleetExplanation(tuple(some))))
+def test_maps_come_back(told: FleetExplanation) -> None:
+    assert decode(encode(told), FleetExplanation) == told
 
 
 @given(rulings)
 def test_constraints_and_questions_round_trip(ruling: ManualConstraint) -> None:
-    assert decode_ruling(encode_ruling(ruling)) == ruling
+    assert decode(encode(ruling), ManualConstraint) == ruling
     request = ExplainRequest(ruling.ends)
-    assert decode_explain_request(encode_explain_request(request)) == request
-    assert decode_explain_request(encode_explain_request(ExplainRequest())).ends is None
+    assert decode(encode(request), ExplainRequest) == request
+    assert decode(encode(ExplainRequest()), ExplainRequest).ends is None
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("y", "perhaps"), ("m", b"123"), ("h", b"\xff\xff\x00\x00"), ("u", []), ("u", [-1.0]), ("q", 1.5),
-        ("f", [b"", [0, 0, 0], 1.0, True]), ("f", [1, 2]), ("w", [[1]]), ("g", [[1, 2]]), ("r", "two\nlines"),
-        ("a", b"no node"), ("c", [7]),
+        ("standing", "perhaps"), ("matches", ["i8", [3], b"123"]), ("matches", b"123"),
+        ("matches", ["i8", [1, 2], bytes(15)]), ("matches", ["i8", [1, 2], b"\xff" * 16]),
+        ("matches", ["i8", [1, 2], bytes(8) + b"\0\x10" + bytes(6)]), ("matches", ["O", [1], bytes(8)]),
+        ("matches", ["i8", [1, 1], bytes(8)]), ("matches", ["i8", [-1, -2], bytes(16)]),
+        ("matches", ["i8", [2**62, 2**62, 0], b""]), ("shared", ["f8", [1, 2], bytes(16)]),
+        ("residuals_px", ["f8", [0], b""]), ("residuals_px", ["f8", [1], struct.pack("<d", -1.0)]),
+        ("probability", 1.5), ("misfit", [1, 2]), ("misfit", {**MISFIT, "merged_a_from_b": b""}),
+        ("misfit", {**MISFIT, "off": ["f8", [2], bytes(16)]}), ("misfit", {**MISFIT, "alone": 1}),
+        ("misfit", {**MISFIT, "off": ["f8", [3], struct.pack("<3d", 0.0, math.nan, 0.0)]}),
+        ("misfit", {**MISFIT, "strain2": -1.0}), ("witnesses", [[1]]), ("witnesses", [{"a": ["a", 1, 2]}]),
+        ("rulings", [[1, 2]]), ("reason", "two\nlines"), ("evidence", {"inliers": "many"}),
+        ("a", b"no node"), ("a", encode_body(NodeRetired(NODE_A))), ("claims", [7]),
     ],
 )  # fmt: skip
 def test_a_damaged_explanation_is_refused_in_one_line(field: str, value: Any) -> None:
-    fields = msgpack.unpackb(encode_pair(explanation()))
+    fields = msgpack.unpackb(encode(explanation()))
     with pytest.raises(InvalidMessage) as refused:
-        decode_pair(msgpack.packb({**fields, field: value}))
+        decode(msgpack.packb({**fields, field: value}), PairExplanation)
     assert len(str(refused.value).splitlines()) == 1
+    assert decode(msgpack.packb({**fields, "misfit": MISFIT}), PairExplanation).misfit is not None
+
+
+def ruled(*ends: list[Any]) -> bytes:
+    rest = {"apart": True, "who": "x", "stamp_ns": 0, "because": ""}
+    return msgpack.packb({"v": 1, "ends": list(ends), **rest})
 
 
 @pytest.mark.parametrize(
-    "value", [[["a", 1, 2], ["a", 1, 2], True, "x", 0, ""], [["a", 1], ["b", 1, 2], True, "x", 0, ""]]
+    "ends",
+    [[["a", 1, 2], ["a", 1, 2]], [["a", 1], ["b", 1, 2]], [["a", 1]], [["a", 1, 2, 3]] * 2],
 )
-def test_a_constraint_without_effect_is_refused(value: list[Any]) -> None:
+def test_a_constraint_without_effect_is_refused(ends: list[Any]) -> None:
     with pytest.raises(InvalidMessage):
-        decode_ruling(msgpack.packb({"v": 1, "r": value}))
+        decode(ruled(*ends), ManualConstraint)
 
 
 def test_a_constraint_on_one_map_retires_it() -> None:
-    ruling = decode_ruling(msgpack.packb({"v": 1, "r": [["a", 1], ["a", 1], True, "x", 0, ""]}))
-    assert ruling.retires == MapId("a", 1)
+    assert decode(ruled(["a", 1], ["a", 1]), ManualConstraint).retires == MapId("a", 1)
 
 
 def test_undecodable_values_are_not_encoded() -> None:
     with pytest.raises(InvalidValue):
-        encode_pair(
+        encode(
             PairExplanation(*nodes(), Standing.LINKED, "x" * 5000, *[np.zeros((0, 2), int)] * 2, np.zeros(0))
         )

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
+    FleetExplanation,
     MapsExplanation,
     Misfit,
     NearMiss,
@@ -29,26 +30,19 @@ from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
     Certainty,
+    ExplainRequest,
     KnownAnswer,
+    KnownRequest,
     RelocalizeAnswer,
     RouteAnswer,
     RouteLeg,
+    RouteRequest,
     View,
     Whereabouts,
 )
 from mapweave.storage.map_file import MapFile, pack_map_file, unpack_map_file
+from mapweave.wire import messages
 from mapweave.wire.codec import decode_body, decode_change, encode_body, encode_change
-from mapweave.wire.explanation_messages import (
-    ExplainRequest,
-    decode_explain_request,
-    decode_maps,
-    decode_pair,
-    decode_ruling,
-    encode_explain_request,
-    encode_maps,
-    encode_pair,
-    encode_ruling,
-)
 from mapweave.wire.log_messages import (
     Ack,
     Head,
@@ -59,29 +53,14 @@ from mapweave.wire.log_messages import (
     decode_record,
     encode_record,
 )
-from mapweave.wire.messages import (
-    KnownRequest,
-    RouteRequest,
-    decode_known_answer,
-    decode_known_request,
-    decode_relocalize_answer,
-    decode_route_answer,
-    decode_route_request,
-    decode_view,
-    encode_known_answer,
-    encode_known_request,
-    encode_relocalize_answer,
-    encode_route_answer,
-    encode_route_request,
-    encode_view,
-)
+from mapweave.wire.messages import decode_view, encode, encode_view
 from mapweave.wire.packing import _exceeds
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 
 Decoder = Callable[[bytes], object]
 
 
-def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
+def one_of_each(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
     """One good message for each decoder."""
     changes = [(decode_change, encode_change(change)) for change in some.changes()]
     here = PoseGaussian.from_sigmas(Pose2(0.1, 0.2, 0.3), 0.1, 0.1)
@@ -101,12 +80,12 @@ def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
         (LogAnswer.decode, LogAnswer(5, 3, 6, ((3, b"abc"), (5, b""))).encode()),
         (decode_record, encode_record({"a": 1, "b": 0.5, "c": "text", "d": True})),
         (decode_view, encode_view(view)),
-        (decode_relocalize_answer,
-         encode_relocalize_answer(RelocalizeAnswer(Certainty.AMBIGUOUS, places, "why"))),
-        (decode_route_request, encode_route_request(request)),
-        (decode_route_answer, encode_route_answer(RouteAnswer(legs, "why"))),
-        (decode_known_request, encode_known_request(KnownRequest(some.map, 1.5, -2.5, 9.0))),
-        (decode_known_answer, encode_known_answer(KnownAnswer(np.ones((2, 4)), "why"))),
+        (partial(messages.decode, kind=RelocalizeAnswer),
+         encode(RelocalizeAnswer(Certainty.AMBIGUOUS, places, "why"))),
+        (partial(messages.decode, kind=RouteRequest), encode(request)),
+        (partial(messages.decode, kind=RouteAnswer), encode(RouteAnswer(legs, "why"))),
+        (partial(messages.decode, kind=KnownRequest), encode(KnownRequest(some.map, 1.5, -2.5, 9.0))),
+        (partial(messages.decode, kind=KnownAnswer), encode(KnownAnswer(np.ones((2, 4)), "why"))),
         (unpack_map_file, pack_map_file(MapFile("merged", "t", (NodePut(node),), {node.id: (0, here)}))),
         *explanations(some, node, here),
     ]  # fmt: skip
@@ -133,10 +112,10 @@ def explanations(some: SimpleNamespace, a: Node, pose: PoseGaussian) -> list[tup
     near = NearMiss(a.id, b.id, 5, 3, "too few")
     maps = MapsExplanation(one, two, False, "why", 0, 0, 3, 4, (near,), (ruling,))
     return [
-        (decode_pair, encode_pair(pair)),
-        (decode_maps, encode_maps((maps,))),
-        (decode_explain_request, encode_explain_request(ExplainRequest((one, two)))),
-        (decode_ruling, encode_ruling(ruling)),
+        (partial(messages.decode, kind=PairExplanation), encode(pair)),
+        (partial(messages.decode, kind=FleetExplanation), encode(FleetExplanation((maps,)))),
+        (partial(messages.decode, kind=ExplainRequest), encode(ExplainRequest((one, two)))),
+        (partial(messages.decode, kind=ManualConstraint), encode(ruling)),
     ]
 
 
@@ -177,7 +156,7 @@ def test_good_messages_gone_bad(some: SimpleNamespace, data: st.DataObject) -> N
 
 
 def test_every_truncation_is_refused(some: SimpleNamespace) -> None:
-    for decode, good in messages(some):
+    for decode, good in one_of_each(some):
         lengths = range(len(good)) if len(good) < 800 else np.linspace(0, len(good) - 1, 300).astype(int)
         for length in lengths:
             with pytest.raises(InvalidMessage):
@@ -202,7 +181,7 @@ def test_every_single_field_may_be_anything(some: SimpleNamespace) -> None:
         [None] * 3,
         {},
     ]
-    for decode, good in messages(some):
+    for decode, good in one_of_each(some):
         if decode in (Mark.decode, unpack_map_file):
             continue
         fields = msgpack.unpackb(good)
@@ -244,8 +223,9 @@ def test_small_values_in_a_large_message_cost_no_memory(
 ) -> None:
     """A message as long as its kind allows, full of the smallest values, is refused before they are made."""
     for decode, length in (
-        (LogAnswer.decode, 31_000_000), (decode_route_answer, 8_000_000), (decode_change, 100_000),
-        (decode_relocalize_answer, 36_000), (Head.decode, 65_000), (decode_record, 65_000),
+        (LogAnswer.decode, 31_000_000), (partial(messages.decode, kind=RouteAnswer), 8_000_000),
+        (decode_change, 100_000), (partial(messages.decode, kind=RelocalizeAnswer), 36_000),
+        (Head.decode, 65_000), (decode_record, 65_000),
     ):  # fmt: skip
         count = length // len(small) - 10
         name = {"field": "c", "unknown": "zz", "nested": "w"}[outer].encode()
@@ -289,7 +269,7 @@ _once: list[tuple[Decoder, bytes]] = []
 def messages_once(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
     """Encoded once for all examples."""
     if not _once:
-        _once.extend(messages(some))
+        _once.extend(one_of_each(some))
     return _once
 
 

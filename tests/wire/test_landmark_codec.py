@@ -6,6 +6,7 @@ import math
 import struct
 import zlib
 from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -38,6 +39,9 @@ from tests.hybridmap.kernel_forms import in_numpy
 
 data = st.data()
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)
+
+
+TABLES = Path(__file__).parents[2] / "hybridmap" / "landmarks_v2.npz"
 
 
 class PlainDecoder:
@@ -86,7 +90,7 @@ class PlainDecoder:
 
     def read(self) -> list[tuple[float, float, list[int], float, float]]:
         """(x, y, code, depth, sigma) of each landmark for a camera of 320 x 240."""
-        tables, everyone = landmark_tables(), range(self.count)
+        tables, everyone = np.load(TABLES), range(self.count)
         high, low = self.rows()
         self.size = max(12, (((self.reach_x + 1) << low) - 1).bit_length())
         self.states = [(1 << self.size) + self.take(self.size) for _ in everyone]
@@ -94,14 +98,14 @@ class PlainDecoder:
         codes: list[list[int]] = [[] for _ in everyone]
         for k in range(32):
             for lane in everyone:
-                codes[lane].append(self.pop(lane, tables.codes[k].tolist()))
+                codes[lane].append(self.pop(lane, tables["codes"][k].tolist()))
             self.refill()
         depths, sigmas = [math.nan] * self.count, [math.nan] * self.count
         if self.flags & 2:
-            shares = [self.pop(lane, tables.shares.tolist()) for lane in everyone]
+            shares = [self.pop(lane, tables["shares"].tolist()) for lane in everyone]
             self.refill()
             known = [lane for lane in everyone if shares[lane]]
-            cells = {lane: self.pop(lane, tables.cells.tolist()) for lane in known}
+            cells = {lane: self.pop(lane, tables["cells"].tolist()) for lane in known}
             self.refill()
             for lane in known:
                 share = 0.002 * math.exp((shares[lane] - 1) / 8)

@@ -52,7 +52,7 @@ def test_a_second_reader(content: MapFile) -> None:
     fields = msgpack.unpackb(data[20:-32])
     assert (fields["v"], fields["kind"], fields["title"]) == (1, "merged", "three rooms")
     assert fields["changes"] == [encode_body(body) for body in content.changes]
-    ((node, component, pose),) = fields["poses"]
+    ((node, (component, pose)),) = fields["poses"]
     assert (node, component) == (["robot-0", 3, 17], 4)
     assert struct.unpack("<9f", pose) == (1.5, -2.5, 0.25, 0.25, 0, 0, 0.25, 0, 0.0625)
 
@@ -117,7 +117,7 @@ def test_a_file_of_the_other_kind_can_be_refused(tmp_path: Path, content: MapFil
 
 
 def test_an_unknown_kind(content: MapFile) -> None:
-    with pytest.raises(InvalidValue, match="kind 'odd' is unknown"):
+    with pytest.raises(InvalidValue, match="Invalid enum value 'odd'"):
         pack_map_file(MapFile("odd", "", ()))  # type: ignore[arg-type]
 
 

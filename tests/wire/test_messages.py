@@ -13,11 +13,14 @@ from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
+    MAX_KNOWN,
     Certainty,
     KnownAnswer,
+    KnownRequest,
     RelocalizeAnswer,
     RouteAnswer,
     RouteLeg,
+    RouteRequest,
     View,
     Whereabouts,
 )
@@ -31,23 +34,8 @@ from mapweave.wire.log_messages import (
     decode_record,
     encode_record,
 )
-from mapweave.wire.messages import (
-    MAX_KNOWN,
-    KnownRequest,
-    RouteRequest,
-    decode_known_answer,
-    decode_known_request,
-    decode_relocalize_answer,
-    decode_route_answer,
-    decode_route_request,
-    decode_view,
-    encode_known_answer,
-    encode_known_request,
-    encode_relocalize_answer,
-    encode_route_answer,
-    encode_route_request,
-    encode_view,
-)
+from mapweave.wire.messages import decode, decode_view, encode, encode_view
+from mapweave.wire.packing import pack
 
 HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.125), 0.5, 0.25)
 sequences = st.integers(1, 2**53)
@@ -77,12 +65,12 @@ def test_small_messages() -> None:
     [
         (Mark.decode, b"\0" * 16),
         (Mark.decode, b"\1" * 15),
-        (LogRequest.decode, LogRequest(5, 4).encode()),
+        (LogRequest.decode, pack({"f": 5, "q": 4})),
         (LogRequest.decode, LogRequest(0, 4).encode()),
-        (LogAnswer.decode, LogAnswer(1, 3, 9, ((4, b""), (4, b""))).encode()),
-        (LogAnswer.decode, LogAnswer(1, 3, 9, ((2, b""),)).encode()),
-        (LogAnswer.decode, LogAnswer(1, 3, 9, ((10, b""),)).encode()),
-        (LogAnswer.decode, LogAnswer(1, 3, 1, ()).encode()),
+        (LogAnswer.decode, pack({"l": 1, "f": 3, "q": 9, "c": [[4, b""], [4, b""]]})),
+        (LogAnswer.decode, pack({"l": 1, "f": 3, "q": 9, "c": [[2, b""]]})),
+        (LogAnswer.decode, pack({"l": 1, "f": 3, "q": 9, "c": [[10, b""]]})),
+        (LogAnswer.decode, pack({"l": 1, "f": 3, "q": 1, "c": []})),
         (LogAnswer.decode, LogAnswer(1, 1, 300, tuple((k, b"") for k in range(1, 259))).encode()),
         (Head.decode, Head(1, -1).encode()),
         (Head.decode, Head(1, 1, {"S!": 1}).encode()),
@@ -93,6 +81,14 @@ def test_nonsense_is_refused(decode: object, data: bytes) -> None:
     assert callable(decode)
     with pytest.raises(InvalidMessage):
         decode(data)
+
+
+@pytest.mark.parametrize(("covered", "numbers"), [(9, [4, 4]), (9, [2]), (9, [10]), (1, [])])
+def test_nobody_makes_a_piece_of_a_log_that_is_none(covered: int, numbers: list[int]) -> None:
+    with pytest.raises(InvalidValue):
+        LogAnswer(1, 3, covered, tuple((number, b"") for number in numbers))
+    with pytest.raises(InvalidValue):
+        LogRequest(5, 4)
 
 
 def test_only_the_newest_refusals_travel_and_none_is_too_long() -> None:
@@ -145,8 +141,8 @@ def test_a_relocalization() -> None:
         Whereabouts(NodeId("r1", 3, 17), HERE, HERE, 0, 41, 0.75),
         Whereabouts(NodeId("r2", 1, 4), HERE, None, -1, 12, 0.25),
     )
-    encoded = encode_relocalize_answer(RelocalizeAnswer(Certainty.FOUND, places, "41 landmarks agree"))
-    back = decode_relocalize_answer(encoded)
+    encoded = encode(RelocalizeAnswer(Certainty.FOUND, places, "41 landmarks agree"))
+    back = decode(encoded, RelocalizeAnswer)
     assert (back.certainty, back.reason) == (Certainty.FOUND, "41 landmarks agree")
     for new, old in zip(back.candidates, places, strict=True):
         assert (new.node, new.component, new.inliers) == (old.node, old.component, old.inliers)
@@ -154,16 +150,16 @@ def test_a_relocalization() -> None:
         assert new.node_from_robot.mean == HERE.mean
         assert np.array_equal(new.node_from_robot.covariance, HERE.covariance)
         assert (new.merged_from_robot is None) == (old.merged_from_robot is None)
-    assert encode_relocalize_answer(back) == encoded
+    assert encode(back) == encoded
     nothing = RelocalizeAnswer(Certainty.UNKNOWN, (), "no node looks like it")
-    same = decode_relocalize_answer(encode_relocalize_answer(nothing))
+    same = decode(encode(nothing), RelocalizeAnswer)
     assert (same.certainty, same.candidates, same.reason) == (Certainty.UNKNOWN, (), nothing.reason)
 
 
 def test_a_relocalization_that_cannot_be_sent() -> None:
     wrong = Whereabouts(NodeId("r1", 3, 17), HERE, HERE, 0, 41, 1.5)
     with pytest.raises(InvalidValue, match="probability"):
-        encode_relocalize_answer(RelocalizeAnswer(Certainty.FOUND, (wrong,), ""))
+        encode(RelocalizeAnswer(Certainty.FOUND, (wrong,), ""))
 
 
 def test_a_route(some: SimpleNamespace) -> None:
@@ -173,31 +169,31 @@ def test_a_route(some: SimpleNamespace) -> None:
         ((NodeId("r0", 1, 2), NodeId("r1", 1, 1)),),
         Pose2(0.1, 0.2, -3),
     )
-    assert decode_route_request(encode_route_request(request)) == request
-    assert decode_route_request(encode_route_request(RouteRequest(request.start, request.goal))).blocked == ()
+    assert decode(encode(request), RouteRequest) == request
+    assert decode(encode(RouteRequest(request.start, request.goal)), RouteRequest).blocked == ()
     node = some.node(9)
-    encoded = encode_route_answer(
+    encoded = encode(
         RouteAnswer((RouteLeg(node, HERE, None), RouteLeg(node, HERE, EdgeKind.MERGED)), "2 nodes")
     )
-    back = decode_route_answer(encoded)
+    back = decode(encoded, RouteAnswer)
     assert [(leg.node.id, leg.kind) for leg in back.legs] == [(node.id, None), (node.id, EdgeKind.MERGED)]
     assert back.legs[1].previous_from_node.mean == HERE.mean
-    assert encode_route_answer(back) == encoded
-    nothing = decode_route_answer(encode_route_answer(RouteAnswer((), "no way")))
+    assert encode(back) == encoded
+    nothing = decode(encode(RouteAnswer((), "no way")), RouteAnswer)
     assert (nothing.legs, nothing.reason) == ((), "no way")
 
 
 def test_the_cache_returns_its_entries() -> None:
     request = KnownRequest(MapId("r0", 3), 1.25, -2.5, 8.7)
-    assert decode_known_request(encode_known_request(request)) == request
+    assert decode(encode(request), KnownRequest) == request
     views = np.random.default_rng(1).uniform([-50, -50, -3, 0.1], [50, 50, 3, 1.2], (MAX_KNOWN, 4))
-    encoded = encode_known_answer(KnownAnswer(views, "512 of 600 views"))
-    assert len(encoded) < 16 * MAX_KNOWN + 40
-    back = decode_known_answer(encoded)
+    encoded = encode(KnownAnswer(views, "512 of 600 views"))
+    assert len(encoded) < 16 * MAX_KNOWN + 64
+    back = decode(encoded, KnownAnswer)
     assert np.allclose(back.views, views, atol=1e-5)
     assert back.reason == "512 of 600 views"
-    assert encode_known_answer(back) == encoded
-    nothing = decode_known_answer(encode_known_answer(KnownAnswer(np.zeros((0, 4)), "nobody")))
+    assert encode(back) == encoded
+    nothing = decode(encode(KnownAnswer(np.zeros((0, 4)), "nobody")), KnownAnswer)
     assert (nothing.views.shape, nothing.reason) == ((0, 4), "nobody")
 
 
@@ -206,11 +202,11 @@ def test_the_cache_returns_its_entries() -> None:
 )
 def test_impossible_views_are_not_returned(view: list[float]) -> None:
     with pytest.raises(InvalidValue, match="out of range"):
-        encode_known_answer(KnownAnswer(np.array([view]), ""))
+        encode(KnownAnswer(np.array([view]), ""))
 
 
 def test_more_than_the_announced_size_is_refused() -> None:
     with pytest.raises(InvalidValue, match="at most"):
-        encode_known_answer(KnownAnswer(np.zeros((MAX_KNOWN + 1, 4)), ""))
-    with pytest.raises(InvalidValue, match="position"):
-        encode_known_request(KnownRequest(MapId("r0", 1), float("nan"), 0.0, 1.0))
+        encode(KnownAnswer(np.zeros((MAX_KNOWN + 1, 4)), ""))
+    with pytest.raises(InvalidValue, match="finite"):
+        encode(KnownRequest(MapId("r0", 1), float("nan"), 0.0, 1.0))

@@ -8,7 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.wire.rans import TOTAL, BitReader, Column, Columns, LaneReader, LaneWriter, pack_bits
+from mapweave.wire.rans import (
+    TOTAL,
+    BitReader,
+    Column,
+    Columns,
+    Frequencies,
+    Ints,
+    LaneReader,
+    LaneWriter,
+    pack_bits,
+)
 from tests.hybridmap.kernel_forms import form
 
 __all__ = ["form"]
@@ -20,6 +30,11 @@ def some_column(random: np.random.Generator, symbols: int) -> Column:
     """Frequencies that sum to 2^12, some of them 1."""
     cuts = np.sort(random.choice(np.arange(1, TOTAL), symbols - 1, replace=False))
     return Column(np.diff(np.concatenate([[0], cuts, [TOTAL]])))
+
+
+def push(writer: LaneWriter, symbols: Ints, column: Column) -> None:
+    """One column."""
+    writer.push(symbols.astype(np.uint8)[None], Frequencies.of([column]))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 30), st.integers(1, 12), st.integers(12, 18))
@@ -34,7 +49,7 @@ def test_pushed_symbols_come_back(seed: int, lanes: int, steps: int, size: int) 
     writer = LaneWriter(seeds + (1 << size), size)
     writer.push_plain(plain, widths, some)
     for column, row in zip(columns[::-1], symbols[::-1], strict=True):
-        writer.push(row, column)
+        push(writer, row, column)
     data = pack_bits(*writer.finish())
     bits = BitReader(data)
     reader = LaneReader(bits, lanes, size)
@@ -49,12 +64,16 @@ def test_pushed_symbols_come_back(seed: int, lanes: int, steps: int, size: int) 
 def test_many_columns_at_once_equal_one_by_one(seed: int) -> None:
     random = np.random.default_rng(seed)
     lanes, size = int(random.integers(0, 200)), int(random.integers(12, 32))
-    columns = [some_column(random, int(random.integers(1, 60))) for _ in range(9)]
-    symbols = [random.integers(0, len(c.frequencies), lanes) for c in columns]
-    writer = LaneWriter(random.integers(0, 1 << size, lanes) + (1 << size), size)
+    alphabet = int(random.integers(1, 60))
+    columns = [some_column(random, alphabet) for _ in range(9)]
+    symbols = [random.integers(0, alphabet, lanes) for _ in columns]
+    seeds = random.integers(0, 1 << size, lanes) + (1 << size)
+    writer, at_once = LaneWriter(seeds.copy(), size), LaneWriter(seeds.copy(), size)
     for column, row in zip(columns[::-1], symbols[::-1], strict=True):
-        writer.push(row, column)
+        push(writer, row, column)
     data = pack_bits(*writer.finish())
+    at_once.push(np.array(symbols, np.uint8).reshape(9, lanes), Frequencies.of(columns))
+    assert pack_bits(*at_once.finish()) == data
     bits, other = BitReader(data), BitReader(data)
     reader, plain = LaneReader(bits, lanes, size), LaneReader(other, lanes, size)
     found = reader.pop(Columns.of(columns))
@@ -76,7 +95,7 @@ def test_a_symbol_costs_its_entropy() -> None:
     lanes, steps = 100, 200
     writer = LaneWriter(np.full(lanes, 1 << 15), 15)
     for _ in range(steps):
-        writer.push(random.choice(5, lanes, p=shares), column)
+        push(writer, random.choice(5, lanes, p=shares), column)
     bits = 8 * len(pack_bits(*writer.finish()))
     assert bits / (lanes * steps) == pytest.approx(entropy + 15 / steps, rel=0.01)
 
@@ -88,7 +107,7 @@ def test_one_rans_lane_in_plain_python() -> None:
     symbols = random.integers(0, 20, 50)
     writer = LaneWriter(np.array([(1 << size) + 77]), size)
     for symbol in symbols[::-1]:
-        writer.push(np.array([symbol]), column)
+        push(writer, np.array([symbol]), column)
     text = "".join(f"{byte:08b}" for byte in pack_bits(*writer.finish()))
     state, text = (1 << size) + int(text[:size], 2), text[size:]
     for symbol in symbols:

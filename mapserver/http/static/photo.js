@@ -8,7 +8,7 @@ function table(candidates) {
     const th = document.createElement("th"); th.textContent = name; head.append(th);
   }
   for (const c of candidates) {
-    const [x, y, turn] = c.node_from_robot;
+    const [x, y, turn] = c.node_from_robot.mean;
     const away = m => cell(c.distance_known ? m.toFixed(2) + " m" : "not known");
     table.insertRow().append(cell(c.node), away(x), away(y),
       cell((turn * 180 / Math.PI).toFixed(0) + "\u00b0"), cell((100 * c.probability).toFixed(0) + " %"));

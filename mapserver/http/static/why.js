@@ -18,23 +18,24 @@ function colour(px) {
   return "rgb(" + COLOURS[k].map((c, i) => Math.round(c + (at - k) * (COLOURS[k + 1][i] - c))) + ")";
 }
 function picture(parent, pair) {
-  const [left, right] = pair.images, gap = 0.06 * left[0], shift = [0, left[0] + gap];
+  const nodes = [pair.a, pair.b], [left, right] = nodes.map(node => node.image);
+  const gap = 0.06 * left[0], shift = [0, left[0] + gap];
   const svg = draw(parent, "svg", { role: "img",
     viewBox: [-2, -14, shift[1] + right[0] + 4, Math.max(left[1], right[1]) + 16].join(" ") });
-  pair.images.forEach(([width, height], side) => {
+  nodes.forEach(({ id, image: [width, height] }, side) => {
     draw(svg, "rect", { x: shift[side], y: 0, width, height, fill: "#f7f5f0", stroke: "#555" });
-    draw(svg, "text", { x: shift[side], y: -4, "font-size": 9 }).textContent = side ? pair.b : pair.a;
+    draw(svg, "text", { x: shift[side], y: -4, "font-size": 9 }).textContent = id;
   });
   const agree = new Set(pair.shared.map(String));
   function line([i, j], values) {
-    const [x, y] = pair.pixels[0][i], [u, v] = pair.pixels[1][j];
+    const [x, y] = pair.a.pixels[i], [u, v] = pair.b.pixels[j];
     draw(svg, "line", { x1: x, y1: y, x2: u + shift[1], y2: v, ...values });
   }
   for (const match of pair.matches)
     if (!agree.has(String(match))) line(match, { stroke: "#9a9a9a", "stroke-width": 0.5, class: "alike" });
   pair.shared.forEach((match, k) =>
     line(match, { stroke: colour(pair.residuals_px[k]), "stroke-width": 1.1, class: "agree" }));
-  pair.pixels.forEach((pixels, side) => pixels.forEach(([x, y]) =>
+  nodes.forEach(({ pixels }, side) => pixels.forEach(([x, y]) =>
     draw(svg, "circle", { cx: x + shift[side], cy: y, r: 1.3, fill: "#333" })));
   const alike = pair.matches.filter(match => !agree.has(String(match))).length;
   add(parent, "small", "Dots are landmarks; images are not kept. " +
@@ -44,7 +45,7 @@ function picture(parent, pair) {
 const metres = ([x, y, turn]) =>
   `${x.toFixed(3)} m ahead, ${y.toFixed(3)} m left, ${(turn * 180 / Math.PI).toFixed(1)}\u00b0`;
 function pose(gaussian) {
-  const sigma = [0, 1, 2].map(k => Math.sqrt(gaussian.covariance[k][k]));
+  const sigma = gaussian.sigma;
   return `${metres(gaussian.mean)} (sigma ${sigma[0].toFixed(3)} m, ${sigma[1].toFixed(3)} m, ` +
     `${(sigma[2] * 180 / Math.PI).toFixed(1)}\u00b0)`;
 }
@@ -54,7 +55,7 @@ function to(parent, a, b, words) {
 }
 function showPair(pair) {
   const box = add(told, "section", "", pair.standing === "linked" || pair.standing === "own" ? "good" : "");
-  add(box, "p", `${pair.a} and ${pair.b}: ${pair.standing}: ${pair.reason}.`);
+  add(box, "p", `${pair.a.id} and ${pair.b.id}: ${pair.standing}: ${pair.reason}.`);
   if (pair.evidence.doubles)
     add(box, "p", `${pair.evidence.doubles} of the landmarks that agree are found at other places too.`);
   if (pair.a_from_b) add(box, "p", "Seen from the first, the second is " + pose(pair.a_from_b) + ".");

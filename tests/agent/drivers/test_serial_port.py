@@ -53,7 +53,7 @@ def test_lines_end_by_either_character_and_empty_ones_are_skipped(ends: tuple[in
     assert not port.line_waiting()
     os.write(master, b"ee\n")
     assert port.line() == "three"
-    with pytest.raises(DeviceError, match="no answer for 0.3 s"):
+    with pytest.raises(DeviceError, match=r"no answer for 0\.3 s"):
         port.line()
 
 

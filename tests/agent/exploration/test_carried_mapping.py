@@ -9,13 +9,12 @@ import pytest
 
 from mapweave.agent.exploration import carried_mapping
 from mapweave.agent.exploration.carried_mapping import CarriedMapping
+from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Observation, Odometry
+from mapweave.agent.observation import Command
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-
-TICK = Observation(0, Odometry(0.0, 0.0))
 
 
 @dataclass
@@ -28,14 +27,13 @@ class Stage:
     converged_share: float = 0.0
     typical_depth: float = 2.0
     started: bool = True
-    finished: int = 0
 
-    def begin(self, observation: Observation) -> None:
-        self.started = observation.image is not None
 
-    def finish(self, observation: Observation) -> bool:
-        self.finished += 1
-        return True
+def tick(passenger: CarriedMapping) -> list[EpisodeRequest]:
+    """What it asks of the mapper in a tick. The wheels are not its business."""
+    moves = list(iter(passenger.next_move, Command()))
+    assert all(isinstance(move, EpisodeRequest) for move in moves)
+    return moves
 
 
 @pytest.mark.parametrize(
@@ -57,34 +55,29 @@ class Stage:
     ],
 )
 def test_a_node_is_made_when_the_view_is_known_or_leaving(stage, node):
-    CarriedMapping(stage).step(TICK)
-    assert stage.finished == node
+    assert tick(CarriedMapping(stage)) == [EpisodeRequest.FINISH] * node
 
 
 def test_limits_are_heeded(monkeypatch):
     stage = Stage(Pose2(0.3), converged_share=0.5)
-    CarriedMapping(stage).step(TICK)
-    assert not stage.finished
+    assert not tick(CarriedMapping(stage))
     monkeypatch.setattr(carried_mapping, "CONVERGED", 0.4)
     monkeypatch.setattr(carried_mapping, "DEPTH_STEP", 0.1)
-    CarriedMapping(stage).step(TICK)
-    assert stage.finished
+    assert tick(CarriedMapping(stage))
 
 
 def test_without_an_image_it_waits():
     stage = Stage(started=False)
     passenger = CarriedMapping(stage)
     assert passenger.detail == "no image yet"
-    passenger.step(TICK)
-    assert not stage.started
-    passenger.step(Observation(0, Odometry(0, 0), np.zeros((240, 320), np.uint8)))
-    assert stage.started
-    assert not stage.finished
+    assert tick(passenger) == tick(passenger) == [EpisodeRequest.BEGIN]
+    stage.started = True
+    assert not tick(passenger)
 
 
 def test_problems_of_the_view_are_reported():
     passenger = CarriedMapping(Stage(anchor_features=3, anchored=2))
-    passenger.step(TICK)
+    tick(passenger)
     assert passenger.detail == "only 3 features in view"
 
 
@@ -93,10 +86,11 @@ def carried(walls, description, poses):
     mapper = Mapper(MapId("r0", 1), description)
     passenger = CarriedMapping(mapper)
     changes, before = [], poses[0]
-    for tick, pose in enumerate(poses):
-        observation = walls.observe(before, pose, tick)
+    for number, pose in enumerate(poses):
+        observation = walls.observe(before, pose, number)
         mapper.step(observation)
-        passenger.step(observation)
+        while isinstance(move := passenger.next_move(), EpisodeRequest):
+            mapper.meet(move, observation)
         changes += mapper.take_changes()
         before = pose
     return changes, mapper, passenger

@@ -99,7 +99,7 @@ def test_tracks_that_do_not_correct_the_filter_are_expected_where_they_were_last
         before, pose = pose, Pose2(0.002 * tick)
         observed = walls.observe(before, pose, tick)
         tracking.step(replace(observed, odometry=Odometry(observed.odometry.forward, 0.01)))
-        assert tracking.strange == tracking.blank == 0
+        assert tracking.acceptance.strange == tracking.acceptance.blank == 0
     assert abs(tracking.pose.mean.heading - 0.2) < 1e-6, "by the wheels alone"
     assert len(tracking.ids) > 0.9 * alive
 

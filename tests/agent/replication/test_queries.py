@@ -9,7 +9,7 @@ from mapweave.agent.replication.queries import FARTHEST, decode_answer
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
-from mapweave.wire.messages import encode_relocalize_answer, encode_route_answer
+from mapweave.wire.messages import encode
 from tests.agent.scripted_fleet import EXACT, A, B, C, bare, here, straight
 
 
@@ -20,7 +20,7 @@ def route_of(*poses: Pose2) -> RouteAnswer:
 
 
 def where(view: View, *places: Whereabouts) -> RelocalizeAnswer:
-    payload = encode_relocalize_answer(RelocalizeAnswer(Certainty.FOUND, places, "here"))
+    payload = encode(RelocalizeAnswer(Certainty.FOUND, places, "here"))
     answer = decode_answer(WhereAmI(1, view), payload)
     assert isinstance(answer, RelocalizeAnswer)
     return answer
@@ -29,18 +29,18 @@ def where(view: View, *places: Whereabouts) -> RelocalizeAnswer:
 @pytest.mark.parametrize("far", [Pose2(1e6), Pose2(0.0, -FARTHEST - 1.0)])
 def test_a_leg_of_a_million_metres_is_refused(far: Pose2) -> None:
     question = WhichWay(1, A, C)
-    decode_answer(question, encode_route_answer(route_of(Pose2(1.0), Pose2(FARTHEST - 1.0))))
+    decode_answer(question, encode(route_of(Pose2(1.0), Pose2(FARTHEST - 1.0))))
     with pytest.raises(InvalidMessage, match=rf"route: the leg to node {C} is \d+ m away, more than 100 m"):
-        decode_answer(question, encode_route_answer(route_of(Pose2(1.0), far)))
+        decode_answer(question, encode(route_of(Pose2(1.0), far)))
 
 
 def test_a_route_to_another_node_is_refused() -> None:
     with pytest.raises(InvalidMessage, match=f"route: it ends at node {B}, not at {C}"):
-        decode_answer(WhichWay(1, A, C), encode_route_answer(route_of(Pose2(1.0))))
+        decode_answer(WhichWay(1, A, C), encode(route_of(Pose2(1.0))))
 
 
 def test_no_way_is_an_answer() -> None:
-    answer = decode_answer(WhichWay(1, A, C), encode_route_answer(RouteAnswer((), "all blocked")))
+    answer = decode_answer(WhichWay(1, A, C), encode(RouteAnswer((), "all blocked")))
     assert isinstance(answer, RouteAnswer)
     assert answer.reason == "all blocked"
 

@@ -20,6 +20,7 @@ from mapweave.wire.codec import decode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, Refusal
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.packing import pack
 from tests.waiting import eventually
 
 KEYS = Keys("fleet")
@@ -46,7 +47,7 @@ class HandServer:
         self.bus.publish(KEYS.ack(self.name, "r0"), ack.encode())
 
     def ask(self, first: int, last: int) -> LogAnswer:
-        (reply,) = self.bus.ask(KEYS.log(MAP), LogRequest(first, last).encode(), 5)
+        (reply,) = self.bus.ask(KEYS.log(MAP), pack({"f": first, "q": last}), 5)
         if reply.error:
             raise InvalidMessage(reply.error)
         return LogAnswer.decode(reply.payload)

@@ -13,7 +13,7 @@ import pytest
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import NodeId
-from mapweave.mapserver.http.explanation_json import route_values
+from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
@@ -60,10 +60,11 @@ def test_maps_and_nodes_are_explained(served: Web) -> None:
     link = next(link for link in merged.links if str(link.a) == weakest["a"] and str(link.b) == weakest["b"])
     assert status == 200 and pair["standing"] == "linked" and pair["shared"] == link.shared.tolist()
     assert np.allclose(pair["a_from_b"]["covariance"], link.a_from_b.covariance)
-    for side, end in enumerate(link.pair):
+    for side, end in zip("ab", link.pair, strict=True):
         node = merged.maps[end.map].nodes[end]
-        assert pair["images"][side] == [node.camera.width, node.camera.height]
-        assert np.allclose(pair["pixels"][side], node.landmarks.pixels, atol=0.051)
+        assert pair[side]["id"] == str(end)
+        assert pair[side]["image"] == [node.camera.width, node.camera.height]
+        assert np.allclose(pair[side]["pixels"], node.landmarks.pixels, atol=0.051)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +124,7 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(
 ) -> None:
     start, goal = NodeId("r0", 1, 1), NodeId("r1", 1, 7)
     told = explain_route(Router(two_maps()), start, goal)
-    assert told.found and ask(served, f"?a={start}&b={goal}", "route") == (200, route_values(told))
+    assert told.found and ask(served, f"?a={start}&b={goal}", "route") == (200, json_values(told))
     with Browser(tmp_path_factory.mktemp("profile")) as page:
         page.open(f"http://127.0.0.1:{served.port}/why")
         page.type("#a", str(start))

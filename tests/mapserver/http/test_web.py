@@ -64,8 +64,10 @@ def test_an_image_in_and_json_out(served: Web, desk: Desk) -> None:
         assert (answer["certainty"], answer["reason"]) == ("found", ANSWER.reason)
         (place,) = answer["candidates"]
         assert place["node"] == "r0.1.7"
-        assert place["node_from_robot"] == pytest.approx([0.5, -0.25, 0.1])
-        assert place["sigma"] == pytest.approx([0.02, 0.02, 0.01])
+        pose = place["node_from_robot"]
+        assert pose["mean"] == pytest.approx([0.5, -0.25, 0.1])
+        assert pose["sigma"] == pytest.approx([0.02, 0.02, 0.01])
+        assert np.sqrt(np.diag(pose["covariance"])).tolist() == pose["sigma"]
         assert (place["merged_from_robot"], place["inliers"]) == (None, 31)
     assert all(len(view) > 20 for view in desk.views)
 

@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -173,6 +174,7 @@ def fleet(whole: Path, tmp_path: Path) -> Iterator[Fleet]:
     fleet.stop_robots()
 
 
+@cache
 def truth(whole: Path) -> tuple[dict[MapId, list[bytes]], dict[MapId, list[bytes]]]:
     """Logs, and the maps that they make, by the journals."""
     logs, maps = {}, {}

@@ -239,7 +239,7 @@ def test_a_bad_map_is_left_out_before_comparing(
 def test_nodes_that_cannot_be_compared_are_not_linked(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    import mapweave.mapserver.merging.merger as module
+    import mapweave.mapserver.merging.node_comparisons as module
 
     real = module.verify
 
@@ -260,14 +260,14 @@ def test_a_node_whose_search_fails_holds_up_no_other(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     merger = merger_of(told, BAD, R0, R1)
-    real = merger.index.overlaps
+    real = merger.places.overlaps
 
     def fails(node: Any, *more: Any) -> Any:
         if node.id.map == BAD:
             raise IndexError("no such cell")
         return real(node, *more)
 
-    monkeypatch.setattr(merger.index, "overlaps", fails)
+    monkeypatch.setattr(merger.places, "overlaps", fails)
     merged = merger.merged()
     assert merger.uncompared == 0
     assert said(merged, R0, R1) == said(merger_of(told, R0, R1).merged(), R0, R1)

@@ -164,7 +164,7 @@ def test_robots_that_would_walk_through_each_other_are_not_joined(clock: str, jo
 
 
 def relocalizer(merger: Merger) -> Relocalizer:
-    return Relocalizer(merger.index, merger.node, merger.merged())
+    return Relocalizer(merger.places, merger.node, merger.merged())
 
 
 def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger) -> None:
@@ -200,10 +200,10 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
         examined.append(node.id)
         return examine_matches(node, *others)
 
-    monkeypatch.setattr("mapweave.mapserver.relocalization.relocalizer.examine_matches", counted)
+    monkeypatch.setattr("mapweave.mapserver.relocalization.view_registration.examine_matches", counted)
     # No single candidate is enough: then every similar node is examined.
     thorough = Relocalizer(
-        merger.index,
+        merger.places,
         merger.node,
         merger.merged(),
         RelocalizationSettings(faint=0.0),
@@ -265,7 +265,7 @@ def test_maps_that_nothing_joins_are_not_silently_confused(scene: Scene) -> None
     for map_id in (A, B):
         nodes, _ = take_map(scene.world, map_id, [stop], rng)
         merger.apply(map_id, NodePut(nodes[0]))
-    service = Relocalizer(merger.index, merger.node, MergedMap.empty())
+    service = Relocalizer(merger.places, merger.node, MergedMap.empty())
     view, _ = take_view(scene.world, stop, rng)
     answer = service.answer(view)
     assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason

@@ -22,7 +22,7 @@ from mapweave.mapserver.merging.verification_cache_keeper import SUFFIX, Verific
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict
-from mapweave.merge.settings import MergeSettings
+from mapweave.merge.settings import ExclusionSettings, MergeSettings
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -169,7 +169,7 @@ def test_a_damaged_index_is_built_again(
     path.write_bytes(bytes(data))
     settings = {
         # What large islands had decided was decided by other rules.
-        "merging": MergeSettings(strain=20.0),
+        "merging": MergeSettings(exclusion=ExclusionSettings(doubt=0.01)),
     }
     if damage == "version":
         # Another version may compare by other rules.

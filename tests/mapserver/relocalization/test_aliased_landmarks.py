@@ -12,8 +12,10 @@ from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.mapserver.relocalization.aliased_landmarks import AliasedLandmarks, carried, unexplained
+from mapweave.mapserver.relocalization.candidates import Candidates
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, hidden, is_lonely
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
@@ -80,9 +82,10 @@ def test_a_place_whose_twin_was_not_recognised_is_ambiguous() -> None:
             return [(first.id, 2.0), (twin.id, 1.0)]
 
     service = Relocalizer(Ranked(), by_id.get, nowhere_joined(places))
-    alone = service.conclude(view, [NodeMatch(first.id, found)], [(first.id, 2.0)])
+    matches = service.registration.refined(view, [NodeMatch(first.id, found)])
+    alone = service.conclude(Registration(Candidates(view, [(first.id, 2.0)]), matches))
     assert alone.certainty is Certainty.FOUND
-    both = service.conclude(view, [NodeMatch(first.id, found)], Ranked().query(view))
+    both = service.conclude(Registration(Candidates(view, Ranked().query(view)), matches))
     assert both.certainty is Certainty.AMBIGUOUS and "look alike on the map" in both.reason
     assert {one.node for one in both.candidates} == {first.id, twin.id}
     assert max(one.probability for one in both.candidates) < 0.9
@@ -96,7 +99,8 @@ def test_landmarks_at_one_place_are_not_aliased() -> None:
     poses = {one.id: Placement(0, PoseGaussian(AT, HERE.covariance)) for one in (first, twin)}
     merged = MergedMap({}, (), (), (frozenset(poses),), poses, ())
     service = Relocalizer(PlaceIndex(), {first.id: first, twin.id: twin}.get, merged)
-    assert not service.doubled(view, NodeMatch(first.id, found), [(first.id, 2.0), (twin.id, 1.0)])
+    ranked = [(first.id, 2.0), (twin.id, 1.0)]
+    assert not service.aliasing.matches(view, NodeMatch(first.id, found), ranked)
 
 
 def test_matches_that_a_pose_explains() -> None:

@@ -11,13 +11,15 @@ import pytest
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, View
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.merge_worker import PREPARED_AT_ONCE, MergeWorker
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.relocalization.aliased_landmarks import between
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegionSettings
+from mapweave.mapserver.relocalization.candidates import Candidates
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
+from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
 from mapweave.merge.pose_graph.component import solve_graph
@@ -163,13 +165,20 @@ def test_the_same_room_mapped_twice_is_one_place() -> None:
     assert asked(twice, joined(twice)).answer(VIEW).certainty is Certainty.FOUND
 
 
+def concluded(
+    service: Relocalizer, recognised: NodeMatch, ranked: list[tuple[NodeId, float]]
+) -> RelocalizeAnswer:
+    matches = service.registration.refined(VIEW, [recognised])
+    return service.conclude(Registration(Candidates(VIEW, ranked), matches))
+
+
 def test_maps_that_are_not_merged_have_their_own_frames() -> None:
     nodes = here_and_there(agent="r1")
     found = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
     assert found is not None
     ranked = [(nodes[0].id, 2.0), (nodes[1].id, 0.1), (nodes[2].id, 0.1)]
     service = asked(nodes, MergedMap.empty())
-    answer = service.conclude(VIEW, [NodeMatch(nodes[0].id, found)], ranked)
+    answer = concluded(service, NodeMatch(nodes[0].id, found), ranked)
     assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason
     assert answer.candidates[1].node.agent == "r1" and answer.candidates[1].merged_from_robot is None
 
@@ -267,5 +276,5 @@ def test_landmarks_without_depths_are_in_no_region() -> None:
             for k, one in enumerate(nodes)
         ]
         service = asked(fewer, joined(fewer))
-        answer = service.conclude(VIEW, [NodeMatch(nodes[0].id, found)], [(nodes[0].id, 2.0)])
+        answer = concluded(service, NodeMatch(nodes[0].id, found), [(nodes[0].id, 2.0)])
         assert answer.certainty is told

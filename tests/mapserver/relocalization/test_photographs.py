@@ -15,7 +15,7 @@ from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.merge.islands import Islands
 from mapweave.merge.pose_graph.verdicts import Verdicts
-from mapweave.wire.messages import decode_relocalize_answer, encode_relocalize_answer
+from mapweave.wire.messages import decode, encode
 from synthetic.world import Sensing, World, room, take_node, take_view
 from tests.hand_held import photograph
 
@@ -55,7 +55,7 @@ def test_a_photograph_is_a_place_of_unknown_distance(seed: int) -> None:
     assert not best.distance_known
     there = Pose2() if best.node.number == 1 else NEXT
     assert best.node_from_robot.mahalanobis2(there.inverse() @ off) < 16.3
-    again = decode_relocalize_answer(encode_relocalize_answer(answer))
+    again = decode(encode(answer), RelocalizeAnswer)
     assert again.certainty is Certainty.PLACE
     assert not again.candidates[0].distance_known
     measured = told(nodes, view)

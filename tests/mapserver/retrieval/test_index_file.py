@@ -19,8 +19,8 @@ from mapweave.mapserver.log.entry import Entry, Position
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.retrieval import index_file
 from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
-from mapweave.mapserver.retrieval.index_keeper import SUFFIX, PlaceIndexKeeper
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndexSettings
+from mapweave.mapserver.retrieval.place_database import SUFFIX, PlaceDatabase
 from mapweave.mapserver.retrieval.place_index import PlaceIndex, PlaceIndexSettings
 from mapweave.wire.codec import encode_change
 from synthetic.world import CAMERA, random_vectors, room, take_map, take_view
@@ -212,7 +212,7 @@ def many(count: int, first: int = 0) -> list[Node]:
 def test_a_server_that_starts_again_has_its_places_at_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.INFO, "mapweave.mapserver.retrieval.index_keeper")
+    caplog.set_level(logging.INFO, "mapweave.mapserver.retrieval.place_database")
     path = tmp_path / "store.db"
     store = Store(path)
     put(store, [NodePut(node) for node in many(90)])
@@ -220,20 +220,21 @@ def test_a_server_that_starts_again_has_its_places_at_once(
     def replayed() -> list[Node]:
         return [one.body.node for one in store.replay(MAP) if isinstance(one.body, NodePut)]
 
-    keeper = PlaceIndexKeeper(store, path)
-    assert f"made anew: {path}{SUFFIX}: there is none yet" in caplog.text and len(keeper.index) == 0
-    keeper.index.extend(replayed())
-    keeper.close()
+    places = PlaceDatabase(store, path)
+    assert f"made anew: {path}{SUFFIX}: there is none yet" in caplog.text and len(places) == 0
+    places.put(replayed())
+    places.close()
     put(store, [NodeRetired(NodeId("a", 1, 4)), *(NodePut(node) for node in many(3, 200))], 91)
-    again = PlaceIndexKeeper(store, path)
+    again = PlaceDatabase(store, path)
     assert "the place index of 89 nodes is as it was saved; 1 are gone" in caplog.text
-    assert set(again.index.slots) == {NodeId("a", 1, k) for k in range(90)} - {NodeId("a", 1, 4)}
-    again.index.extend(node for node in replayed() if node.id.number != 4)
-    assert len(again.index) == 92 and len(again.index.landmarks) == 92 * 140
+    assert len(again) == 89 and all((NodeId("a", 1, k) in again) == (k != 4) for k in range(90))
+    again.put(node for node in replayed() if node.id.number != 4)
     again.close()
     kept = path.with_name(path.name + SUFFIX)
+    saved = index_file.load(kept, store.positions())
+    assert len(again) == len(saved) == 92 and len(saved.landmarks) == 92 * 140
     kept.write_bytes(kept.read_bytes()[:-5])
-    assert len(PlaceIndexKeeper(store, path).index) == 0 and "damaged or cut off" in caplog.text
+    assert len(PlaceDatabase(store, path)) == 0 and "damaged or cut off" in caplog.text
     store.close()
 
 
@@ -255,17 +256,17 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_file(
 def test_a_running_server_saves_when_enough_is_new(tmp_path: Path) -> None:
     store = Store(tmp_path / "store.db")
     kept = tmp_path / f"store.db{SUFFIX}"
-    keeper = PlaceIndexKeeper(store, tmp_path / "store.db")
+    places = PlaceDatabase(store, tmp_path / "store.db")
     nodes = many(120)
-    keeper.index.extend(nodes[:100])
-    keeper.look()
+    places.put(nodes[:100])
+    places.save_if_worthwhile()
     first = kept.read_bytes()
-    keeper.index.add(nodes[100])
-    keeper.look()
+    places.put(nodes[100:101])
+    places.save_if_worthwhile()
     assert kept.read_bytes() == first
-    keeper.index.extend(nodes[101:])
-    keeper.look()
+    places.put(nodes[101:])
+    places.save_if_worthwhile()
     assert kept.read_bytes() != first
-    keeper.close()
+    places.close()
     assert len(index_file.load(kept, store.positions())) == 120
     store.close()

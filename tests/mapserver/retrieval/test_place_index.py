@@ -9,9 +9,10 @@ from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import place_index
+from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.mapserver.retrieval.inverted_file import InvertedFile
 from mapweave.mapserver.retrieval.landmark_index import MOST_WITHIN, LandmarkIndexSettings
-from mapweave.mapserver.retrieval.place_index import MOST_LANDMARKS, SLOT_BITS, PlaceIndex, PlaceIndexSettings
+from mapweave.mapserver.retrieval.place_index import SLOT_BITS, PlaceIndex, PlaceIndexSettings
 from mapweave.merge.pose_graph.candidates import overlaps
 from synthetic.world import CAMERA, World, random_vectors, room, take_map, take_view
 

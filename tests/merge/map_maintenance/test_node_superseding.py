@@ -129,7 +129,7 @@ def test_a_file_has_the_superseded_nodes_with_reasons(merger: Merger) -> None:
 
 def test_questions_are_answered_by_active_nodes(drives: Drives, merger: Merger) -> None:
     merged = merger.merged()
-    places = ActiveNodes(merger.index, merger.node, merged)
+    places = ActiveNodes(merger.places, merger.node, merged)
     relocalizer = Relocalizer(places, places.node, merged)
     for k, node in enumerate(sorted(merged.superseded)):
         view, _ = take_view(drives.world, drives.truth[node], np.random.default_rng(k))
@@ -182,7 +182,7 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
     merger = drives.merger(OLD, NEW, OTHER)
     merged = merger.merged()
     assert merged.superseded
-    assert {node for node in merged.poses if node in merger.index} == living(merged)
+    assert {node for node in merged.poses if node in merger.places} == living(merged)
     # Refined, it is judged again, and superseded again.
     old = next(iter(merged.superseded))
     node = merger.node(old)
@@ -190,7 +190,7 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
     before = {link.pair for link in merged.links}
     merger.apply(OLD, NodePut(node))
     merged = merger.merged()
-    assert {one for one in merged.poses if one in merger.index} == living(merged)
+    assert {one for one in merged.poses if one in merger.places} == living(merged)
     assert {link.pair for link in merged.links} == before, "what tied it ties it still"
     merger.rule(
         ManualConstraints(
@@ -198,7 +198,7 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
         )
     )
     merged = merger.merged()
-    assert not merged.superseded and all(one in merger.index for one in merged.poses)
+    assert not merged.superseded and all(one in merger.places for one in merged.poses)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -252,10 +252,10 @@ def test_nodes_of_today_are_searched_even_if_superseded(drives: Drives) -> None:
         merger.on_change(Change(MapId("r2", 1), k + 1, 0, body))
     merged = merger.merged()
     assert {node.map for node in merged.superseded} == {OLD}
-    assert all(node in merger.index for node in merged.poses)
+    assert all(node in merger.places for node in merged.poses)
     far = replace(
         nodes[0], id=NodeId("r0", 1, 99), stamp_ns=4 * 10**12, landmarks=nodes[0].landmarks.take([])
     )
     merger.apply(OLD, NodePut(far))
     merged = merger.merged()
-    assert merged.superseded and not any(node in merger.index for node in merged.superseded)
+    assert merged.superseded and not any(node in merger.places for node in merged.superseded)

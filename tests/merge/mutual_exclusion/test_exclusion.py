@@ -177,9 +177,6 @@ def test_moments_of_segments_move_with_their_nodes() -> None:
     assert trail.nodes == tuple(ids[k] for _, k, _ in expected)
     assert found[:, :2] == pytest.approx(np.array([vector[:2] for _, _, vector in expected]))
     assert np.exp(1j * found[:, 2]) == pytest.approx(np.exp([1j * vector[2] for _, _, vector in expected]))
-    assert [view.id for view in trail.views] == list(ids) and trail.view_times == pytest.approx(
-        10.0 * np.arange(1, 6)
-    )
 
 
 def test_no_evidence_without_a_common_clock() -> None:

@@ -22,6 +22,7 @@ from mapweave.merge.mutual_exclusion.exclusion import clash_of
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ExclusionSettings
+from mapweave.sim.events import Fail
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 
@@ -51,6 +52,9 @@ class Walks:
         self.nodes: list[Node] = []
         self.truth: dict[NodeId, Pose2] = {}
         with Simulation(world, ["r0", "r1"], seed) as simulation:
+            # Only the rangers are read: no picture is drawn.
+            for name in simulation.robots:
+                simulation.apply(Fail(name, "camera", "drop", 1.0))
             for instant in range(instants):
                 one, two = instant % 2, 1 - instant % 2
                 # One has arrived, two is midway.

@@ -87,7 +87,7 @@ def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expect
     maps[MapId("c", 1)] = corridor("c", scale, gap, 12)
     ids = sorted(maps)
     links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
-    finder = WrongGeometrySearch(ConsistencySettings(), 25.0)
+    finder = WrongGeometrySearch(ConsistencySettings())
     wrong = finder.wrong(maps, links.__getitem__, links.keys())
     assert (set(wrong) == {ids[2]}) is expected
     if expected:
@@ -110,5 +110,5 @@ def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch: pytest.
         return real(links, *rest)
 
     monkeypatch.setattr(wrong_geometry, "link_sets", fails)
-    found = WrongGeometrySearch(ConsistencySettings(), 25.0).wrong(maps, links.__getitem__, links.keys())
+    found = WrongGeometrySearch(ConsistencySettings()).wrong(maps, links.__getitem__, links.keys())
     assert found.keys() == {ids[2]}

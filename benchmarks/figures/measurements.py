@@ -1,0 +1,31 @@
+"""Which command measures what: one stored result each.
+
+Seeds from 700 on were used for nothing before. `DATA` stands for the folder of recordings (`--data`).
+"""
+
+from __future__ import annotations
+
+MEASUREMENTS: dict[str, str] = {
+    "ekf": "python -m benchmarks.ekf --runs 60 --seed 701 --json",
+    "ekf_speed": "python -m benchmarks.ekf_speed --seed 702 --json",
+    "servo": "python -m benchmarks.servo --trials 100 --seed 703 --json",
+    "parking": "python -m benchmarks.parking --seed 704 --json",
+    "navigate": "python -m benchmarks.navigate --runs 10 --seed 705 --json",
+    "explore": "python -m benchmarks.explore --robots 1 --minutes 3 --seed 706 --json",
+    "landmarks": "python -m benchmarks.landmarks --seed 707 --json",
+    "relocalize": "python -m benchmarks.relocalize --nodes 1000 100000 --no-peer --ceilings --seed 708 "
+    "--json",
+    "merge": "python -m benchmarks.merge --runs 6 --seed 709 --json",
+    "merge_scale": "python -m benchmarks.merge --scale 10000 --seed 710 --json",
+    "merge_sim": "python -m benchmarks.merge_sim --scenarios office --runs 1 --seed 712 --json",
+    "kitti_two": "mapweave eval merge DATA/kitti03 --robots 2 --json",
+    "kitti_three": "mapweave eval merge DATA/kitti03 --robots 3 --json",
+    "rules_fleets": "python -m benchmarks.rules --fleets 30 --seed 721 --json",
+    "rules_graphs": "python -m benchmarks.rules --g2o DATA/posegraph/intel.g2o DATA/posegraph/manhattan.g2o "
+    "--json",
+    "rules_trials": "python -m benchmarks.rules --trials warehouse twin-corridor --runs 2 --seed 722 --json",
+    "rules_places": "python -m benchmarks.rules --places 1000 --seed 708 --json",
+    "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
+    "--seed 723 --json",
+    "life": "python -m benchmarks.life --drives 6 --stops 4 --seed 713 --json",
+}

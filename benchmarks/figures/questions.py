@@ -1,0 +1,380 @@
+"""The questions of docs/figures.md, and from which results they are answered.
+
+No number of a measurement stands here: `{path/of/keys:format}` is filled in from a result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+INTRODUCTION = (
+    "`python -m benchmarks.figures` writes this page from the results in [figures/](figures/); "
+    "with `--run NAME` it measures first. No number is written by hand. *Asked* is what should hold. "
+    "Seeds from 700 on were used for nothing before."
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure, or a few of one kind.
+
+    Attributes:
+        what: is measured.
+        figure: template.
+        source: name of the result.
+        asked: value, empty where none is.
+    """
+
+    what: str
+    figure: str
+    source: str
+    asked: str = ""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A table.
+
+    Attributes:
+        title: of the section.
+        rows: of the table.
+    """
+
+    title: str
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule that rejects links, answers or frames.
+
+    Attributes:
+        name: of the rule.
+        file: where it stands.
+        fails: templates of what fails without it, each with the name of the result.
+    """
+
+    name: str
+    file: str
+    fails: tuple[tuple[str, str], ...]
+
+
+FILTERS = Question(
+    "How accurate and fast are the filters?",
+    (
+        Row(
+            "mapping filter: error over that of a batch optimum, median and 90th percentile",
+            "{rmse_ratio_to_batch_median:.3f}, {rmse_ratio_to_batch_p90:.3f}",
+            "ekf",
+            "median at most 1.02",
+        ),
+        Row(
+            "the same with 30 % wrong tracks, over that without any",
+            "{outlier30_ratio:.3f}, {outlier30_ratio_p90:.3f}",
+            "ekf",
+        ),
+        Row(
+            "mapping filter: normalised squared error of poses and landmarks (3 is ideal)",
+            "{nees_pose:.2f}, {nees_landmark:.2f}",
+            "ekf",
+        ),
+        Row(
+            "localization filter: starts up to 1 m and 1 rad wrong that converge",
+            "{localization_converged:.1%}",
+            "ekf",
+        ),
+        Row(
+            "mapping filter, a step with 30 landmarks: as robots run it; with FilterPy's algorithm; FilterPy",
+            "{step_ms_n30:.2f}, {step_ms_n30_plain:.2f}, {filterpy_step_ms_n30:.2f} ms",
+            "ekf_speed",
+            "at most 0.5 ms",
+        ),
+        Row(
+            "the same with 100 landmarks",
+            "{step_ms_n100:.1f}, {step_ms_n100_plain:.1f}, {filterpy_step_ms_n100:.1f} ms",
+            "ekf_speed",
+        ),
+    ),
+)
+DRIVING = Question(
+    "Does a robot park, arrive and explore?",
+    (
+        Row(
+            "servo on an exact unicycle: parked within 1 cm and 1 degree, never under 4 landmarks in view",
+            "{success:.0%} of {trials}",
+            "servo",
+            "100 %",
+        ),
+        Row(
+            "its way over the shortest that keeps the landmarks in view, median",
+            "{path_ratio_median:.2f}",
+            "servo",
+        ),
+        Row(
+            "the same starts by greedy switching, and by a pursuit that ignores the field of view",
+            "{rivals/greedy_2004/success:.0%}, {rivals/pursuit_without_fov/success:.0%}",
+            "servo",
+        ),
+        Row(
+            "parking with camera and filters from up to 2.5 m: within 1 cm and 1 degree",
+            "{success:.0%} of {starts}",
+            "parking",
+            "100 %",
+        ),
+        Row(
+            "its error, median and 95th percentile",
+            "{error_m_median:.1m}, {error_m_p95:.1m} mm; {error_deg_median:.1f}, {error_deg_p95:.1f} degrees",
+            "parking",
+        ),
+        Row(
+            "navigation to a node at least 4 edges away: there, within 5 cm and 5 degrees, nothing touched",
+            "{success:.0%} of {runs}",
+            "navigate",
+            "100 %",
+        ),
+        Row(
+            "its error, median; its way over the shortest on the known floor",
+            "{goal_error_m_median:.1m} mm, {goal_error_deg_median:.1f} degrees; {path_over_shortest:.2f}",
+            "navigate",
+        ),
+        Row(
+            "exploration, floor mapped a minute by one robot: by itself, by chance",
+            "{area_per_minute_ours/1:.1f}, {area_per_minute_random/1:.1f} m²",
+            "explore",
+        ),
+    ),
+)
+LANDMARKS = Question(
+    "What does a node cost, and what does it keep?",
+    (
+        Row(
+            "a node with 150 landmarks on the wire, framing included: mean, most",
+            "{bytes_per_node:.0f}, {bytes_per_node_most:.0f} bytes",
+            "landmarks",
+            "at most 3 kB",
+        ),
+        Row(
+            "right matches kept, of those that SIFT with 512 bytes a descriptor has",
+            "{inliers_ratio_to_float_sift:.1%}",
+            "landmarks",
+            "at least 97 %",
+        ),
+    ),
+)
+LOST = Question(
+    "Are lost robots answered rightly?",
+    (
+        Row(
+            "a view up to 0.3 m and 10 degrees off a node, among 1 000 and 100 000 places: right within "
+            "0.25 m and 5 degrees",
+            "{sizes/1000/recall_at_1:.0%}, {sizes/100000/recall_at_1:.0%}",
+            "relocalize",
+        ),
+        Row(
+            "views of twin rooms and of unknown buildings that are told a place, among 1 000 and 100 000",
+            "{sizes/1000/false_accept:.1%}, {sizes/100000/false_accept:.1%} of twice {queries}",
+            "relocalize",
+            "none",
+        ),
+        Row(
+            "features in, answer out, median among 1 000 places: by the clock, of the processor",
+            "{sizes/1000/p50_ms:.0f}, {sizes/1000/cpu_p50_ms:.0f} ms",
+            "relocalize",
+            "at most 15 ms",
+        ),
+        Row(
+            "the same among 100 000 places",
+            "{sizes/100000/p50_ms:.0f}, {sizes/100000/cpu_p50_ms:.0f} ms",
+            "relocalize",
+            "at most 30 ms",
+        ),
+    ),
+)
+MERGING = Question(
+    "Are maps merged rightly?",
+    (
+        Row(
+            "synthetic fleets with 80 and 90 % false links that are as good as with the true links known",
+            "{fleets/all rules/80/good}, {fleets/all rules/90/good}",
+            "rules_fleets",
+        ),
+        Row(
+            "the same: joined by no true link",
+            "{fleets/all rules/80/joined_falsely}, {fleets/all rules/90/joined_falsely}",
+            "rules_fleets",
+            "none",
+        ),
+        Row(
+            "the same by pairwise consistency and graduated non-convexity (PCM and GNC), and by GNC alone",
+            "{rivals/pcm_gnc/joined_falsely/80:.0%}, {rivals/pcm_gnc/joined_falsely/90:.0%}; "
+            "{rivals/gnc/joined_falsely/80:.0%}, {rivals/gnc/joined_falsely/90:.0%} of {runs}",
+            "merge",
+        ),
+        Row(
+            "Intel and Manhattan split among four robots: chi-square over GTSAM's batch optimum",
+            "{graphs/all rules/intel:.6f}, {graphs/all rules/manhattan:.6f}",
+            "rules_graphs",
+        ),
+        Row(
+            "a map of 10 000 nodes grows, processor time: a new node, verified; a merge after five nodes",
+            "{scale/cpu_ms_per_node/10000:.0f} ms; {scale/cpu_ms_per_merge/10000:.0f} ms",
+            "merge_scale",
+            "a node at most 50 ms",
+        ),
+        Row(
+            "false links there; memory of the server",
+            "{scale/false_links/10000:.0f} of {scale/links/10000:.0f}; {scale/rss_mb/10000:.0f} MB",
+            "merge_scale",
+        ),
+        Row(
+            "simulated office, from the first image to the merged map: false links, wrong joins, error",
+            "{false_links/office} of {links/office}, {false_merges/office}, "
+            "{merged_ate_m_median/office:.0m} mm",
+            "merge_sim",
+            "none false",
+        ),
+        Row(
+            "simulated warehouses and twin rooms on a corridor: false links",
+            "{trials/warehouse/all rules/false_links} of {trials/warehouse/all rules/links}, "
+            "{trials/twin-corridor/all rules/false_links} of {trials/twin-corridor/all rules/links}",
+            "rules_trials",
+            "none",
+        ),
+        Row(
+            "a real street (KITTI odometry 03) cut into two robots: components, false links, error",
+            "{components}, {false_links} of {links}, {merged_ate_m:.2f} m",
+            "kitti_two",
+            "one map",
+        ),
+        Row(
+            "the same cut into three",
+            "{components}, {false_links} of {links}, {merged_ate_m:.2f} m",
+            "kitti_three",
+            "one map",
+        ),
+    ),
+)
+LIFE = Question(
+    "Does a map stay small?",
+    (
+        Row(
+            "the same rooms mapped six times: active nodes over those of the first drive",
+            "{growth:.2f}",
+            "life",
+        ),
+        Row(
+            "views answered rightly from the first drive, from the active nodes, from all nodes",
+            "{recall_first:.0%}, {recall_after:.0%}, {recall_all_nodes:.0%}",
+            "life",
+        ),
+    ),
+)
+QUESTIONS = (FILTERS, DRIVING, LANDMARKS, LOST, MERGING, LIFE)
+
+
+def _fleets(rule: str) -> tuple[str, str]:
+    """What comes of fleets without a rule, and with all."""
+    good, falsely, good_all, falsely_all = (
+        ", ".join(f"{{fleets/{way}/{share}/{figure}}}" for share in (50, 80, 90))
+        for way in (rule, "all rules")
+        for figure in ("good", "joined_falsely")
+    )
+    words = (
+        f"fleets as good as with the true links known, with 50, 80, 90 % false ones: {good} instead of "
+        f"{good_all}; joined falsely: {falsely} instead of {falsely_all}"
+    )
+    return words, "rules_fleets"
+
+
+def _trials(rule: str, scenario: str) -> tuple[str, str]:
+    """What comes of simulated trials without a rule, and with all."""
+    found, whole = (
+        f"{{trials/{scenario}/{way}/false_links}} of {{trials/{scenario}/{way}/links}}"
+        for way in (rule, "all rules")
+    )
+    return f"{scenario}: false links {found} instead of {whole}", "rules_trials"
+
+
+def _places(rule: str) -> tuple[str, str]:
+    """What lost robots are told without a rule, and with all."""
+    told = (
+        "{places/WAY/wrong/twins:.1%} of twin rooms, {places/WAY/wrong/nowhere:.1%} of unknown buildings, "
+        "recall {places/WAY/recall_at_1:.1%}"
+    )
+    words = f"told a place: {told.replace('WAY', rule)} instead of {told.replace('WAY', 'all rules')}"
+    return words, "rules_places"
+
+
+RULES = (
+    Rule(
+        "independent support",
+        "merge/outlier_rejection/independent_support.py",
+        (_fleets("independent support"),),
+    ),
+    Rule(
+        "support beyond chance",
+        "merge/outlier_rejection/independent_support.py",
+        (_fleets("chance support"),),
+    ),
+    Rule("dominance", "merge/outlier_rejection/pairwise_consistency.py", (_fleets("dominance"),)),
+    Rule(
+        "refused links heard again",
+        "merge/outlier_rejection/agglomerative_joining.py",
+        (
+            (
+                "share of true links kept at 50, 80, 90 % false links: "
+                + ", ".join(
+                    f"{{fleets/refused links heard again/{share}/recall:.3f}}" for share in (50, 80, 90)
+                )
+                + " instead of "
+                + ", ".join(f"{{fleets/all rules/{share}/recall:.3f}}" for share in (50, 80, 90)),
+                "rules_fleets",
+            ),
+        ),
+    ),
+    Rule(
+        "readmission",
+        "merge/outlier_rejection/readmission.py",
+        (
+            (
+                "chi-square over the optimum of Manhattan in four: {graphs/readmission/manhattan:.3f} "
+                "instead of {graphs/all rules/manhattan:.6f}",
+                "rules_graphs",
+            ),
+        ),
+    ),
+    Rule(
+        "mutual exclusion",
+        "merge/mutual_exclusion/",
+        (_trials("mutual exclusion", "twin-corridor"),),
+    ),
+    Rule(
+        "aliased landmarks",
+        "merge/outlier_rejection/distinctness.py",
+        (
+            (
+                "warehouse: {trials/warehouse/aliased landmarks/links} links instead of "
+                "{trials/warehouse/all rules/links}, maps in {trials/warehouse/aliased landmarks/components} "
+                "pieces instead of {trials/warehouse/all rules/components}",
+                "rules_trials",
+            ),
+        ),
+    ),
+    Rule(
+        "aliased regions",
+        "mapserver/relocalization/aliased_regions.py",
+        (_places("aliased regions"),),
+    ),
+    Rule(
+        "wrong geometry",
+        "merge/outlier_rejection/wrong_geometry.py",
+        (
+            (
+                "right answers to lost robots: {rule_off/right} instead of {with_the_map/right}; fleets "
+                "whose sound maps are in pieces: {rule_off/in_pieces} instead of {with_the_map/in_pieces} of "
+                "{with_the_map/fleets}",
+                "wrong_geometry",
+            ),
+        ),
+    ),
+)

@@ -1,0 +1,104 @@
+"""What fails without each rule that rejects links or answers.
+
+    python -m benchmarks.rules --fleets N [--g2o FILE ...] [--seed N] [--json]
+    python -m benchmarks.rules --trials SCENARIO ... [--runs N] [--seed N] [--json]
+    python -m benchmarks.rules --places N [--seed N] [--json]
+
+Each rule is switched off by itself, and the same is measured as with all rules. Fleets are those of
+`benchmarks.merge`, 50, 80 and 90 % of their links false: how many are as good as least squares with the true
+links alone (`good`), joined by no true link (`joined_falsely`), and how many false links are believed. Graphs
+in files are split among four robots: chi-square over the batch optimum. Trials are those of
+`benchmarks.merge_sim`; what their robots mapped is merged once more without each rule. Places are those of
+`benchmarks.relocalize`: recall of near views, and the share of views of twin rooms and of unknown buildings
+that are told a place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.merge_sim.benchmark import SCENARIOS, SEEDS_APART
+from benchmarks.relocalize.fleet import Bench
+from benchmarks.relocalize.score import figures, wrong_by_kind
+from benchmarks.rules.fleets import SHARES, fleets, public_graphs
+from benchmarks.rules.switches import MERGE_RULES, PLACE_RULES, by_rule
+from benchmarks.rules.trials import total, trial
+from mapweave.formats.g2o import read_g2o
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+
+ROBOTS = 4
+"""Among which graphs in files are split."""
+QUERIES = 200
+"""Of each kind to lost robots."""
+
+
+def places(seed: int, count: int, progress: Progress) -> dict[str, dict[str, Any]]:
+    """Answers to lost robots on a map of so many real places."""
+    bench = Bench(seed, count, QUERIES, progress)
+    index = PlaceIndex()
+    index.extend(list(bench.nodes(count)))
+    index.settle()
+
+    def answers() -> dict[str, Any]:
+        replies = bench.asked("questions", Relocalizer(index, bench.node, bench.merged))
+        told = figures(replies)
+        wanted = ("recall_at_1", "false_accept", "wrong_place", "ambiguous", "cpu_p50_ms")
+        return {**{name: told[name] for name in wanted}, "wrong": wrong_by_kind(replies)}
+
+    return by_rule(PLACE_RULES, answers)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.rules", description=__doc__.splitlines()[0])
+    parser.add_argument("--fleets", type=int, default=0, metavar="N", help="of each share of false links")
+    parser.add_argument("--g2o", type=Path, nargs="*", default=[], metavar="FILE", help="planar pose graphs")
+    parser.add_argument("--trials", nargs="+", default=[], choices=list(SCENARIOS), metavar="SCENARIO")
+    parser.add_argument("--runs", type=int, default=1, help="of each scenario (default 1)")
+    parser.add_argument("--places", type=int, default=0, metavar="N", help="real ones on the map")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
+    arguments = parser.parse_args()
+    if min(arguments.fleets, arguments.places, arguments.seed) < 0 or arguments.runs < 1:
+        parser.error("--fleets, --places and --seed must be at least 0, --runs at least 1")
+    console = Console(stderr=True)
+    found: dict[str, Any] = {"seed": arguments.seed}
+    try:
+        graphs = {path.stem: read_g2o(path) for path in arguments.g2o}
+        with Progress(console=console) as progress:
+            if arguments.fleets:
+                wanted = len(SHARES) * arguments.fleets * (1 + len(MERGE_RULES))
+                task = progress.add_task("fleets", total=wanted)
+                found["fleets"] = by_rule(
+                    MERGE_RULES,
+                    lambda: fleets(arguments.seed, arguments.fleets, lambda: progress.advance(task)),
+                )
+            if graphs:
+                found["graphs"] = by_rule(MERGE_RULES, lambda: public_graphs(graphs, ROBOTS))
+            if arguments.places:
+                found["places"] = places(arguments.seed, arguments.places, progress)
+            task = progress.add_task("trials", total=len(arguments.trials) * arguments.runs)
+            for name in arguments.trials:
+                done = []
+                for run in range(arguments.runs):
+                    done.append(trial(name, SEEDS_APART * arguments.seed + run))
+                    progress.advance(task)
+                found.setdefault("trials", {})[name] = total(done)
+    except (MapweaveError, OSError) as problem:
+        print(f"rules: {problem}", file=sys.stderr)
+        raise SystemExit(1) from None
+    console.print_json(data=found)
+    if arguments.json:
+        print(json.dumps(found))

@@ -1,0 +1,54 @@
+"""Synthetic fleets merged with all rules, and without each."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mapweave.formats.g2o import G2oGraph
+from mapweave.merge.merging import merge_maps
+from synthetic.fleet import FleetSettings, draw_fleet
+from synthetic.merge_rivals import error, joined_falsely, oracle, precision_recall
+from synthetic.pose_graph import batch_optimum, chi2_of, factors_of, split
+
+SHARES = (50, 80, 90)
+"""Of false links, per cent."""
+GOOD = 1.1
+"""An error over that of least squares with the true links alone that is as good."""
+
+
+def fleets(seed: int, count: int, step: Callable[[], None]) -> dict[str, dict[str, float]]:
+    """What comes of so many fleets of each share of false links, by the share."""
+    out = {}
+    for share in SHARES:
+        rows = []
+        for run in range(count):
+            fleet = draw_fleet(share / 100.0, np.random.default_rng([seed, run, share]), FleetSettings())
+            merged = merge_maps(fleet.maps, fleet.links)
+            ratio = error(merged, fleet.truth) / error(oracle(fleet), fleet.truth)
+            _, recall = precision_recall(merged.links, fleet)
+            false = sum(link.pair not in fleet.true for link in merged.links)
+            rows.append((ratio <= GOOD, joined_falsely(merged, fleet), false, recall, ratio))
+            step()
+        good, falsely, false_links, recalls, ratios = zip(*rows, strict=True)
+        out[str(share)] = {
+            "good": sum(good),
+            "joined_falsely": sum(falsely),
+            "false_links": sum(false_links),
+            "recall": round(statistics.mean(recalls), 4),
+            "error_ratio_median": round(statistics.median(ratios), 4),
+        }
+    return out
+
+
+def public_graphs(graphs: dict[str, G2oGraph], robots: int) -> dict[str, Any]:
+    """Chi-square of each graph, split among robots and merged, over its batch optimum; null in pieces."""
+    out = {}
+    for name, graph in graphs.items():
+        maps, links, nodes = split(graph, robots)
+        chi2 = chi2_of(factors_of(graph), merge_maps(maps, links), nodes)
+        out[name] = None if chi2 is None else round(chi2 / batch_optimum(graph), 6)
+    return out

@@ -1,0 +1,49 @@
+"""From maps to a merged map, with what each step knows from the last time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.limits import MAX_POSITION
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.merge.islands import Islands
+from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
+from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verdicts import Verdicts
+from mapweave.merge.settings import MergeSettings
+
+
+class MergePipeline:
+    """The merge, superseding of nodes and removal of landmarks."""
+
+    def __init__(self, settings: MergeSettings, reaches: ReachabilityCache) -> None:
+        """Nothing is merged yet."""
+        self._islands = Islands(settings)
+        self._superseder = NodeSuperseder(reaches)
+        self._remover = LandmarkRemover()
+
+    def merged(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        touched: set[MapId],
+        rulings: ManualConstraints,
+    ) -> MergedMap:
+        """See `Islands.merge`.
+
+        Raises:
+            InvalidValue: a node lies where nobody could be told of it.
+        """
+        merged = self._islands.merge(maps, verdicts, touched, rulings)
+        for graph in merged.graphs:
+            # Written so that NaN fails.
+            if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():
+                raise InvalidValue(f"nodes joined with {graph.anchor} lie beyond {MAX_POSITION:g} m")
+        return self._remover.fade(self._superseder.renewed(merged))

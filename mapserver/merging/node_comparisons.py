@@ -1,0 +1,194 @@
+"""Comparing nodes: which look alike, and the verdicts on pairs of them, each found once."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from itertools import islice
+
+from mapweave.hybridmap.node import Edge, EdgeKind, Node, NodeId
+from mapweave.mapserver.merging.merger_counters import MergerCounters
+from mapweave.mapserver.merging.verification_cache import (
+    CachedVerifications,
+    VerificationCache,
+    fingerprint_of,
+)
+from mapweave.mapserver.retrieval.compared_landmarks import bounded
+from mapweave.mapserver.retrieval.place_database import PlaceDatabase
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.pairs import PairTable
+from mapweave.merge.pose_graph.verdicts import Verdict
+from mapweave.merge.pose_graph.verification import verify
+
+log = logging.getLogger(__name__)
+
+
+class NodeComparisons:
+    """The overlaps of nodes, the pairs that are compared, and the verdicts on them.
+
+    A verdict holds while both nodes stay what they are. Those of another process are taken over for nodes
+    that are just as they were.
+    """
+
+    def __init__(
+        self,
+        places: PlaceDatabase,
+        node_of: Callable[[NodeId], Node | None],
+        counters: MergerCounters,
+    ) -> None:
+        """Begin with no nodes.
+
+        Args:
+            places: says which nodes look alike.
+            node_of: gives a node by its id.
+            counters: of what is done.
+        """
+        self._places, self._node_of = places, node_of
+        self._counters = counters
+        self._pairs = PairTable()
+        self._uncompared: dict[NodeId, None] = {}
+        self._verdicts: dict[NodeId, dict[NodeId, Verdict]] = {}
+        self._cached: CachedVerifications | None = None
+        self._prints: dict[NodeId, tuple[Node, bytes]] = {}
+
+    def __len__(self) -> int:
+        """Pairs of nodes on which there is a verdict."""
+        return sum(map(len, self._verdicts.values())) // 2
+
+    def __getitem__(self, pair: Pair) -> Verdict:
+        """The verdict on a pair that was compared."""
+        return self._verdicts[pair[0]][pair[1]]
+
+    def __contains__(self, pair: Pair) -> bool:
+        """Whether there is a verdict on a pair."""
+        return pair[1] in self._verdicts.get(pair[0], {})
+
+    @property
+    def uncompared(self) -> int:
+        """Nodes that were read and for which nobody has yet looked which others are like them."""
+        return len(self._uncompared)
+
+    # Nodes come and go.
+
+    def pairs_of(self, node_id: NodeId) -> list[Pair]:
+        """The pairs of a node that are to be compared."""
+        return self._pairs.of(node_id)
+
+    def put(self, node: Node, before: Iterable[Pair] = ()) -> None:
+        """Look which nodes are like one that is in the place database.
+
+        Args:
+            node: has come, or come anew.
+            before: its pairs as it was.
+        """
+        self._pairs.put(node.id, self._places.overlaps(node, self._node_of, before))
+
+    def put_overlaps(self, node_id: NodeId, overlaps: Mapping[NodeId, float]) -> None:
+        """Take overlaps of a node with others that are known already."""
+        self._pairs.put(node_id, dict(overlaps))
+
+    def postpone(self, nodes: Iterable[Node]) -> None:
+        """Nodes for which `search_pairs` shall look which others are like them."""
+        self._uncompared.update((node.id, None) for node in nodes)
+
+    def forget(self, node_id: NodeId) -> None:
+        """Drop what was found out about a node: it is gone, or is known better."""
+        self._pairs.forget(node_id)
+        self._uncompared.pop(node_id, None)
+        for other in self._verdicts.pop(node_id, {}):
+            del self._verdicts[other][node_id]
+
+    def connect(self, edge: Edge) -> None:
+        """An edge has come."""
+        if _makes_neighbours(edge):
+            self._pairs.connect(edge.a, edge.b)
+
+    def disconnect(self, edge: Edge) -> None:
+        """An edge has gone."""
+        if _makes_neighbours(edge):
+            self._pairs.disconnect(edge.a, edge.b)
+
+    # Pairs are compared.
+
+    def search_pairs(self, most: int | None = None) -> None:
+        """Look for what is like the nodes that were read, or like so many of them."""
+        for node_id in list(islice(self._uncompared, most)):
+            del self._uncompared[node_id]
+            if (node := self._node_of(node_id)) is not None:
+                cached = self._cached
+                source = cached if cached is not None and cached.knows(node) else self._places
+                try:
+                    self._pairs.put(node_id, source.overlaps(node, self._node_of))
+                except Exception:  # a defect with one node must not hold up all others
+                    log.exception("nobody can say which nodes are like %s: it is compared with none", node_id)
+
+    def changes(self) -> list[tuple[Pair, Verdict | None]]:
+        """Compare what is to be compared, and tell what has changed since this was asked last.
+
+        Returns:
+            Pairs in the order of ids, each with its verdict; None if it is not to be compared, or gone.
+        """
+        changed = self._pairs.changed()
+        self.verify(pair for pair in changed if pair in self._pairs)
+        return [(pair, self[pair] if pair in self._pairs and pair in self else None) for pair in changed]
+
+    def verify(self, pairs: Iterable[Pair]) -> None:
+        """Compare pairs on which there is no verdict yet."""
+        for pair in pairs:
+            a, b = self._node_of(pair[0]), self._node_of(pair[1])
+            if pair in self or a is None or b is None:
+                continue
+            verdict: Verdict
+            try:
+                verdict = verify(bounded(a), bounded(b))
+            except Exception as error:  # a defect with two nodes must not hold up all others
+                log.exception("%s and %s cannot be compared", a.id, b.id)
+                verdict = RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})")
+            self.judge(pair, verdict)
+            self._counters.verified += 1
+            self._counters.recognised += isinstance(verdict, Link)
+
+    def judge(self, pair: Pair, verdict: Verdict) -> None:
+        """Take a verdict that is known already."""
+        for one, other in (pair, pair[::-1]):
+            self._verdicts.setdefault(one, {})[other] = verdict
+
+    # What was found outlives the process.
+
+    @property
+    def recollecting(self) -> bool:
+        """Whether there are findings of before that have not been taken over yet."""
+        return self._cached is not None
+
+    def recollect(self, findings: VerificationCache) -> None:
+        """Believe what was found before of nodes that are just as they were; what is not read by then."""
+        self._cached = CachedVerifications(findings)
+
+    def take_over(self) -> None:
+        """Take over all verdicts of before, once nodes are read; whatever comes now is found anew."""
+        if self._cached is not None:
+            for pair, verdict in self._cached.verdicts(self._node_of):
+                if pair not in self:
+                    self.judge(pair, verdict)
+            self._cached = None
+
+    def findings(self, nodes: Iterable[Node]) -> VerificationCache:
+        """What was found of those of these nodes that are compared."""
+        before, self._prints = self._prints, {}
+        for node in nodes:
+            known = before.get(node.id)
+            same = known is not None and known[0] is node
+            self._prints[node.id] = known if known and same else (node, fingerprint_of(node))
+        prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
+        verdicts = {(a, b): v for a, known in self._verdicts.items() for b, v in known.items() if a < b}
+        return VerificationCache(prints, self._pairs.overlaps(), verdicts)
+
+
+def _makes_neighbours(edge: Edge) -> bool:
+    """Whether an edge says that two nodes are near to each other on their robot's way.
+
+    These are not compared: it tells nothing new. A later drive says nothing of that, and nobody says it of
+    others' nodes.
+    """
+    return edge.kind is not EdgeKind.DRIVEN and edge.within

@@ -1,0 +1,191 @@
+"""The place database: the one owner of the place index. It builds, updates and saves it; all others ask.
+
+A node can be found as soon as it is announced. Superseded nodes of an earlier drive leave the index, so that
+a new node costs the same on every drive. Nodes of today stay in it, superseded or not: while maps are being
+made, links between all of them tell true merges from false ones.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.retrieval import voting
+from mapweave.mapserver.retrieval.compared_landmarks import bounded
+from mapweave.mapserver.retrieval.index_file import load, save
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
+
+log = logging.getLogger(__name__)
+
+SUFFIX = ".places"
+"""Of the index's file, behind the store's name."""
+EVERY = 600.0
+"""Seconds between two looks whether there is something new to save."""
+WORTHWHILE = 0.02
+"""Share of the nodes that must be new before a running server saves the index."""
+SETTLED = 3600.0
+"""s on the robot's own clock after which what it saw is no longer of today."""
+SECOND = 1_000_000_000
+
+NodeOf = Callable[[NodeId], Node | None]
+"""Gives a node by its id; None if it is gone."""
+
+
+class PlaceDatabase:
+    """Nodes by what they look like, in memory or beside a store.
+
+    One thread, the merging one, changes it, but for `announce`; any thread may ask.
+    """
+
+    def __init__(self, store: Store | None = None, path: Path | None = None) -> None:
+        """Begin with what was saved, as far as the store still holds it.
+
+        Args:
+            store: says which nodes there are; None: start empty, and never save.
+            path: of the store's file; the index lies beside it.
+        """
+        self._store = store
+        self._path = None if path is None else path.with_name(path.name + SUFFIX)
+        self._index = self._restored()
+        self._saved = self._index.version
+        self._left_out: set[NodeId] = set()
+        self._newest: dict[str, tuple[int, int]] = {}
+
+    # Ask.
+
+    def __len__(self) -> int:
+        """How many nodes can be found."""
+        return len(self._index)
+
+    def __contains__(self, node_id: NodeId) -> bool:
+        """Whether a node can be found."""
+        return node_id in self._index
+
+    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
+        """At most k nodes with how much they look like a view, best first; see `PlaceIndex.query`."""
+        return self._index.query(view, k, exclude)
+
+    def overlaps(
+        self, node: Node, node_of: NodeOf, before: Iterable[Sequence[NodeId]] = ()
+    ) -> dict[NodeId, float]:
+        """Which nodes a node is compared with, and by how much they overlap; see `PlaceIndex.overlaps`.
+
+        Args:
+            node: itself need not be in the database.
+            node_of: gives another node by its id.
+            before: pairs of nodes in which it was; of these also those that were left out are compared.
+        """
+        found = self._index.overlaps(node, node_of)
+        for other_id in {one for pair in before for one in pair} & self._left_out:
+            other = node_of(other_id)
+            if other is not None and other_id != node.id:
+                codes, others = (bounded(one).landmarks.codes for one in (node, other))
+                value = voting.pair_overlap(codes, others, ALIKE)
+                if value >= LEAST_OVERLAP:
+                    found[other_id] = value
+        return found
+
+    # Update.
+
+    def announce(self, node: Node) -> None:
+        """Let a node be found before it is put; any thread may do so."""
+        self._index.add(node)
+
+    def observe(self, node: Node) -> None:
+        """Take note of a node before it is put: what its robot saw long before is no longer of today."""
+        self._left_out.discard(node.id)
+        told = node.id.epoch, node.stamp_ns
+        self._newest[node.id.agent] = max(told, self._newest.get(node.id.agent, told))
+
+    def put(self, nodes: Iterable[Node]) -> None:
+        """Put nodes, or put them anew; many at once cost less than one by one."""
+        self._index.extend(nodes)
+
+    def remove(self, node: Node | None, node_id: NodeId) -> None:
+        """Forget a node for good.
+
+        Args:
+            node: as it was, if that is known: then it is found faster.
+            node_id: its id.
+        """
+        self._left_out.discard(node_id)
+        self._index.remove(node_id, None if node is None else node.landmarks.codes)
+
+    def leave_out(self, superseded: Collection[NodeId], node_of: NodeOf) -> dict[NodeId, dict[NodeId, float]]:
+        """Leave out the superseded nodes of earlier drives, and no others.
+
+        Args:
+            superseded: by the newest merge.
+            node_of: gives a node by its id.
+
+        Returns:
+            The nodes that are taken in again, each with its overlaps.
+        """
+        past = {node_id for node_id in superseded if self._is_past(node_id, node_of)}
+        revived = {}
+        for node_id in sorted(self._left_out - past):
+            if (node := node_of(node_id)) is not None:
+                self._index.add(node)
+                revived[node_id] = self._index.overlaps(node, node_of)
+        for node_id in sorted(past - self._left_out):
+            node = node_of(node_id)
+            self._index.remove(node_id, None if node is None else node.landmarks.codes)
+        self._left_out = past
+        return revived
+
+    def _is_past(self, node_id: NodeId, node_of: NodeOf) -> bool:
+        """Whether its robot is in a later epoch by now, or was there long after it."""
+        node = node_of(node_id)
+        if node is None:
+            return True
+        epoch, stamp_ns = self._newest.get(node_id.agent, (node_id.epoch, node.stamp_ns))
+        return epoch > node_id.epoch or stamp_ns - node.stamp_ns > SETTLED * SECOND
+
+    # Save.
+
+    def save_if_worthwhile(self) -> None:
+        """Save the index if enough is new; called every so many seconds."""
+        (before, _), (now, nodes) = self._saved, self._index.version
+        # A large index is not written for a few nodes: they are soon put in again.
+        if now - before >= WORTHWHILE * nodes:
+            self._save()
+
+    def close(self) -> None:
+        """Save for the last time; nobody may change the database any more."""
+        self._save()
+
+    def _restored(self) -> PlaceIndex:
+        if self._store is None or self._path is None:
+            return PlaceIndex()
+        began, logs = time.monotonic(), self._store.positions()
+        try:
+            index = load(self._path, logs)
+        except InvalidFile as error:
+            if logs:
+                log.info("the place index is made anew: %s", error)
+            return PlaceIndex()
+        gone = index.retain(self._store.present())
+        log.info(
+            "the place index of %d nodes is as it was saved; %d are gone; %.1f s",
+            len(index), gone, time.monotonic() - began,
+        )  # fmt: skip
+        return index
+
+    def _save(self) -> None:
+        state = self._index.version
+        if self._store is None or self._path is None or state == self._saved:
+            return
+        try:
+            # The logs first: what comes meanwhile may be in the index, but is not claimed.
+            save(self._path, self._index, self._store.positions())
+        except InvalidFile as error:
+            log.warning("%s; the next start takes longer", error)
+            return
+        self._saved = state

@@ -1,0 +1,46 @@
+"""Where an image was taken, by a map file alone: no server, no network."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.active_nodes import ActiveNodes
+from mapweave.mapserver.map_files import merged_of
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.storage.map_file import MapFile
+from mapweave.vision.lens import Distortion, Lens
+from mapweave.vision.sift import Sift
+
+
+def relocalizer_of(content: MapFile) -> Relocalizer:
+    """A relocalizer that answers from a map file as a map server answers from its store.
+
+    Args:
+        content: a robot's own map or a merged one. Nodes that are superseded, retired or faded count as such.
+
+    Raises:
+        InvalidFile: the file's measurements determine no poses.
+    """
+    merged = merged_of(content)
+    nodes = {node.id: node for one in merged.maps.values() for node in one.nodes.values()}
+    index = PlaceIndex()
+    index.extend(list(nodes.values()))
+    active = ActiveNodes(index, nodes.get, merged)
+    return Relocalizer(active, active.node, merged)
+
+
+def view_of(
+    image: NDArray[np.uint8], camera: Camera, distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+) -> View:
+    """The features of an image, for `Relocalizer.answer`.
+
+    Args:
+        image: (H, W) grey, as it comes from the camera.
+        camera: that took it; its mount says where on the robot it is.
+        distortion: of its lens, OpenCV's five coefficients.
+    """
+    return Sift(Lens(camera, distortion)).extract(image).view(camera)

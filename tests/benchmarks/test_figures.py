@@ -1,0 +1,60 @@
+"""docs/figures.md: it is what its generator makes of the stored results."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.figures.benchmark import PAGE, written_page
+from benchmarks.figures.measurements import MEASUREMENTS
+from benchmarks.figures.page import filled
+from benchmarks.figures.results import FOLDER, load, run, store
+from benchmarks.rules.switches import MERGE_RULES, PLACE_RULES, TRIAL_RULES
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+
+
+def test_the_page_is_made_of_the_stored_results() -> None:
+    assert PAGE.read_text(encoding="utf-8") == written_page(), "python -m benchmarks.figures"
+
+
+def test_each_stored_result_is_of_the_command_that_is_named() -> None:
+    assert {path.stem for path in FOLDER.glob("*.json")} == set(MEASUREMENTS)
+    assert {name: load(name).command for name in MEASUREMENTS} == MEASUREMENTS
+
+
+def test_figures_are_filled_in() -> None:
+    figures = {"a": {"b c": 0.0123, "80": None}, "n": 7}
+    template = "{a/b c:.1m} mm, {a/b c:.1%}, {n} of {n:.2f}, {a/80:.0f}"
+    assert filled(template, figures) == "12.3 mm, 1.2%, 7 of 7.00, none"
+    with pytest.raises(InvalidValue, match="no figure a/x"):
+        filled("{a/x}", figures)
+
+
+def test_the_last_line_of_a_command_is_kept(tmp_path: Path) -> None:
+    script = tmp_path / "measure.py"
+    script.write_text("import sys\nprint('words')\nprint('{\"argument\": \"%s\"}' % sys.argv[1])\n")
+    result = run(f"python {script} DATA/x", Path("there"))
+    assert result.figures == {"argument": "there/x"} and result.command == f"python {script} DATA/x"
+    path = store("one", result, tmp_path)
+    assert load("one", tmp_path) == result and json.loads(path.read_text())["machine"] == result.machine
+
+
+@pytest.mark.parametrize(
+    ("text", "why"), [("print('no figures')", "no JSON object"), ("raise SystemExit(3)", "exit status 3")]
+)
+def test_a_command_without_figures_is_said(tmp_path: Path, text: str, why: str) -> None:
+    script = tmp_path / "measure.py"
+    script.write_text(text)
+    with pytest.raises(InvalidValue, match=why):
+        run(f"python {script}", None)
+    with pytest.raises(InvalidValue, match="--data"):
+        run(f"python {script} DATA/x", None)
+    with pytest.raises(InvalidFile, match="--run missing"):
+        load("missing", tmp_path)
+
+
+def test_what_is_switched_off_is_there() -> None:
+    """A rule that has gone or was renamed is named here too."""
+    for name, switches in {**MERGE_RULES, **TRIAL_RULES, **PLACE_RULES}.items():
+        for where, function, _ in switches:
+            assert hasattr(where, function), name

@@ -1,0 +1,85 @@
+"""The verdict names its outcome, and the answer says it in words."""
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, View
+from mapweave.mapserver.relocalization import verdict
+from mapweave.mapserver.relocalization.candidates import retrieve
+from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
+from mapweave.mapserver.relocalization.verdict import Outcome
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from synthetic.world import room, take_node, take_view
+
+WORLD = room(0, 0, 5, 4, 600, np.random.default_rng(1))
+AT, ASIDE = Pose2(2.2, 2.0, 0.2), Pose2(2.2, 2.0, 3.0)
+VIEW = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.02), np.random.default_rng(4))[0]
+NODE = take_node(
+    WORLD, NodeId("r0", 1, 1), AT, PoseGaussian.from_sigmas(Pose2(), 0.02, 0.01), np.random.default_rng(2)
+)
+LEAST = RelocalizationSettings().recognition.least_inliers
+
+
+class Ranked:
+    """Retrieval that finds one node, and counts how often it is asked."""
+
+    def __init__(self, *ranked: tuple[NodeId, float]) -> None:
+        self.ranked, self.asked = list(ranked), 0
+
+    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+        self.asked += 1
+        return self.ranked
+
+
+def few(count: int) -> View:
+    return View(VIEW.pixels[:count], VIEW.codes[:count], VIEW.camera)
+
+
+FOUND = Ranked((NODE.id, 2.0))
+OTHER_WAY = take_view(WORLD, ASIDE, np.random.default_rng(5))[0]
+
+
+@pytest.mark.parametrize(
+    ("view", "index", "nodes", "alone", "outcome", "words"),
+    [
+        (
+            few(LEAST - 1),
+            FOUND,
+            {NODE.id: NODE},
+            18,
+            Outcome.FEW_FEATURES,
+            f"the view has {LEAST - 1} features",
+        ),
+        (VIEW, Ranked(), {}, 18, Outcome.NO_CANDIDATE, "no node of any map"),
+        (VIEW, FOUND, {}, 18, Outcome.NOT_RECOGNISED, "are gone"),
+        (OTHER_WAY, FOUND, {NODE.id: NODE}, 18, Outcome.NOT_RECOGNISED, f"nearest is {NODE.id}"),
+        (VIEW, FOUND, {NODE.id: NODE}, 1000, Outcome.ONE_WEAK_NODE, "no other node says the same"),
+        (VIEW, FOUND, {NODE.id: NODE}, 18, Outcome.FOUND, f"landmarks of {NODE.id} agree"),
+    ],
+    ids=["few features", "no candidate", "gone", "not recognised", "one weak node", "found"],
+)
+def test_each_outcome(
+    view: View,
+    index: Ranked,
+    nodes: dict[NodeId, Node],
+    alone: int,
+    outcome: Outcome,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(verdict, "ALONE", alone)
+    service = Relocalizer(index, nodes.get, MergedMap.empty())
+    candidates = retrieve(view, index, LEAST)
+    decided = service.selection.decide(service.registration.register(candidates))
+    assert decided.outcome is outcome
+    answer = service.answer(view)
+    assert words in answer.reason
+    assert (answer.certainty is Certainty.FOUND) == (outcome is Outcome.FOUND) == bool(answer.candidates)
+
+
+def test_retrieval_is_not_asked_about_a_view_that_cannot_be_registered() -> None:
+    index = Ranked((NODE.id, 2.0))
+    assert not retrieve(few(LEAST - 1), index, LEAST).ranked and not index.asked
+    assert retrieve(VIEW, index, LEAST).ranked == [(NODE.id, 2.0)] and index.asked == 1

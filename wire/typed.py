@@ -1,0 +1,239 @@
+"""Conversion between values and plain data: dataclasses become maps of their fields, at any depth.
+
+`packed` returns what MessagePack and JSON accept: numbers, text, bytes, lists and maps. `decode` returns the
+value. `msgspec.convert` checks every type and range; a value checks what else it requires when it is created.
+
+Some types have their own form, see docs/wire.md: poses are 36 bytes, a node is the body of its change, an
+array is `[kind, shape, bytes]`, a map with node ids as keys is a list of pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from functools import cache, reduce
+from operator import or_
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
+from mapweave.hybridmap.limits import MAX_FLOAT, Coordinate
+from mapweave.hybridmap.manual_constraint import Ends
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.wire.codec import decode_body, encode_body
+from mapweave.wire.packing import Limit, pack, unpack
+from mapweave.wire.pose_codec import pack_camera, pack_pose, unpack_camera, unpack_pose
+
+Value = TypeVar("Value")
+Packers = Mapping[type, Callable[[Any], Any]]
+
+
+class Form(NamedTuple):
+    """How values of a type are read.
+
+    Attributes:
+        plain: type of the plain data.
+        read: returns the value; raises InvalidMessage or InvalidValue.
+    """
+
+    plain: Any
+    read: Callable[[Any], Any]
+
+
+def _node(data: bytes) -> Node:
+    body = decode_body(data)
+    if not isinstance(body, NodePut):
+        raise InvalidMessage("not a node")
+    return body.node
+
+
+def _edge(data: bytes) -> Edge:
+    body = decode_body(data)
+    if not isinstance(body, EdgePut):
+        raise InvalidMessage("not an edge")
+    return body.edge
+
+
+def _ends(ends: tuple[list[Any], list[Any]]) -> Any:
+    return tuple(_convert(end, NodeId if len(end) == 3 else MapId) for end in ends)
+
+
+def _events(events: list[dict[str, Any]]) -> tuple[MapEvent, ...]:
+    """Skips events of unknown kinds: a newer program may have written them."""
+    kinds = set(MapEventKind)
+    read = (event for event in events if not isinstance(event.get("kind"), str) or event["kind"] in kinds)
+    return tuple(_convert(event, _schema(MapEvent)) for event in read)
+
+
+FORMS: dict[Any, Form] = {
+    PoseGaussian: Form(bytes, unpack_pose),
+    Pose2: Form(tuple[Coordinate, Coordinate, Coordinate], lambda numbers: Pose2(*numbers)),
+    Camera: Form(bytes, unpack_camera),
+    ChangeBody: Form(bytes, decode_body),
+    Node: Form(bytes, _node),
+    Edge: Form(bytes, _edge),
+    Ends: Form(tuple[list[Any], list[Any]], _ends),
+    tuple[MapEvent, ...]: Form(list[dict[str, Any]], _events),
+}
+PACKERS: Packers = {
+    PoseGaussian: pack_pose,
+    Pose2: lambda pose: [pose.x, pose.y, pose.heading],
+    Camera: pack_camera,
+    Node: lambda node: encode_body(NodePut(node)),
+    Edge: lambda edge: encode_body(EdgePut(edge)),
+    **dict.fromkeys((NodePut, NodeRetired, EdgePut, EdgeRetired), encode_body),
+    np.ndarray: lambda array: [array.dtype.str[1:], array.shape, array.tobytes()],
+}
+
+
+def packed(value: Any, packers: Packers = PACKERS) -> Any:
+    """Return a value as plain data.
+
+    Args:
+        value: dataclasses, lists, maps, and the types of `packers`, nested in any way.
+        packers: functions for types with their own form.
+
+    Raises:
+        InvalidValue: a number is out of the range of messages.
+    """
+    if (pack_value := packers.get(type(value))) is not None:
+        return pack_value(value)
+    if is_dataclass(value):
+        return {field.name: packed(getattr(value, field.name), packers) for field in fields(value)}
+    match value:
+        case msgspec.Struct():
+            return msgspec.to_builtins(value, builtin_types=(bytes,))
+        case Enum():
+            return value.value
+        case float():
+            return min(max(float(value), -MAX_FLOAT), MAX_FLOAT)
+        case np.generic():
+            return value.item()
+        case Mapping() if any(isinstance(key, tuple) for key in value):
+            return [[packed(key, packers), packed(element, packers)] for key, element in value.items()]
+        case Mapping():
+            return {key: packed(element, packers) for key, element in value.items()}
+        case tuple() | list():
+            return [packed(element, packers) for element in value]
+        case frozenset():
+            return [packed(element, packers) for element in sorted(value)]
+    return value
+
+
+def encode(value: Any, limit: Limit) -> bytes:
+    """Encode a value as a message.
+
+    Raises:
+        InvalidValue: it would not decode.
+    """
+    data = pack(packed(value))
+    try:
+        # The same rule for both sides: nothing is sent that a receiver would refuse.
+        decode(data, type(value), limit)
+    except InvalidMessage as error:
+        raise InvalidValue(str(error)) from None
+    return data
+
+
+def decode(data: bytes, kind: type[Value], limit: Limit) -> Value:
+    """Decode a message.
+
+    Raises:
+        InvalidMessage: the message is invalid; one line says why.
+    """
+    schema: Any = kind
+    value: Value = unpack(data, _schema(schema), limit, _read)
+    return value
+
+
+class _Opaque(type):
+    """Metaclass of types that msgspec passes to `_read`. It accepts every value that `_read` returns."""
+
+    def __instancecheck__(cls, value: object) -> bool:
+        return True
+
+
+@cache
+def _opaque(kind: Any) -> type:
+    return _Opaque("Opaque", (), {"kind": kind})
+
+
+@cache
+def _schema(kind: Any) -> Any:
+    """Return the type for msgspec: dataclasses and types with their own form are opaque in it.
+
+    msgspec would read a dataclass itself, without the forms of the types within.
+    """
+    origin, inner = get_origin(kind), get_args(kind)
+    by_id = origin is Mapping and inner[0] is NodeId
+    if kind in FORMS or is_dataclass(kind) or origin is np.ndarray or by_id:
+        return _opaque(kind)
+    if origin is None or origin is Literal:
+        return kind
+    if origin is Annotated:
+        return Annotated[_schema(inner[0]), *kind.__metadata__]
+    if origin in (Union, UnionType):
+        members = [member for member in inner if member is not NoneType]
+        if len(members) < len(inner):
+            return _schema(reduce(or_, members)) | None
+        return reduce(or_, map(_schema, members))
+    return origin[tuple(member if member is ... else _schema(member) for member in inner)]
+
+
+@cache
+def _fields(kind: Any) -> type[msgspec.Struct]:
+    """Return the fields of a dataclass as a struct; those with a default may be missing in a message."""
+    hints, declared = get_type_hints(kind, include_extras=True), []
+    for field in fields(kind):
+        given: dict[str, Any] = {"default": field.default, "default_factory": field.default_factory}
+        default = msgspec.field(**{name: value for name, value in given.items() if value is not MISSING})
+        declared.append((field.name, _schema(hints[field.name]), default))
+    return msgspec.defstruct(kind.__name__, declared, kw_only=True)
+
+
+def _convert(plain: Any, kind: Any) -> Any:
+    return msgspec.convert(plain, kind, builtin_types=(bytes,), dec_hook=_read)
+
+
+def _read(opaque: Any, plain: Any) -> Any:
+    try:
+        return _value(opaque.kind, plain)
+    except (msgspec.ValidationError, MapweaveError) as error:
+        # msgspec adds the path to a ValueError.
+        raise ValueError(str(error).splitlines()[0]) from None
+
+
+def _value(kind: Any, plain: Any) -> Any:
+    if kind in FORMS:
+        form = FORMS[kind]
+        return form.read(_convert(plain, form.plain))
+    if is_dataclass(kind):
+        make: Any = kind
+        read = _convert(plain, _fields(make))
+        return make(**{name: getattr(read, name) for name in read.__struct_fields__})
+    if get_origin(kind) is np.ndarray:
+        return _array(np.dtype(get_args(get_args(kind)[1])[0]), *_convert(plain, _Array))
+    pair: Any = tuple[tuple(map(_schema, get_args(kind)))]  # type: ignore[misc]
+    # An empty map is packed as a map: nothing says what its keys would be.
+    return dict(_convert(plain, list[pair] | _EmptyMap))
+
+
+_EmptyMap = Annotated[dict[str, Any], Meta(max_length=0)]
+_Array = tuple[str, Annotated[list[Annotated[int, Meta(ge=0)]], Meta(max_length=3)], bytes]
+
+
+def _array(dtype: np.dtype[Any], kind: str, shape: list[int], data: bytes) -> NDArray[Any]:
+    if kind != dtype.str[1:] or len(data) != math.prod(shape) * dtype.itemsize:
+        raise InvalidValue(f"{len(data)} bytes of kind {kind[:8]} are not an array of {shape} {dtype}")
+    return np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype).reshape(shape)
