@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import termios
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -37,7 +38,7 @@ class SerialPort:
             self._serial: Any = serial.serial_for_url(
                 path, baud, stopbits=stop_bits, timeout=TIMEOUT, write_timeout=TIMEOUT, exclusive=True
             )
-        except (serial.SerialException, ValueError, OSError) as error:
+        except (serial.SerialException, termios.error, ValueError, OSError) as error:
             raise DeviceError(f"{path}: {_reason(error)}") from error
 
     @property
@@ -47,7 +48,7 @@ class SerialPort:
 
     def close(self) -> None:
         """Close the port. Never raises."""
-        with contextlib.suppress(serial.SerialException, OSError):
+        with contextlib.suppress(serial.SerialException, termios.error, OSError):
             self._serial.close()
 
     def write(self, data: bytes) -> None:
@@ -109,13 +110,14 @@ class SerialPort:
     def _failing(self) -> Iterator[None]:
         try:
             yield
-        except (serial.SerialException, OSError, TypeError) as error:
+        except (serial.SerialException, termios.error, OSError, TypeError) as error:
             # TypeError: pyserial's, if a port is closed while it is read.
             raise DeviceError(f"{self.path}: {_reason(error)}") from error
 
 
 def _reason(error: Exception) -> str:
-    number = getattr(error, "errno", None)
+    # The errors of termios have their number as the first argument, and no attribute.
+    number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
     words = str(error)
     if number == 2 or "No such file" in words:
         return "there is no such port; is the robot connected and switched on?"
@@ -125,4 +127,5 @@ def _reason(error: Exception) -> str:
         return "is in use by another process"
     if isinstance(error, serial.SerialTimeoutException):
         return f"takes no bytes for {TIMEOUT:g} s"
-    return "the port is gone" if number == 5 or "disconnected" in words else " ".join(words.split())
+    gone = number == 5 or "disconnected" in words or "Errno 5" in words
+    return "the port is gone" if gone else " ".join(words.split())

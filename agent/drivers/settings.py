@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
@@ -13,6 +15,8 @@ from mapweave.hybridmap.errors import SettingsError
 
 REMOTE = "remote"
 """The driver of a robot base behind Zenoh keys, for example a simulated one."""
+
+Positive = Annotated[float, Meta(gt=0.0)]
 
 
 @dataclass(frozen=True)
@@ -34,17 +38,17 @@ class CameraSettings:
         lock_exposure: fix exposure and white balance after the first second.
     """
 
-    width: int
-    height: int
-    fx: float
-    fy: float
+    width: Annotated[int, Meta(ge=16, le=16384)]
+    height: Annotated[int, Meta(ge=16, le=16384)]
+    fx: Positive
+    fy: Positive
     cx: float
     cy: float
     height_m: float
     forward_m: float = 0.0
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     source: str = "0"
-    delay: float = 0.0
+    delay: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
     lock_exposure: bool = False
 
     @property
@@ -69,13 +73,13 @@ class Geometry:
         ranger_reach: the proximity sensors' maximum, m.
     """
 
-    radius: float | None = None
-    axle: float | None = None
-    wheel_noise: float | None = None
-    max_forward: float | None = None
-    max_turn: float | None = None
+    radius: Positive | None = None
+    axle: Positive | None = None
+    wheel_noise: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
+    max_forward: Positive | None = None
+    max_turn: Positive | None = None
     ranger_bearings_deg: tuple[float, ...] | None = None
-    ranger_reach: float | None = None
+    ranger_reach: Positive | None = None
 
     def over(self, defaults: Geometry) -> Geometry:
         """These values where given, the defaults elsewhere."""
@@ -106,7 +110,7 @@ class RobotSettings:
             known: values of the driver.
 
         Raises:
-            SettingsError: there is no camera, or a length is missing or not positive.
+            SettingsError: there is no camera, or a dimension is missing.
         """
         if self.camera is None:
             raise SettingsError(
@@ -114,11 +118,8 @@ class RobotSettings:
             )
         geometry = self.geometry.over(known)
         for name in ("radius", "axle", "max_forward", "max_turn"):
-            value = getattr(geometry, name)
-            if value is None:
+            if getattr(geometry, name) is None:
                 raise SettingsError(f"[robot.geometry] {name} is missing: the driver cannot know it")
-            if not value > 0.0:
-                raise SettingsError(f"[robot.geometry] {name} = {value:g} must be positive")
         assert geometry.radius and geometry.axle and geometry.max_forward and geometry.max_turn
         given = RobotDescription(
             self.camera.intrinsics,

@@ -50,11 +50,11 @@ def test_what_has_no_default_is_printed_as_a_comment() -> None:
     off = re.findall(r"^#(\w+) =", as_toml(), re.MULTILINE)
     assert sorted(off) == sorted(item.name for item in OPTIONAL)
     text = re.sub(r"^#(\[|\w+ =)", r"\1", as_toml(), flags=re.MULTILINE)
-    text = re.sub(
-        r"= *$", "= 1", text.replace("ranger_bearings_deg =", "ranger_bearings_deg = [1]"), flags=re.MULTILINE
-    )
+    text = text.replace("ranger_bearings_deg =", "ranger_bearings_deg = [1]")
+    text = text.replace("wheel_noise =", "wheel_noise = 0.1")
+    text = re.sub(r"= *$", "= 64", text, flags=re.MULTILINE)
     settings = build(Settings, tomllib.loads(text), "filled in")
-    assert settings.robot.camera is not None and settings.robot.geometry.axle == 1.0
+    assert settings.robot.camera is not None and settings.robot.geometry.axle == 64.0
 
 
 def test_each_has_a_text_and_the_page_counts_them() -> None:

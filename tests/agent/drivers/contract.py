@@ -39,7 +39,8 @@ from pathlib import Path
 from mapweave.agent.drivers.registry import find_driver
 from mapweave.agent.observation import Command
 from mapweave.settings import load_settings
-settings = load_settings(Path(sys.argv[1])).robot
+path = Path(sys.argv[1])
+settings = load_settings(path).robot
 robot = find_driver(settings.driver)(settings)
 while True:
     robot.sense()
