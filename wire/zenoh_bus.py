@@ -198,7 +198,7 @@ class ZenohBus:
                         self._session = session
                         return
                     except NotConnected:
-                        # The interpreter is ending; then nobody waits for this bus.
+                        # The interpreter is ending; then no caller waits for this bus.
                         if threading.main_thread().is_alive():
                             raise
             session.close()  # type: ignore[no-untyped-call]

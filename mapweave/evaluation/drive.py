@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
-
-import numpy as np
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings
+from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import LEVELS, Verdict
 from mapweave.hybridmap.change import Change
-from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.hybridmap.query import Certainty
@@ -33,51 +28,6 @@ TURN = math.radians(20.0)
 """and had that heading, within this, rad."""
 NEAR = (LEVELS[-1][0], math.degrees(TURN))
 """A node is the right place if it is that near, m and degrees."""
-
-
-@dataclass(frozen=True)
-class Truth:
-    """Where the camera was.
-
-    Attributes:
-        stamps_ns: (N,) ascending.
-        poses: one each.
-    """
-
-    stamps_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
-    poses: list[Pose2]
-
-    @classmethod
-    def read(cls, path: Path) -> Truth:
-        """Read a truth.csv; one that is missing is empty.
-
-        Raises:
-            DeviceError: it is there, but wrong.
-        """
-        if not path.exists():
-            return cls(np.zeros(0, np.int64), [])
-        try:
-            with path.open(newline="") as file:
-                rows = [[float(row[name]) for name in COLUMNS] for row in csv.DictReader(file)]
-            poses = [Pose2(x, y, heading) for _, x, y, heading in rows]
-            stamps = np.array([round(row[0] * 1e9) for row in rows], np.int64)
-        except KeyError as missing:
-            raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
-        except (OSError, ValueError, TypeError, OverflowError, csv.Error, InvalidValue) as error:
-            raise DeviceError(f"{path}: {error}") from None
-        if (np.diff(stamps) <= 0).any():
-            raise DeviceError(f"{path}: stamps must ascend")
-        return cls(stamps, poses)
-
-    def at(self, stamp_ns: int) -> Pose2 | None:
-        """The pose at a stamp, if there is one within a millisecond."""
-        if not self.poses:
-            return None
-        nearest = int(np.abs(self.stamps_ns - stamp_ns).argmin())
-        return self.poses[nearest] if abs(int(self.stamps_ns[nearest]) - stamp_ns) <= 1_000_000 else None
-
-
-COLUMNS = ("stamp_s", "x_m", "y_m", "heading_rad")
 
 
 class DriveMap:

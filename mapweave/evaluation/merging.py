@@ -18,9 +18,9 @@ from mapweave.agent.mission import Carried
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings
 from mapweave.drawing.map_picture import MapPicture, draw_map
-from mapweave.evaluation.drive import Truth
 from mapweave.evaluation.map_score import FALSE_LINK, FALSE_LINK_TURN, link_recall, pose_error, score_map
 from mapweave.evaluation.pieces import pieces
+from mapweave.evaluation.truth import Truth
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import DeviceError, InvalidFile
 from mapweave.hybridmap.node import Edge, MapId, NodeId

@@ -15,9 +15,10 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_of
 from mapweave.agent.settings import AgentSettings
-from mapweave.evaluation.drive import DriveMap, Truth
+from mapweave.evaluation.drive import DriveMap
 from mapweave.evaluation.photographs import AppearanceMap, Photographs
 from mapweave.evaluation.splits import robots_of
+from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import Verdict, figures
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError

@@ -18,8 +18,8 @@ from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Stamps
 from mapweave.agent.recordings.trajectory_file import tum_line
 from mapweave.agent.settings import AgentSettings
-from mapweave.evaluation.drive import Truth
 from mapweave.evaluation.map_score import align
+from mapweave.evaluation.truth import Truth
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId

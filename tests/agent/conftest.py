@@ -30,7 +30,7 @@ class PhotoWalls:
         # (picture, x of the wall, y of its left edge, z of its top edge, width), m in world
         soft = [cv2.GaussianBlur(picture, (0, 0), 1.0) for picture in (right, left)]
         self.walls = [(soft[0], 3.2, 0.2, 1.5, 2.6), (soft[1], 2.2, 1.9, 1.3, 1.8)]
-        self._last: tuple[Pose2, np.ndarray] | None = None
+        self._last: tuple[object, np.ndarray] | None = None
 
     def depth_at(self, world_from_robot: Pose2, pixels: np.ndarray) -> np.ndarray:
         """True depth along the optical axis at pixels of a robot that looks along x exactly."""
@@ -43,7 +43,8 @@ class PhotoWalls:
 
     def render(self, world_from_robot: Pose2) -> np.ndarray:
         """(240, 320) grey. Robots that stand still see the same array again."""
-        if self._last is not None and self._last[0] == world_from_robot:
+        shown = world_from_robot, tuple(wall[1:] for wall in self.walls)
+        if self._last is not None and self._last[0] == shown:
             return self._last[1]
         image = np.full((CAMERA.height, CAMERA.width), 128, np.uint8)
         for picture, x, y, z, width in self.walls:
@@ -58,7 +59,7 @@ class PhotoWalls:
             mask = cv2.warpPerspective(np.full_like(picture, 255), to_image, size_out)
             np.copyto(image, drawn, where=mask > 127)
         image.flags.writeable = False
-        self._last = world_from_robot, image
+        self._last = shown, image
         return image
 
     def observe(self, before: Pose2, now: Pose2, tick: int) -> Observation:

@@ -46,9 +46,13 @@ CASES: list[tuple[str, str, str]] = [
     ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its robot
     ("robots", "", "koala"),
     ("router", "--listen nowhere", "endpoints look like"),
+    ("record", "R0 --out {tmp}/drive --connect {nobody}", "R0"),
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
+    ("info", "{recording}", "3 images"),
+    ("settings", "", "[network]"),
     ("relocalize", "{recording}/images/0.png --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
     ("eval relocalize", "{recording}", SERVER),
+    ("eval replay", "{recording} --out {tmp}/replay", "frames"),
     ("eval merge", "{recording}", 'needs the extras "server" and "viz"'),
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said

@@ -14,6 +14,7 @@ from mapweave.sim.ground_truth_client import SimControl
 from mapweave.sim.lockstep_robot import LockstepRobot
 from mapweave.sim.simulation import Simulation
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.waiting import eventually
 
 
 class Table:
@@ -46,6 +47,8 @@ class Table:
 
         self.threads.append(threading.Thread(target=run))
         self.threads[-1].start()
+        # Time passes without a driver that the simulation does not know of yet.
+        eventually(lambda: self.control.status().robots[name].active)
         return robot
 
     def end(self):

@@ -51,7 +51,7 @@ def test_a_moment_with_sixteen_sensors_costs_24_bytes():
 
 @pytest.mark.parametrize("size", [1, 7, 9, 11, 10 * MOST + 10], ids=str)
 def test_other_lengths_are_refused(size):
-    with pytest.raises(InvalidMessage, match=r"wake|trajectory"):
+    with pytest.raises(InvalidMessage, match="trajectory"):
         unpack_trajectory(bytes(size), TWO)
 
 
@@ -70,5 +70,5 @@ def test_mismatched_arrays_are_refused(ages, poses, distances):
 @pytest.mark.parametrize("distances", [[[1.0]], [[1.0, 3.0]], [[1.0, -0.1]], [[1.0, np.nan]]])
 def test_a_node_refuses_a_trajectory_of_other_sensors(some, distances):
     node = replace(some.node(), ranges=TWO)
-    with pytest.raises(InvalidValue, match="wake"):
+    with pytest.raises(InvalidValue, match="trajectory"):
         replace(node, wake=TrajectorySegment(np.zeros(1), np.zeros((1, 3)), np.array(distances)))

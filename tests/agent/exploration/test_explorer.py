@@ -24,7 +24,7 @@ BODY = RobotDescription(
     Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3), ranger_bearings=BEARINGS, ranger_reach=3.0
 )
 """The robot of the photographs, with rangers."""
-ALL_AROUND = np.array([[0.1, 0.1, heading, 0.5] for heading in np.arange(0.0, math.tau, 0.7)])
+ALL_AROUND = np.array([[0.1, 0.1, heading, 0.5] for heading in np.arange(-math.pi, math.pi, 0.7)])
 
 
 def live(

@@ -96,7 +96,7 @@ def looks(x: float, y: float, headings: np.ndarray) -> np.ndarray:
     return np.array([[x, y, heading, CAMERA.semi_aperture] for heading in headings])
 
 
-ALL_AROUND = np.arange(0.0, math.tau, 0.9)
+ALL_AROUND = np.remainder(np.arange(0.0, math.tau, 0.9) + math.pi, math.tau) - math.pi
 
 
 def test_any_robots_views_cover_a_place():

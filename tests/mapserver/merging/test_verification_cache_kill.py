@@ -42,7 +42,7 @@ if not path.exists():
 with MapServer(MemoryBus(MemoryHub()), Keys(), path, "s0") as server:
     began = time.thread_time()
     assert server.settle(120)
-    merger, merged = server._upkeep._merger, server._upkeep.answers.merged
+    merger, merged = server._worker._merger, server._worker.answers.merged
     digest = hashlib.sha256(repr([
         [link.pair for link in merged.links], [(r.pair, r.reason) for r in merged.refused],
     ]).encode())
