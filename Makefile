@@ -36,7 +36,7 @@ test: setup
 	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 4 --dist worksteal
 
 slow: setup
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
 
 # About a quarter of an hour on two cores: every scenario, in real processes.
 scenarios: setup
