@@ -55,5 +55,6 @@ class RecordingOptions:
 
 
 NO_ODOMETRY = (
-    "no odometry: give --odometry FILE (stamped poses), or map it by appearance with --spacing METRES"
+    "no odometry: give --odometry FILE (stamped poses), or make a map of some of the images alone with "
+    "`mapweave map from-photos`"
 )
