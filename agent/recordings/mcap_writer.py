@@ -105,11 +105,19 @@ class McapWriter:
                 assert self._part is not None
                 self._part.write(observation, command, odom_from_robot)
                 self.written += 1
-            except OSError as error:
-                self._failed = error.strerror or str(error)
-                self._say(f"{self._folder}: the recording ends here, {self._failed}")
-        if self._part is not None:
-            self._part.close()
+            except Exception as error:  # noqa: BLE001 - a thread that ends without a word records nothing
+                self._fail(error)
+        try:
+            if self._part is not None:
+                self._part.close()
+        except Exception as error:  # noqa: BLE001 - as above: the disk may be full
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        self._failed = (
+            getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        )
+        self._say(f"{self._folder}: the recording ends here, {self._failed}")
 
     def _next_part(self, stamp_ns: int) -> None:
         if self._part is not None:

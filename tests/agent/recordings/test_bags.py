@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -255,3 +256,26 @@ def test_a_recording_overwrites_nothing(drive: Drive, tmp_path: Path) -> None:
     (tmp_path / "walk" / "notes.txt").write_text("mine")
     with pytest.raises(DeviceError, match="not empty; a recording overwrites nothing"):
         RecordedRobot(Driven(drive), tmp_path / "walk")
+
+
+def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, tmp_path: Path) -> None:
+    """One reading instead of two. What came before is kept, and the robot goes on."""
+    lines: list[str] = []
+    robot = Driven(drive)
+    recorded = RecordedRobot(robot, tmp_path / "walk", print_line=lines.append)
+    recorded.describe()
+    whole = robot.sense
+
+    def sense() -> Observation | None:
+        observation = whole()
+        wrong = observation is not None and observation.stamp_ns > drive.stamps_ns[4]
+        return (
+            replace(observation, proximity=np.ones(1)) if observation is not None and wrong else observation
+        )
+
+    robot.sense = sense  # type: ignore[method-assign]
+    assert len(list(iter(recorded.sense, None))) == COUNT
+    recorded.close()
+    (line,) = lines
+    assert line.startswith(f"{tmp_path / 'walk'}: the recording ends here, ") and "\n" not in line
+    assert len(Replay(tmp_path / "walk")) >= 5
