@@ -25,15 +25,15 @@ def add_to(actions: Any) -> None:
         description="Calibrate a camera from views of the target of `mapweave calibrate target`: live, with "
         "guidance, until the views suffice; or from a folder of images or a video. The result goes to "
         "[robot.camera] of the robot's settings file.",
-        epilog="Exit status 1: the calibration is not good enough and nothing is written; the output says what is missing.",
+        epilog="Exit status 1: the calibration is not good enough; nothing is written, the output says why.",
     )  # fmt: skip
     parser.add_argument(
         "images", type=Path, nargs="?", help="folder of images or video (default: live from the camera)"
     )
     parser.add_argument(
         "--robot", type=Path, metavar="FILE",
-        help="the robot's settings file, for example r0.toml: its [robot.camera] says which camera it is, and "
-        "gets the result; made if it is not there",
+        help="the robot's settings file, for example r0.toml: its [robot.camera] says which camera it is, "
+        "and gets the result; made if it is not there",
     )  # fmt: skip
     parser.add_argument(
         "--source", help="video device, file or URL of the camera (default: the settings file's, else 0)"
@@ -85,7 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
         _recorded(collection, a.images, console)
     if not collection.views:
         raise InvalidValue(
-            f"{a.images or f'camera {source}'}: no view shows the target, {collection.detector.target}; is it this one?"
+            f"{a.images or f'camera {source}'}: no view shows the target ({collection.detector.target}); "
+            "is it this one?"
         )
     found = collection.done or calibrate_camera(collection.views, model)
     _print(found, console)
@@ -99,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
         console.print(f"[robot.camera] written to {a.robot}", markup=False)
     elif not found.problems:
         console.print(
-            "no --robot FILE: nothing is written. For [robot.camera], or camera.toml of a recording:"
+            "no --robot FILE: nothing is written. For [robot.camera], or a recording's camera.toml:"
         )
         for key, value in _values(found).items():
             console.print(f"{key} = {json.dumps(value)}", markup=False, highlight=False)
@@ -202,7 +203,8 @@ def _print(found: CameraCalibration, console: Console) -> None:
     for model, error in found.compared.items():
         console.print(f"views held out, {model}: corners {error:.2f} px off")
     console.print(
-        f"{found.coverage.views} views, {found.outliers} corners left out, noise of a corner {fit.sigma_px:.2f} px; "
+        f"{found.coverage.views} views, {found.outliers} corners left out, noise of a corner "
+        f"{fit.sigma_px:.2f} px; "
         f"projections are certain to {found.worst_px:.2f} px where they are worst",
     )
 

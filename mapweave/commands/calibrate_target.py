@@ -78,7 +78,5 @@ def run(arguments: argparse.Namespace) -> int:
     target = target_of(arguments)
     write_whole(arguments.out, target_pdf(target, arguments.paper))
     print(f"{arguments.out}: {target}, on {arguments.paper}")
-    print(
-        "Print it at 100 % (not fitted to the page), hold a ruler to both scales, and glue it to a flat board."
-    )
+    print("Print it at 100 % (not fitted to the page), hold a ruler to both scales, glue it to a flat board.")
     return 0

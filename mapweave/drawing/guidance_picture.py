@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -56,7 +57,7 @@ def guidance_picture(
 
 
 def _dots(
-    picture: NDArray[np.uint8], view: BoardView, scale: float, colour: tuple[int, int, int], radius: int
+    picture: NDArray[Any], view: BoardView, scale: float, colour: tuple[int, int, int], radius: int
 ) -> None:
     for x, y in np.rint(scale * (view.pixels + 0.5)).astype(int).tolist():
         cv2.circle(picture, (x, y), radius, colour, -1, cv2.LINE_AA)

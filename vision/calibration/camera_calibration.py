@@ -1,4 +1,4 @@
-"""A camera from views of a target: which lens, how sure, how well it explains other views, and what is missing."""
+"""A camera from views of a target: which lens, how sure, how well it explains other views, what lacks."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ MUCH_BETTER = 0.9
 COMPARED_WIDTH = 800
 """px; images of recordings and robots are worked on at no more than this width."""
 MOST_ERROR = 0.7
-"""px of an image of that width, of the worst projection and of corners of views held out: the noise of a pixel
-that the agent tracks (`pixel_sigma`)."""
+"""px of an image of that width, of the worst projection and of corners of views held out: the noise of a
+pixel that the agent tracks (`pixel_sigma`)."""
 SQUARE_PIXELS = 0.02
 """Share by which fx and fy differ at most. Pixels are square; a printer that stretches a page is not."""
 GRID = (13, 9)

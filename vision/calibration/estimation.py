@@ -74,7 +74,7 @@ def fit(views: Sequence[BoardView], model: LensModel) -> Fit:
         kept = _inliers(views, found)
         if sum(one.any() for one in kept) < 3:
             raise InvalidValue(
-                "the views contradict each other: is the board flat, and were its numbers given?"
+                "the views contradict each other: is the board flat, and are its numbers right?"
             )
         same = all(np.array_equal(a, b) for a, b in zip(kept, found.kept, strict=True))
         found = _minimised(views, replace(found, kept=kept), ~np.zeros_like(narrow), robust=False)
@@ -123,7 +123,7 @@ def _first(views: Sequence[BoardView], model: LensModel) -> Fit:
         if best is None or cost < best[0]:
             best = cost, tried
     if best is None:
-        raise InvalidValue("no focal length explains the views: were the board's numbers given?")
+        raise InvalidValue("no focal length explains the views: are the board's numbers right?")
     return best[1]
 
 
@@ -206,7 +206,7 @@ Blocks = list[tuple[Array, Array, Array]]
 def _normal(
     views: Sequence[BoardView], at: Fit, free: NDArray[np.bool_], scale: float
 ) -> tuple[Array, Array, Blocks]:
-    """Normal equations: (F, F) and (F,) of the free intrinsics, and for each view pose, coupling and right side."""
+    """Normal equations: (F, F) and (F,) of the free intrinsics; pose, coupling, right side of each view."""
     count = int(free.sum())
     by_all, towards, blocks = np.zeros((count, count)), np.zeros(count), []
     for view, pose, kept in zip(views, at.poses, at.kept, strict=True):

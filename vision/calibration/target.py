@@ -114,7 +114,7 @@ class CalibrationTarget:
     def corners(self) -> Array:
         """(N, 3) m, inner corners of the squares, row by row; z is 0."""
         x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-        return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square
+        return self.square * np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).astype(np.float64)
 
     @cached_property
     def board(self) -> cv2.aruco.CharucoBoard:

@@ -32,8 +32,8 @@ def target_pdf(target: CalibrationTarget, paper: str) -> bytes:
     room = page_width - 2 * EDGE - RULER, page_height - 2 * EDGE - RULER - CAPTION
     if width > room[0] or height > room[1]:
         raise InvalidValue(
-            f"target: {width:g} x {height:g} mm do not fit on {paper}, which has {room[0]:.0f} x {room[1]:.0f} "
-            "mm for it; take smaller or fewer squares"
+            f"target: {width:g} x {height:g} mm do not fit on {paper}, which has {room[0]:.0f} x "
+            f"{room[1]:.0f} mm for it; take smaller or fewer squares"
         )
     # PDF counts upwards from the lower left corner.
     left = EDGE + RULER + (room[0] - width) / 2
@@ -41,7 +41,8 @@ def target_pdf(target: CalibrationTarget, paper: str) -> bytes:
     top = low + height
     lines = [f"{POINTS:.9f} 0 0 {POINTS:.9f} 0 0 cm", "0 g"]
     lines += [
-        f"{left + 1e3 * r.x:.4f} {top - 1e3 * (r.y + r.height):.4f} {1e3 * r.width:.4f} {1e3 * r.height:.4f} re"
+        f"{left + 1e3 * r.x:.4f} {top - 1e3 * (r.y + r.height):.4f} "
+        f"{1e3 * r.width:.4f} {1e3 * r.height:.4f} re"
         for r in target.rectangles()
     ]
     lines += ["f", "0.15 w", *_ruler(left, low - 3.0, width, upright=False)]
@@ -49,7 +50,7 @@ def target_pdf(target: CalibrationTarget, paper: str) -> bytes:
     text = low - 3.0 - RULER
     lines += [
         _text(left, text, 3.5, f"mapweave: {target}"),
-        _text(left, text - 5.0, 3.5, "Print at 100 %, not fitted to the page. Hold a ruler to both scales: they are in mm."),
+        _text(left, text - 5.0, 3.5, "Print at 100 %, not fitted to the page. Check both scales (mm)."),
     ]  # fmt: skip
     return _document("\n".join(lines).encode("ascii"), page_width * POINTS, page_height * POINTS)
 

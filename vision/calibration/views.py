@@ -59,14 +59,14 @@ class BoardDetector:
             if not good:
                 return None
             pixels = found.reshape(-1, 2)
-        pixels = np.asarray(pixels, np.float64)
+        at: Array = np.asarray(pixels, np.float64)
         corners = self.target.corners[numbers]
         spread = np.linalg.svd(corners[:, :2] - corners[:, :2].mean(axis=0), compute_uv=False)
         if spread[1] < self.target.square:
             return None  # corners on one line tell nothing
         shape = image.shape[1], image.shape[0]
-        placement = placement_of(self.target, shape, corners, pixels)
-        return None if placement is None else BoardView(shape, numbers, corners, pixels, placement, name)
+        placement = placement_of(self.target, shape, corners, at)
+        return None if placement is None else BoardView(shape, numbers, corners, at, placement, name)
 
 
 def placement_of(
