@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
@@ -31,7 +32,7 @@ pixel that the agent tracks (`pixel_sigma`)."""
 SQUARE_PIXELS = 0.02
 """Share by which fx and fy differ at most. Pixels are square; a printer that stretches a page is not."""
 GRID = (13, 9)
-"""Places in the image at which the uncertainty is computed."""
+"""Columns and rows of cells in the image; the uncertainty is computed in the middle of each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,22 +85,23 @@ def calibrate_camera(views: Sequence[BoardView], model: LensModel | None = None)
     if len(sizes) > 1:
         raise InvalidValue(f"images of different sizes: {', '.join(f'{w}x{h}' for w, h in sizes)}")
     chosen = diverse(views, MOST_VIEWS)
-    found: dict[LensModel, tuple[float, Fit]] = {}
+    fits: dict[LensModel, Fit] = {}
     failure: InvalidValue | None = None
     for one in [model] if model is not None else list(LensModel):
         try:
-            fitted = fit(chosen, one)
-            found[one] = held_out_error(chosen, fitted), fitted
+            fits[one] = fit(chosen, one)
         except InvalidValue as error:
             failure = error
-    if not found:
+    if not fits:
         assert failure is not None
         raise failure
-    best = next(iter(found))
-    fisheye = found.get(LensModel.EQUIDISTANT)
-    if fisheye is not None and fisheye[0] < MUCH_BETTER * found[best][0]:
+    # A lens of the wrong kind leaves out what it cannot explain: all are judged by what any of them keeps.
+    judged = [np.any(kept, axis=0) for kept in zip(*(one.kept for one in fits.values()), strict=True)]
+    errors = {one: held_out_error(chosen, fitted, judged) for one, fitted in fits.items()}
+    best = next(iter(fits))
+    if errors.get(LensModel.EQUIDISTANT, math.inf) < MUCH_BETTER * errors[best]:
         best = LensModel.EQUIDISTANT
-    held_out, fitted = found[best]
+    held_out, fitted = errors[best], fits[best]
     used = [view for view, kept in zip(chosen, fitted.kept, strict=True) if kept.any()]
     coverage = coverage_of(used)
     try:
@@ -110,13 +112,19 @@ def calibrate_camera(views: Sequence[BoardView], model: LensModel | None = None)
         problems = [*coverage.missing, str(error).removeprefix("camera: ")]
     return CameraCalibration(
         chosen[0].image_size, fitted, tuple(chosen), coverage, uncertainty, held_out,
-        {one: error for one, (error, _) in found.items()}, tuple(problems),
+        errors, tuple(problems),
     )  # fmt: skip
 
 
-def held_out_error(views: Sequence[BoardView], found: Fit) -> float:
-    """RMS error of a corner in one direction, px, over parts of the views that the fit does without."""
-    used = [k for k, kept in enumerate(found.kept) if kept.any()]
+def held_out_error(views: Sequence[BoardView], found: Fit, judged: Sequence[NDArray[np.bool_]]) -> float:
+    """RMS error of a corner in one direction, px, over parts of the views that the fit does without.
+
+    Args:
+        views: all.
+        found: from all of them.
+        judged: for each view, (N,) which corners count.
+    """
+    used = [k for k, kept in enumerate(judged) if kept.any()]
     folds = min(FOLDS, len(used) // 2)
     if folds < 2:
         return math.inf
@@ -124,8 +132,9 @@ def held_out_error(views: Sequence[BoardView], found: Fit) -> float:
     for part in range(folds):
         held = used[part::folds]
         others = refit(views, found, [k for k in used if k not in held])
-        kept = [found.kept[k] for k in held]
-        off = residuals_of_held_out([views[k] for k in held], others, found.poses[held], kept)
+        off = residuals_of_held_out(
+            [views[k] for k in held], others, found.poses[held], [judged[k] for k in held]
+        )
         squares, count = squares + float((off**2).sum()), count + off.size
     return math.sqrt(squares / count)
 
@@ -140,7 +149,9 @@ def uncertainty_of(found: Fit, image_size: tuple[int, int]) -> Array:
         InvalidValue: the lens folds in the image.
     """
     width, height = image_size
-    across, down = np.linspace(0, width - 1, GRID[0]), np.linspace(0, height - 1, GRID[1])
+    across, down = (
+        (np.arange(n) + 0.5) / n * side - 0.5 for n, side in zip(GRID, (width, height), strict=True)
+    )
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
     rays = rays_of(found.model, found.intrinsics, pixels)
     looked = np.isfinite(rays).all(axis=1)

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
-from mapweave.vision.calibration.projection import COEFFICIENTS, FOCAL, project
+from mapweave.vision.calibration.projection import COEFFICIENTS, FOCAL, project, rays_of
 from mapweave.vision.calibration.views import FEWEST_CORNERS, BoardView
 from mapweave.vision.lens import LensModel
 
 STEPS = 60
 """Of Levenberg and Marquardt, at most."""
-CONVERGED = 1e-9
+CONVERGED = 1e-8
 """Relative change of the cost at which they end."""
 HUBER = 2.0
 """Standard deviations from which a residual counts linearly while outliers are still in."""
@@ -30,10 +30,18 @@ LEAST_SIGMA = 0.02
 """px; no detector is better."""
 MAD = 1.4826
 """Standard deviation over median absolute value of a Gaussian."""
+FAR_OFF = 4.0
+"""A view whose median residual is so many times that of the others is left out for the time being."""
+ROUNDS = 6
+"""Of leaving out corners, at most."""
 STARTS = 9
 """Focal lengths that are tried first."""
-WIDEST_START = 1.3
-"""rad; corners further from the axis are left out of the first poses."""
+WIDEST_START = 3.6
+"""Tangent of the angle from the axis; corners further out are left out of the first poses."""
+UNKNOWN_POSE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 100.0])
+"""Of a view that has none yet: far away, so that it fits nowhere."""
+NEAR_PX = 4.0
+"""Corners that agree on a first pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,19 +73,20 @@ def fit(views: Sequence[BoardView], model: LensModel) -> Fit:
     """
     if len(views) < 3:
         raise InvalidValue(f"{len(views)} views of the target; three are the least, ten or more are good")
-    begun = _first(views, model)
-    narrow = np.zeros(len(begun.intrinsics), np.bool_)
+    found = _plausible(views, _first(views, model))
+    narrow = np.zeros(len(found.intrinsics), np.bool_)
     narrow[[0, 1, FOCAL]] = True
-    begun = _minimised(views, begun, narrow, robust=True)
-    found = _minimised(views, begun, ~np.zeros_like(narrow), robust=True)
-    for _ in range(4):
+    for free in (narrow, narrow, np.ones_like(narrow), np.ones_like(narrow)):
+        found = _minimised(views, found, free, robust=True)
+        found = _plausible(views, _posed_again(views, found))
+    for _ in range(ROUNDS):
         kept = _inliers(views, found)
         if sum(one.any() for one in kept) < 3:
             raise InvalidValue(
                 "the views contradict each other: is the board flat, and are its numbers right?"
             )
         same = all(np.array_equal(a, b) for a, b in zip(kept, found.kept, strict=True))
-        found = _minimised(views, replace(found, kept=kept), ~np.zeros_like(narrow), robust=False)
+        found = _minimised(views, replace(found, kept=kept), np.ones_like(narrow), robust=False)
         if same:
             break
     return _with_covariance(views, found)
@@ -115,11 +124,13 @@ def _first(views: Sequence[BoardView], model: LensModel) -> Fit:
         middle = [focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)]
         intrinsics = np.array([*middle, *[0.0] * COEFFICIENTS[model]])
         poses = [_pose(view, model, intrinsics) for view in views]
-        if any(pose is None for pose in poses):
+        if sum(pose is not None for pose in poses) <= len(views) / 2:
             continue
-        tried = Fit(model, intrinsics, np.zeros((0, 0)), np.array(poses), everything, 0.0)
-        off = np.concatenate([np.linalg.norm(r, axis=1) for r in _residuals(views, tried)])
-        cost = float(np.nanmedian(np.nan_to_num(off, nan=1e9, posinf=1e9)))
+        tried = Fit(
+            model, intrinsics, np.zeros((0, 0)),
+            np.array([UNKNOWN_POSE if pose is None else pose for pose in poses]), everything, 0.0,
+        )  # fmt: skip
+        cost = float(np.median(_medians(views, tried)))
         if best is None or cost < best[0]:
             best = cost, tried
     if best is None:
@@ -128,21 +139,38 @@ def _first(views: Sequence[BoardView], model: LensModel) -> Fit:
 
 
 def _pose(view: BoardView, model: LensModel, intrinsics: Array) -> Array | None:
-    """camera_from_target of a view by a first guess of the intrinsics."""
-    plane = (view.pixels - intrinsics[2:4]) / intrinsics[:2]
-    usable = np.ones(len(plane), np.bool_)
-    if model is LensModel.EQUIDISTANT:
-        angle = np.linalg.norm(plane, axis=1)
-        usable = angle < WIDEST_START
-        plane = plane * (np.tan(np.minimum(angle, WIDEST_START)) / np.maximum(angle, 1e-9))[:, None]
+    """camera_from_target of a view by intrinsics alone; a tenth of the corners may be wrong."""
+    try:
+        rays = rays_of(model, intrinsics, view.pixels)
+    except InvalidValue:
+        return None
+    usable = np.hypot(*np.nan_to_num(rays, nan=np.inf).T) < WIDEST_START
     if usable.sum() < 4:
         return None
-    good, turn, shift = cv2.solvePnP(
-        view.points[usable][:, None], plane[usable][:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-    )
+    points, rays = view.points[usable], rays[usable]
+    _, agree = cv2.findHomography(points[:, :2], rays, cv2.RANSAC, NEAR_PX / intrinsics[0], maxIters=100)
+    if agree is not None and agree.sum() >= FEWEST_CORNERS:
+        points, rays = points[agree.ravel() == 1], rays[agree.ravel() == 1]
+    good, turn, shift = cv2.solvePnP(points[:, None], rays[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     if not good or not np.isfinite(turn).all() or shift[2, 0] <= 0:
         return None
     return np.concatenate([turn.ravel(), shift.ravel()])
+
+
+def _posed_again(views: Sequence[BoardView], found: Fit) -> Fit:
+    """Views that were led astray by the first intrinsics get poses by the present ones."""
+    poses = found.poses.copy()
+    for k, (view, pose) in enumerate(zip(views, found.poses, strict=True)):
+        other = _pose(view, found.model, found.intrinsics)
+        if other is not None:
+            costs = [
+                np.median(
+                    np.abs(project(found.model, found.intrinsics, one, view.points).pixels - view.pixels)
+                )
+                for one in (pose, other)
+            ]
+            poses[k] = other if costs[1] < costs[0] else pose
+    return replace(found, poses=poses)
 
 
 def _residuals(views: Sequence[BoardView], found: Fit) -> list[Array]:
@@ -152,16 +180,32 @@ def _residuals(views: Sequence[BoardView], found: Fit) -> list[Array]:
     ]
 
 
+def _medians(views: Sequence[BoardView], found: Fit) -> list[float]:
+    """Median residual of each view, px; large where it has no pose."""
+    return [
+        float(np.median(np.nan_to_num(np.linalg.norm(r, axis=1), nan=1e9, posinf=1e9)))
+        for r in _residuals(views, found)
+    ]
+
+
 def _spread(residuals: Sequence[Array], kept: Sequence[NDArray[np.bool_]]) -> float:
     """Robust standard deviation, px."""
     flat = np.concatenate([r[k].ravel() for r, k in zip(residuals, kept, strict=True)])
     return max(MAD * float(np.median(np.abs(flat))), LEAST_SIGMA)
 
 
+def _plausible(views: Sequence[BoardView], found: Fit) -> Fit:
+    """All corners of views that fit about as well as the others; a view of something else fits nowhere."""
+    off = _medians(views, found)
+    limit = FAR_OFF * max(float(np.median(off)), LEAST_SIGMA)
+    kept = tuple(np.full(len(view.points), one <= limit) for view, one in zip(views, off, strict=True))
+    return replace(found, kept=kept)
+
+
 def _inliers(views: Sequence[BoardView], found: Fit) -> tuple[NDArray[np.bool_], ...]:
     """Corners within a few deviations; a view with too few of them is left out."""
     residuals = _residuals(views, found)
-    limit = REJECTED * _spread(residuals, tuple(np.ones(len(r), np.bool_) for r in residuals))
+    limit = REJECTED * _spread(residuals, found.kept)
     kept = [np.asarray(np.abs(r).max(axis=1) <= limit) for r in residuals]
     return tuple(k if k.sum() >= max(FEWEST_CORNERS, len(k) / 2) else np.zeros_like(k) for k in kept)
 
@@ -188,9 +232,6 @@ def _minimised(views: Sequence[BoardView], begun: Fit, free: NDArray[np.bool_], 
         at, residuals, cost, damping = tried, tried_residuals, tried_cost, max(damping / 8.0, 1e-12)
         if change < CONVERGED:
             break
-        if robust:
-            scale = HUBER * _spread(residuals, at.kept)
-            cost = _cost(residuals, at.kept, scale)
     return at
 
 
@@ -229,33 +270,35 @@ def _step(
     by_all: Array, towards: Array, blocks: Blocks, free: NDArray[np.bool_], damping: float
 ) -> tuple[Array, Array]:
     """Steps of the intrinsics and the poses; the poses are eliminated."""
-    reduced, right = by_all + damping * np.diag(np.diag(by_all)), towards.copy()
-    inverses = []
-    for own, coupling, side in blocks:
-        inverse = np.linalg.pinv(own + damping * np.diag(np.diag(own)), hermitian=True)
-        inverses.append(inverse)
-        reduced = reduced - coupling @ inverse @ coupling.T
-        right = right - coupling @ inverse @ side
+    own, coupling, side = (np.stack(column) for column in zip(*blocks, strict=True))
+    by_turn = coupling @ _inverses(own + damping * own * np.eye(6))
+    reduced = (
+        by_all + damping * np.diag(np.diag(by_all)) - (by_turn @ coupling.transpose(0, 2, 1)).sum(axis=0)
+    )
+    right = towards - (by_turn @ side[..., None])[..., 0].sum(axis=0)
     step = np.zeros(len(free))
     if free.any():
         # Scaled: focal lengths are hundreds, coefficients thousandths.
         size = 1.0 / np.sqrt(np.maximum(np.diag(by_all), 1e-12))
         scaled = reduced * np.outer(size, size)
         step[free] = -size * np.linalg.lstsq(scaled, size * right, rcond=1e-14)[0]
-    poses = [
-        -inverse @ (side + coupling.T @ step[free])
-        for inverse, (_, coupling, side) in zip(inverses, blocks, strict=True)
-    ]
-    return step, np.array(poses)
+    rest = side + coupling.transpose(0, 2, 1) @ step[free]
+    return step, -(_inverses(own + damping * own * np.eye(6)) @ rest[..., None])[..., 0]
+
+
+def _inverses(own: Array) -> Array:
+    """(V, 6, 6) inverses of normal matrices, scaled to a diagonal of 1: a radian is not a metre."""
+    size = 1.0 / np.sqrt(np.maximum(np.diagonal(own, axis1=1, axis2=2), 1e-12))
+    scale = size[:, :, None] * size[:, None, :]
+    return np.asarray(np.linalg.inv(own * scale + 1e-12 * np.eye(6)) * scale)
 
 
 def _with_covariance(views: Sequence[BoardView], found: Fit) -> Fit:
     """Noise from the residuals, and with it the covariance of the intrinsics."""
     free = np.ones(len(found.intrinsics), np.bool_)
     by_all, _, blocks = _normal(views, found, free, np.inf)
-    reduced = by_all
-    for own, coupling, _ in blocks:
-        reduced = reduced - coupling @ np.linalg.pinv(own, hermitian=True) @ coupling.T
+    own, coupling, _ = (np.stack(column) for column in zip(*blocks, strict=True))
+    reduced = by_all - (coupling @ _inverses(own) @ coupling.transpose(0, 2, 1)).sum(axis=0)
     flat = np.concatenate([r[k].ravel() for r, k in zip(_residuals(views, found), found.kept, strict=True)])
     used = sum(bool(k.any()) for k in found.kept)
     free_numbers = max(len(flat) - len(found.intrinsics) - 6 * used, 1)

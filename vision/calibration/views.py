@@ -14,6 +14,8 @@ from mapweave.vision.calibration.target import CalibrationTarget, Pattern
 
 FEWEST_CORNERS = 8
 """Of a view; a pose has six numbers, and four corners fit any homography."""
+LEAST_WIDTH = 640
+"""px; smaller images are enlarged first: markers of a few pixels are not found otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,11 @@ class BoardDetector:
 
     def find(self, image: NDArray[np.uint8], name: str = "") -> BoardView | None:
         """The view in a grey image (H, W), or None if too little of the target is seen."""
+        shape = image.shape[1], image.shape[0]
+        factor = max(1, math.ceil(LEAST_WIDTH / shape[0]))
+        if factor > 1:
+            large = factor * shape[0], factor * shape[1]
+            image = np.asarray(cv2.resize(image, large, interpolation=cv2.INTER_CUBIC), np.uint8)
         numbers = np.arange(len(self.target.corners))
         if self._charuco is not None:
             found, ids, _, _ = self._charuco.detectBoard(image)
@@ -59,12 +66,12 @@ class BoardDetector:
             if not good:
                 return None
             pixels = found.reshape(-1, 2)
-        at: Array = np.asarray(pixels, np.float64)
+        # The middle of the first pixel is 0.
+        at: Array = (np.asarray(pixels, np.float64) + 0.5) / factor - 0.5
         corners = self.target.corners[numbers]
         spread = np.linalg.svd(corners[:, :2] - corners[:, :2].mean(axis=0), compute_uv=False)
         if spread[1] < self.target.square:
             return None  # corners on one line tell nothing
-        shape = image.shape[1], image.shape[0]
         placement = placement_of(self.target, shape, corners, at)
         return None if placement is None else BoardView(shape, numbers, corners, at, placement, name)
 
