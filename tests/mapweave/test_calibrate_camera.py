@@ -1,4 +1,4 @@
-"""`mapweave calibrate camera`: images, a video or a live camera become a settings file that an agent reads."""
+"""`mapweave calibrate camera`: images, a video or a live camera become settings that an agent reads."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def coverage_of(views: Sequence[BoardView]) -> Coverage:
     if bars[1] < 1.0:
         missing.append(f"hold the board nearer to the {'upper' if low[1] > 1.0 - high[1] else 'lower'} edge")
     if bars[2] < 1.0:
-        missing.append("hold the board nearer to the camera, until it fills half the image")
+        missing.append("hold the board nearer to the camera, until it takes half the width of the image")
     if bars[3] < 1.0:
         missing.append("tilt the board: turn one edge away from the camera, by 30 to 45 degrees")
     width, height = views[0].image_size
