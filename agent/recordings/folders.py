@@ -118,8 +118,10 @@ def images_folder(folder: Path, options: RecordingOptions) -> Recording:
     if options.odometry is not None or _is_poses(path):
         poses = read_poses(options.odometry or path)
         return assembled(folder, "folder of images", camera, distortion, images, poses)
-    increments = read_increments(path, len(paths))
-    return assembled(folder, "folder of images", camera, distortion, images, increments)
+    increments, damage = read_increments(path, len(paths))
+    images = Images(stamps[: len(increments)], images.read)
+    lines = (f"{damage}; the images before it are used",) if damage else ()
+    return assembled(folder, "folder of images", camera, distortion, images, increments, damage=lines)
 
 
 def _is_poses(path: Path) -> bool:

@@ -17,6 +17,9 @@ from mapweave.hybridmap.errors import DeviceError
 
 SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 
+INDEXED = {".mp4", ".mov", ".m4v"}
+"""Their index stands at the end."""
+
 
 def video(path: Path, options: RecordingOptions) -> Recording:
     """Open a video. Stamps begin at 0 with the first frame.
@@ -44,7 +47,8 @@ def video_images(path: Path) -> Images:
     while capture.grab():
         stamps.append(round(1e6 * capture.get(cv2.CAP_PROP_POS_MSEC)))
     if len(stamps) < 2:
-        raise DeviceError(f"{path}: no video that can be read")
+        lost = "; an MP4 that was cut off has lost its index" if path.suffix.lower() in INDEXED else ""
+        raise DeviceError(f"{path}: no video that can be read{lost}")
     if not all(before < after for before, after in itertools.pairwise(stamps)):
         # Some containers give no stamps for each frame.
         rate = capture.get(cv2.CAP_PROP_FPS)

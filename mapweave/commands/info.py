@@ -48,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
         "driven_m": round(float(way), 2),
         "turned_rad": round(float(turn), 2),
         "notes": list(recording.notes),
+        "damage": list(recording.damage),
     }
     if arguments.json:
         print(json.dumps(facts))
@@ -58,6 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"  camera {camera.width}x{camera.height} px, focal length {camera.fx:.0f} px, ", end="")
     print(f"{camera.mount_height:.2f} m high, {camera.mount_forward:.2f} m ahead of the axle")
     print(f"  odometry {way:.1f} m, {turn:.1f} rad of turns")
-    for note in recording.notes:
+    for note in (*recording.notes, *recording.damage):
         print(f"  {note}")
     return 0

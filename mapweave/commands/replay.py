@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,8 @@ def add_to(commands: Any) -> None:
         "replay",
         help="run an agent on a recording",
         description="Run a robot's pipeline on recorded camera images and odometry, as if it were carried "
-        "along. The map goes to a file and, if a server can be reached, to the server.",
+        "along. The map goes to a file and, if a server can be reached, to the server. Of a recording that is "
+        "damaged or cut off, what can be read is mapped; a line says what is lost; the status is 1.",
     )
     add_recording(parser)
     parser.add_argument("--robot", metavar="NAME", help="one of the robots in the recording's splits.toml")
@@ -92,4 +94,6 @@ def run(arguments: argparse.Namespace) -> int:
         run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
         bus.close()
-    return 0
+    for line in robot.damage:
+        print(f"mapweave: {line}", file=sys.stderr)
+    return 1 if robot.damage else 0
