@@ -19,8 +19,8 @@ def add_to(commands: Any) -> None:
         "replay",
         help="run an agent on a recording",
         description="Run a robot's pipeline on recorded camera images and odometry, as if it were carried "
-        "along. The map goes to a file and, if a server can be reached, to the server. Of a recording that is "
-        "damaged or cut off, what can be read is mapped; a line says what is lost; the status is 1.",
+        "along. The map goes to a file and, if a server can be reached, to the server. Of a recording "
+        "that is damaged, what can be read is mapped; a line says what is lost, the status is 1.",
     )
     add_recording(parser)
     parser.add_argument("--robot", metavar="NAME", help="one of the robots in the recording's splits.toml")
