@@ -80,10 +80,10 @@ def _agree(earlier: _Weak, now: _Weak) -> bool:
     if earlier.place.node == now.place.node:
         before, after = earlier.place.node_from_robot, now.place.node_from_robot
     elif NO_COMPONENT != earlier.place.component == now.place.component:
-        merged = earlier.place.merged_from_robot, now.place.merged_from_robot
-        if merged[0] is None or merged[1] is None:
+        in_merged = earlier.place.merged_from_robot, now.place.merged_from_robot
+        if in_merged[0] is None or in_merged[1] is None:
             return False
-        before, after = merged
+        before, after = in_merged[0], in_merged[1]
     else:
         return False
     measured = before.inverse() @ after

@@ -16,7 +16,14 @@ from mapweave.agent.recordings.bag_images import grey_of
 from mapweave.agent.recordings.damaged_bag import DamagedBag
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import heading_of, read_poses
-from mapweave.agent.recordings.recording import Distortion, Images, Recording, StampedPoses, assembled
+from mapweave.agent.recordings.recording import (
+    Distortion,
+    Images,
+    Recording,
+    StampedPoses,
+    assembled,
+    without_odometry,
+)
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
 from mapweave.hybridmap.pose import Array
@@ -195,22 +202,16 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
         raise DeviceError(f"{path}: the stamps of {image.name} do not ascend")
     camera, distortion = _camera(opened, image.name, options, notes)
     images = Images(np.array(stamps, np.int64), _sequential(opened, image.name))
+    kind = f"bag ({path.suffix.lstrip('.') or 'folder'})"
     if options.odometry is not None:
         odometry = read_poses(options.odometry)
-    else:
-        topic = _odometry_topic(opened, options)
+    elif (topic := _odometry_topic(opened, options)) is not None:
         notes.append(f"odometry from {topic.name}")
         odometry = _poses(opened, topic.name)
-    return assembled(
-        path,
-        f"bag ({path.suffix.lstrip('.') or 'folder'})",
-        camera,
-        distortion,
-        images,
-        odometry,
-        tuple(notes),
-        tuple(opened.damage),
-    )
+    else:
+        message, lost = f"{NO_ODOMETRY}; topics: {_names(opened.topics)}", tuple(opened.damage)
+        raise without_odometry(path, kind, camera, distortion, images, message, tuple(notes), lost)
+    return assembled(path, kind, camera, distortion, images, odometry, tuple(notes), tuple(opened.damage))
 
 
 def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, option: str) -> Topic:
@@ -231,13 +232,13 @@ def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, op
     return next(topic for topic in fitting if topic.count == most)
 
 
-def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic:
+def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic | None:
     if options.odometry_topic is not None:
         return _chosen(opened, options.odometry_topic, POSE_TYPES, "poses", "--odometry-topic")
     fitting = [topic for topic in opened.topics if topic.kind == ODOMETRY_TYPE and topic.count]
     fitting = [topic for topic in fitting if not any(word in topic.name.lower() for word in TRUTH)]
     if not fitting:
-        raise DeviceError(f"{opened.path}: {NO_ODOMETRY}; topics: {_names(opened.topics)}")
+        return None
     # Filtered odometry may hold other sensors' errors; the wheels' own is what the filters here expect.
     return min(fitting, key=lambda topic: ("filter" in topic.name.lower(), -topic.count, topic.name))
 

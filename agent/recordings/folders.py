@@ -13,7 +13,14 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_in, images_of, read_increments, read_times
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Distortion, Images, Recording, Stamps, assembled
+from mapweave.agent.recordings.recording import (
+    Distortion,
+    Images,
+    Recording,
+    Stamps,
+    assembled,
+    without_odometry,
+)
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.atomic_file import read_whole
@@ -144,9 +151,11 @@ def _folder(
     camera, distortion = options.camera_of(folder, given)
     beside = next((p for p in (folder / "odometry.csv", folder / "odometry.txt") if p.exists()), None)
     odometry = options.odometry or beside
+    images = _images(paths, stamps_ns)
     if odometry is None:
-        raise DeviceError(f"{folder}: {kind}, {len(paths)} images, but {NO_ODOMETRY}")
-    return assembled(folder, kind, camera, distortion, _images(paths, stamps_ns), read_poses(odometry))
+        message = f"{kind}, {len(paths)} images, but {NO_ODOMETRY}"
+        raise without_odometry(folder, kind, camera, distortion, images, message)
+    return assembled(folder, kind, camera, distortion, images, read_poses(odometry))
 
 
 def _images(paths: Sequence[Path], stamps_ns: Stamps, camera: Camera | None = None) -> Images:

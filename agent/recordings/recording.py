@@ -83,6 +83,19 @@ class StampedPoses:
     damage: str = ""
 
 
+class NoOdometry(DeviceError):
+    """A recording has all but odometry.
+
+    Attributes:
+        recording: the rest; its increments are zero.
+    """
+
+    def __init__(self, message: str, recording: Recording) -> None:
+        """Take the line for people, and what there is."""
+        super().__init__(message)
+        self.recording = recording
+
+
 def increments_between(odometry: StampedPoses, stamps_ns: Stamps) -> tuple[NDArray[np.bool_], Array]:
     """What the wheels did between images.
 
@@ -184,6 +197,22 @@ def assembled(
         notes,
         damage,
     )
+
+
+def without_odometry(
+    path: Path,
+    kind: str,
+    camera: Camera,
+    distortion: Distortion,
+    images: Images,
+    message: str,
+    notes: tuple[str, ...] = (),
+    damage: tuple[str, ...] = (),
+) -> NoOdometry:
+    """The error of a recording that has no odometry, with the images. Arguments as of `assembled`."""
+    nothing = np.zeros((len(images.stamps_ns), 2))
+    recording = assembled(path, kind, camera, distortion, images, nothing, notes, damage)
+    return NoOdometry(f"{path}: {message}", recording)
 
 
 def reduced(camera: Camera, factor: int) -> Camera:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Images, Recording, assembled
+from mapweave.agent.recordings.recording import Images, Recording, assembled, without_odometry
 from mapweave.hybridmap.errors import DeviceError
 
 SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
@@ -32,7 +32,8 @@ def video(path: Path, options: RecordingOptions) -> Recording:
     beside = path.with_suffix(".csv")
     odometry = options.odometry or (beside if beside.exists() else None)
     if odometry is None:
-        raise DeviceError(f"{path}: video, {len(images.stamps_ns)} frames, but {NO_ODOMETRY}")
+        message = f"video, {len(images.stamps_ns)} frames, but {NO_ODOMETRY}"
+        raise without_odometry(path, "video", camera, distortion, images, message)
     return assembled(path, "video", camera, distortion, images, read_poses(odometry))
 
 
