@@ -26,7 +26,7 @@ Switch = tuple[object, str, object]
 """Where a function stands, its name, and what takes its place."""
 
 
-def _each_a_witness(links: Sequence[Link], *_: object) -> NDArray[np.bool_]:
+def _each_independent(links: Sequence[Link], *_: object) -> NDArray[np.bool_]:
     return np.eye(len(links), dtype=np.bool_)
 
 
@@ -39,7 +39,7 @@ def _nothing(*_: object, **__: object) -> list[Any]:
 
 
 MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
-    "independent support": ((pairwise_consistency, "neighbours", _each_a_witness),),
+    "independent support": ((pairwise_consistency, "neighbours", _each_independent),),
     "chance support": ((Sorted, "beyond_chance", _as_it_is),),
     "dominance": ((pairwise_consistency, "_rival", _nothing),),
     "refused links heard again": (

@@ -22,7 +22,7 @@ from typing import ClassVar
 
 
 class TwoWheels:
-    """Wheels that turn at once as they are told; what they really do is the tests' truth."""
+    """Wheels that turn at once as they are commanded; what they really do is the tests' truth."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -81,7 +81,7 @@ class Emulator:
             self.switched_on()
 
     def unplug(self) -> None:
-        """The port vanishes, as a USB adapter does; the wheels go on as they were told."""
+        """The port vanishes, as a USB adapter does; the wheels go on as they were commanded."""
         with self._lock:
             self.path.unlink()
             os.close(self._master)
@@ -317,7 +317,7 @@ class UgvSerial(LineEmulator):
     def switched_on(self) -> None:
         super().switched_on()
         self.ugv = Ugv(self.wheels, self._odometers)
-        self._told = 0.0
+        self._reported = 0.0
 
     def line(self, line: str) -> None:
         with contextlib.suppress(ValueError):
@@ -325,8 +325,8 @@ class UgvSerial(LineEmulator):
 
     def idle(self) -> None:
         self.ugv.watch()
-        if self.ugv.stream and not self.stalled and time.monotonic() - self._told >= self.ugv.interval:
-            self._told = time.monotonic()
+        if self.ugv.stream and not self.stalled and time.monotonic() - self._reported >= self.ugv.interval:
+            self._reported = time.monotonic()
             self.say(self.ugv.info().encode() + b"\r\n")
 
 
@@ -405,7 +405,7 @@ class ArduinoSketch(LineEmulator):
         super().switched_on()
         self.wheels.set(0.0, 0.0)
         self.bumped, self.centimetres = 0, [200, -1, 15]
-        self._last = self._told = time.monotonic()
+        self._last = self._reported = time.monotonic()
 
     def line(self, line: str) -> None:
         word, left, right = line.split()
@@ -417,8 +417,8 @@ class ArduinoSketch(LineEmulator):
         now = time.monotonic()
         if now - self._last > 0.3 and self.wheels.speeds != (0.0, 0.0):
             self.wheels.set(0.0, 0.0)
-        if now - self._told >= 0.05 and not self.stalled:
-            self._told = now
+        if now - self._reported >= 0.05 and not self.stalled:
+            self._reported = now
             turn = 2 * 3.141592653589793 * self.WHEEL_RADIUS
             left, right = (round(way / turn * self.COUNTS_PER_TURN) for way in self.wheels.way())
             numbers = [left, right, self.bumped, *self.centimetres]

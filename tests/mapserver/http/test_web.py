@@ -412,7 +412,7 @@ def test_a_head_that_never_ends_is_dropped(desk: Desk) -> None:
 
 
 def test_a_client_that_reads_nothing_is_dropped(desk: Desk) -> None:
-    desk.happenings = (MapEvent(10**18, MapEventKind.RULED, "no" * 2000),) * 3000
+    desk.happenings = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no" * 2000),) * 3000
     with (
         Web(("127.0.0.1", 0), desk, limits=Limits(stall=0.5)) as served,
         socket.socket() as slow,

@@ -22,7 +22,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.explainer import RulingBook
+from mapweave.mapserver.explainer import ConstraintRecord
 from mapweave.mapserver.log import store as store_module
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest, IngestSettings
@@ -158,7 +158,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fleet.start_robots()
     for replicator, _, _ in fleet.robots:
         assert replicator.wait_acknowledged(30)
-    book = RulingBook(fleet.store)
+    book = ConstraintRecord(fleet.store)
     for k in range(5):
         book.add(ManualConstraint((MapId("r0", 1), MapId(f"r{k + 1}", 1)), True, "anna", k, "two kitchens"))
     fleet.stop_robots()
@@ -347,28 +347,28 @@ def test_a_change_that_this_program_cannot_read_costs_only_itself(
 
 def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
     disk = sqlite3.connect(fleet.path)
-    disk.execute("UPDATE ruling SET body = body || x'00' WHERE number = 2")
+    disk.execute("UPDATE manual_constraint SET body = body || x'00' WHERE number = 2")
     disk.commit()
     disk.close()
     store = Store(fleet.path)
-    assert [constraint.stamp_ns for constraint in RulingBook(store).rulings.made] == [0, 2, 3, 4]
-    assert "1 damaged rows of table ruling" in caplog.text
+    assert [constraint.stamp_ns for constraint in ConstraintRecord(store).constraints.made] == [0, 2, 3, 4]
+    assert "1 damaged rows of table manual_constraint" in caplog.text
     store.close()
 
 
 def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store_module, "MAX_RULINGS", 7)
+    monkeypatch.setattr(store_module, "MAX_CONSTRAINTS", 7)
     store = Store(fleet.path)
-    book = RulingBook(store)
-    constraint = book.rulings.made[0]
+    book = ConstraintRecord(store)
+    constraint = book.constraints.made[0]
     for k in range(2):
         book.add(replace(constraint, stamp_ns=100 + k))
     with pytest.raises(InvalidValue, match="the record of manual constraints is full: 7"):
         book.add(constraint)
-    assert len(book.rulings.made) == 7
+    assert len(book.constraints.made) == 7
     store.close()
     store = Store(fleet.path)
-    assert RulingBook(store).rulings.made == book.rulings.made
+    assert ConstraintRecord(store).constraints.made == book.constraints.made
     store.close()
 
 
