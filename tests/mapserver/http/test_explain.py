@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
@@ -28,17 +27,6 @@ LINKS = "return [...document.querySelectorAll('#result a')].map(a => a.textConte
 
 def count(kind: str) -> str:
     return f"return document.querySelectorAll('svg {kind}').length"
-
-
-@pytest.fixture
-def desk() -> Desk:
-    return Desk()
-
-
-@pytest.fixture
-def served(desk: Desk) -> Iterator[Web]:
-    with Web(("127.0.0.1", 0), desk) as served:
-        yield served
 
 
 def ask(served: Web, query: str, of: str = "explain") -> tuple[int, dict]:
