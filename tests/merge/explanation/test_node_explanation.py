@@ -160,19 +160,19 @@ def test_other_links_close_loops_as_composed_poses(merged: MergedMap) -> None:
     by_pair = {other.pair: other for other in merged.links}
     pieces = {node: fragment for fragment in fragments_of(merged.maps) for node in fragment.nodes}
     assert len(explanation.other_links) >= 3
-    for link in explanation.other_links:
-        if (link.a, link.b) not in by_pair:
+    for other_link in explanation.other_links:
+        if (other_link.a, other_link.b) not in by_pair:
             continue
         # The merge begins each loop at the smaller pair.
-        one, other = sorted([link, by_pair[link.a, link.b]], key=lambda x: x.pair)
+        one, other = sorted([link, by_pair[other_link.a, other_link.b]], key=lambda x: x.pair)
         back = pieces[one.b].graph.relative([one.b], [other.b])
         home = pieces[one.a].graph.relative([other.a], [one.a])
         there, here = (PoseGaussian(Pose2.from_vector(r.means[0]), r.covariances[0]) for r in (back, home))
         loop = one.a_from_b @ there @ other.a_from_b.inverse() @ here
         floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
         distance2 = PoseGaussian(loop.mean, loop.covariance + floor).mahalanobis2(Pose2())
-        assert link.distance2 == pytest.approx(distance2, rel=1e-6)
-        assert link.agrees == (distance2 < s.gate) and link.kept
+        assert other_link.distance2 == pytest.approx(distance2, rel=1e-6)
+        assert other_link.agrees == (distance2 < s.gate) and other_link.kept
 
 
 def test_refused_pairs_say_what_they_lack(merged: MergedMap) -> None:
