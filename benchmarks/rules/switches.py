@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from mapweave.mapserver.relocalization import view_registration
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
-from mapweave.mapserver.relocalization.perceptual_aliasing import PerceptualAliasing
 from mapweave.merge import merging
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency
@@ -56,7 +55,6 @@ TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
 """Rules on links, for robots with images and bodies."""
 PLACE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "aliased regions": ((AliasedRegions, "counterpart", lambda *_: None),),
-    "nodes that look alike": ((PerceptualAliasing, "matches", _nothing),),
     "lonely recognition": ((view_registration, "is_lonely", lambda *_: False),),
 }
 """Rules on answers to lost robots."""

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     happenings = events.history
     left_out = len(happenings) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
-    lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:10}  {h.words}" for h in happenings[-arguments.most :]]
+    lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in happenings[-arguments.most :]]
     print("\n".join(lines) if lines else "no joins, splits or manual constraints yet")
     return 0
 

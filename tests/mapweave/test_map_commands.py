@@ -178,7 +178,7 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     out = said("map", "explain", "r0.1", "r1.1", "--map", path)
     assert "anna decided that they shall not" in out and "bob decided that they may be linked again" in out
     lines = said("map", "history", "--map", path).splitlines()
-    kinds = [line.split("UTC  ")[1][:10].strip() for line in lines]
+    kinds = [line.split("UTC  ")[1].split("  ")[0] for line in lines]
     assert kinds == ["constrained", "parted", "constrained", "joined"]
     assert all("anna" in line and "two kitchens" in line for line in lines[:2]) and "bob" in lines[2]
     # The history of a file is kept in files made of it, once.
