@@ -99,16 +99,16 @@ def test_a_lost_robot_is_told_the_place_but_not_the_distance(video, made: Path) 
         for poses in (list(where.values()), [node.map_from_robot.mean for node in nodes])
     )
     errors = []
-    for k, image in enumerate(frames(path)):
+    for k, image in list(enumerate(frames(path)))[::3]:
         answer = relocalizer.answer(view_of(image, PHONE.intrinsics, PHONE.distortion))
         if answer.certainty is Certainty.PLACE:
             place = answer.candidates[0]
             found = place.node_from_robot.mean
             scaled = Pose2(found.x * way / mapped, found.y * way / mapped, found.heading)
             errors.append((where[place.node] @ scaled).distance(truth[k]))
-            assert np.sqrt(place.node_from_robot.covariance[0, 0]) >= 0.25 * abs(found.x)
+            assert not place.distance_known
         assert answer.certainty is not Certainty.FOUND
-    assert len(errors) > 0.7 * COUNT
+    assert len(errors) > 0.7 * COUNT / 3
     assert np.median(errors) < 0.15 and max(errors) < 0.8, "right but for the scale"
 
 
