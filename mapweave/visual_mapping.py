@@ -67,7 +67,7 @@ def keyframes(recording: Recording, frames: Iterable[int]) -> tuple[list[Keyfram
     camera, lens = recording.camera, Lens(recording.camera, recording.distortion)
     sift = Sift(lens)
     before: NDArray[np.uint8] | None = None
-    corners = points = np.zeros((0, 2), np.float32)
+    corners = points = np.zeros((0, 2))
     walk, lost = list[Keyframe](), list[str]()
     for k in frames:
         try:
@@ -80,7 +80,7 @@ def keyframes(recording: Recording, frames: Iterable[int]) -> tuple[list[Keyfram
         if before is None or _is_next(camera, lens, corners, points):
             walk.append(Keyframe(int(recording.stamps_ns[k]), sift.extract(image).view(camera)))
             found = cv2.goodFeaturesToTrack(image, CORNERS, CORNER_QUALITY, CORNER_DISTANCE_PX)
-            corners = np.zeros((0, 2), np.float32) if found is None else found[:, 0]
+            corners = np.zeros((0, 2)) if found is None else found[:, 0].astype(np.float64)
             points = corners
         before = image
     return walk, [f"{lost[0]} (left out, {len(lost)} of {len(recording)} images)"] if lost else []

@@ -173,7 +173,7 @@ class WholeBag:
 def parts_of(path: Path) -> list[Path]:
     """The bags of a recording: itself, or those in its folder, in their order.
 
-    A bag's folder has a `metadata.yaml`; where the recorder was killed, its files stand for themselves.
+    A bag's folder has a `metadata.yaml`; where the recorder was killed, only its files are there.
     """
     if not path.is_dir():
         return [path]

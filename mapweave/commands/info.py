@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         recording = error.recording
         missing.append(
             "odometry: `mapweave replay` maps it by its images alone; such a map has no scale, so nothing in "
-            "it is metric, and robots are told the place but not the distance"
+            "it is metric, and lost robots get the place but not the distance"
         )
     camera, stamps = recording.camera, recording.stamps_ns
     recording.read(0)

@@ -90,7 +90,7 @@ def test_a_video_becomes_one_map_that_is_right_up_to_one_scale(video, made: Path
     assert all(edge.evidence["shared"] == len(edge.shared) >= 12 for edge in edges)
 
 
-def test_a_lost_robot_is_told_the_place_but_not_the_distance(video, made: Path) -> None:
+def test_a_lost_robot_gets_the_place_but_not_the_distance(video, made: Path) -> None:
     path, truth = video
     relocalizer, (nodes, _) = relocalizer_of(read_map_file(made)), contents(made)
     where = {node.id: truth[round(node.stamp_ns * RATE / 1e9)] for node in nodes}
