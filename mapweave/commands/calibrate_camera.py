@@ -157,22 +157,25 @@ def _recorded(collection: ViewCollection, path: Path, console: Console) -> None:
     from mapweave.agent.recordings.video import video_images
     from mapweave.storage.image_file import read_grey
 
+    quiet = not console.is_terminal
     if not path.exists():
         from mapweave.hybridmap.errors import DeviceError
 
         raise DeviceError(f"{path}: no such folder or video")
     if path.is_dir():
         paths = images_in(path / "images" if (path / "images").is_dir() else path)
-        for image in track(paths, "images", console=console, transient=True):
+        for image in track(paths, "images", console=console, transient=True, disable=quiet):
             view = collection.detector.find(read_grey(image), image.name)
             if view is not None:
                 collection.views.append(view)
-        console.print(f"{len(collection.views)} of {len(paths)} images show the target", highlight=False)
+        if collection.views:
+            console.print(f"{len(collection.views)} of {len(paths)} images show the target", highlight=False)
         return
     images = video_images(path)
-    for k in track(range(len(images.stamps_ns)), "frames", console=console, transient=True):
+    for k in track(range(len(images.stamps_ns)), "frames", console=console, transient=True, disable=quiet):
         collection.see(images.read(k), f"frame {k}")
-    console.print(f"{len(collection.views)} views in {len(images.stamps_ns)} frames", highlight=False)
+    if collection.views:
+        console.print(f"{len(collection.views)} views in {len(images.stamps_ns)} frames", highlight=False)
 
 
 def _values(found: CameraCalibration) -> dict[str, Any]:
