@@ -111,10 +111,10 @@ def test_images_become_settings_that_an_agent_reads(name, true, frames, capfd, t
 
 
 class EmulatedCamera:
-    """Gives the frames one by one, each three times, as a person holds the board still."""
+    """Gives the frames one by one, each twice, as a person holds the board still."""
 
     def __init__(self, frames: list[np.ndarray]) -> None:
-        self._frames, self.given, self.closed = [frame for frame in frames for _ in range(3)], 0, False
+        self._frames, self.given, self.closed = [frame for frame in frames for _ in range(2)], 0, False
 
     def newer(self, stamp_ns: int, patience: float) -> Frame | None:
         if self.given == len(self._frames):
@@ -136,7 +136,7 @@ def test_a_person_is_guided_live_until_the_views_suffice(frames, monkeypatch, ca
     arguments = ["--robot", str(robot), "--source", "rtsp://camera/1", "--height", "0.3", "--http", "0"]
     assert main(["calibrate", "camera", *arguments, *OPTIONS]) == 0
     assert camera.closed and opened == ["rtsp://camera/1"]
-    assert camera.given < len(frames["fisheye"]) * 6, "it ends by itself"
+    assert camera.given < len(frames["fisheye"]) * 4, "it ends by itself"
     output = capfd.readouterr().out
     assert "guidance on http://127.0.0.1:" in output
     table = camera_table(robot)
