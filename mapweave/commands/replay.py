@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     import re
 
     from mapweave.agent.drivers.replay import Replay
-    from mapweave.agent.mission import Carried
+    from mapweave.hybridmap.mission_order import MissionKind
     from mapweave.hybridmap.node import check_name
     from mapweave.processes.agent import AgentOptions, run_agent
 
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
         data=arguments.data,
         epoch=arguments.epoch,
         fresh=True,  # a recording begins where it began, not where another has ended
-        mission=Carried(),
+        mission=MissionKind.CARRIED,
         server=network.server,
         total=len(robot),
         trajectories=True,
