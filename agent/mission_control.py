@@ -1,4 +1,4 @@
-"""Which mission holds: orders in, from anybody and in any order; what the pipeline shall do out.
+"""Which mission holds: orders in, from any sender and in any order; what the pipeline shall do out.
 
 Orders may come twice, late, or never. The same id is the same mission; of two the newer holds; what is over
 stays over. All of it is on the disk before it is acknowledged, so a robot that was switched off goes on.
@@ -182,6 +182,6 @@ class MissionControl:
         try:
             self._keep(reports)
         except InvalidFile as error:
-            # A robot must stop when it is told to, also with a full disk.
+            # A robot must obey a stop, also with a full disk.
             log.warning("mission %s is not on the disk: %s", reports[-1].order.id, error)
         return reports[-1]

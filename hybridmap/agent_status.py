@@ -81,7 +81,7 @@ class AgentStatus:
         traffic: bytes that it has sent and received over the fleet's network since it began.
         linked: whether it sees its map server.
         placed: nodes of its map of which it knows where they lie in the merged map.
-        mission: what it was told to do, and what has become of that.
+        mission: the mission that holds, and what has become of it.
         battery: charge, if the driver tells it.
         last_error: the newest trouble with the fleet, in words; empty without any.
         error_age: how long ago that was, s.

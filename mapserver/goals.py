@@ -40,7 +40,7 @@ def node_of_goal(goal: str, map_id: MapId, router: Router) -> NodeId:
         raise InvalidValue(f"goal {goal!r}: {FORMS}") from None
     if node.map == map_id:
         return node  # the robot knows best
-    # A robot that has mapped nothing yet may find itself on anybody's map.
+    # A robot that has mapped nothing yet may find itself on the map of another.
     if missing := router.missing(min(own, default=node), node):
         raise InvalidValue(missing)
     return node
@@ -67,7 +67,7 @@ def _nearest(position: tuple[float, float], own: list[NodeId], router: Router) -
     distance, node = min((math.hypot(poses[n].x - x, poses[n].y - y), n) for n in members)
     if distance > REACH:
         raise InvalidValue(
-            f"nobody has mapped within {REACH:g} m of {x:g},{y:g}: the nearest node is {node}, "
+            f"nothing is mapped within {REACH:g} m of {x:g},{y:g}: the nearest node is {node}, "
             f"{distance:.1f} m away at {poses[node].x:.1f},{poses[node].y:.1f}"
         )
     return node

@@ -16,13 +16,15 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
     OPEN,
+    MissionKind,
     MissionOrder,
     MissionReport,
     MissionRequest,
     Missions,
     MissionState,
+    new_id,
 )
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, check_name
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.roster import Roster
@@ -38,7 +40,7 @@ KEPT = "missions"
 ANSWER = 2.0
 """How long a robot may take to acknowledge, s."""
 EXPIRY = 600.0
-"""A robot that is away for longer does not get a mission of before, s: nobody expects it to move then."""
+"""A robot that is away for longer does not get a mission of before, s: it would drive off unexpectedly."""
 EVERY = 1.0
 """Time between two attempts, s."""
 
@@ -93,6 +95,20 @@ class MissionRelay:
             known = self._note(self._resolved(request))
             self._replace_older(known.order, MissionState.SENT)
         return self._hand_on(known.order) if known.open else known
+
+    def request(
+        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = ""
+    ) -> MissionRequest:
+        """A mission that is given now, and is newer than the one that holds the robot.
+
+        Raises:
+            InvalidValue: the goal is missing, or there is one too many; a name is none.
+        """
+        status = None if self.roster is None else self.roster.status(robot)
+        report = None if status is None else status.mission
+        stamp_ns = max(self._time_ns(), 0 if report is None else report.order.stamp_ns + 1)
+        mission_id = check_name(mission_id) if mission_id else new_id()
+        return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal[:64])
 
     def hear(self, status: AgentStatus) -> None:
         """Take note of what a robot reports of its mission."""

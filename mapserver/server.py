@@ -16,7 +16,7 @@ from types import TracebackType
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.mission_order import MissionReport, MissionRequest, Missions
+from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.blockages import Blockages
@@ -207,6 +207,10 @@ class MapServer:
             InvalidValue: there is no such robot, or no such goal.
         """
         return self._missions.command(request)
+
+    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+        """Give a robot a mission that is newer than the one that holds it; see `command`."""
+        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id))
 
     def missions(self) -> Missions:
         """The missions that are known, oldest first."""
