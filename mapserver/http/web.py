@@ -71,6 +71,9 @@ BY = "http"
 """Gives a mission, if the request does not say."""
 
 
+Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
+
+
 class Answering(Protocol):
     """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
 
@@ -198,7 +201,7 @@ class Questions:
         self._commands = commands
         self._patience = patience
         self._open = 0
-        answering = {
+        answering: dict[str, Answer] = {
             "/status": self._status, "/history": self._history, "/explain": self._explain,
             "/route": self._explain, "/robots": self._robots, "/missions": self._missions, "/map": self._map,
         }  # fmt: skip
@@ -214,9 +217,7 @@ class Questions:
         app.router.redirect_slashes = False
         self.app: ASGIApp = app
 
-    def _answering(
-        self, answer: Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
-    ) -> Callable[[Request], Awaitable[Response]]:
+    def _answering(self, answer: Answer) -> Callable[[Request], Awaitable[Response]]:
         """Answer a question, or refuse it with a reason."""
 
         async def endpoint(request: Request) -> Response:

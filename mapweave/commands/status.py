@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
 
 SILENT = 5.0
 """A robot that has sent nothing for longer is shown as silent, s; it sends twice a second."""
+WIDE = 400
+"""Characters of a line that no terminal shows."""
+COLUMNS = ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "last trouble")
+LEAST = 12
+"""Characters that a column of words keeps on a narrow terminal."""
 EVERY = 0.5
 """Time between two looks, s."""
 
@@ -49,7 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
                 if not arguments.watch:
                     return 0
                 time.sleep(EVERY)
-        console = Console()
+        # A line a robot where another program reads.
+        console = Console(width=None if sys.stdout.isatty() else WIDE)
         if not arguments.watch:
             status = fleet.status()
             console.print(table(status) if status.robots else "no robot is there")
@@ -65,11 +72,16 @@ def table(status: FleetStatus) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
+    rows = [cells(robot) for robot in status.robots]
     lines = Table(box=None, pad_edge=False)
-    for name in ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "last trouble"):
-        lines.add_column(name, justify="right" if name in ("nodes", "battery", "unsent", "age") else "left")
-    for robot in status.robots:
-        lines.add_row(*(escape(cell) for cell in cells(robot)))
+    for column, name in enumerate(COLUMNS):
+        # On a narrow terminal what is long is cut, and nothing else.
+        widest = max(len(name), *(len(row[column]) for row in rows)) if rows else len(name)
+        least = LEAST if name in ("doing", "last trouble") else widest
+        number = name in ("nodes", "battery", "unsent")
+        lines.add_column(name, justify="right" if number else "left", no_wrap=True, min_width=least)
+    for row in rows:
+        lines.add_row(*map(escape, row))
     return lines
 
 
