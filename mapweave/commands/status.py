@@ -59,27 +59,41 @@ def run(arguments: argparse.Namespace) -> int:
         console = Console(width=None if sys.stdout.isatty() else WIDE)
         if not arguments.watch:
             status = fleet.status()
-            console.print(table(status) if status.robots else "no robot is there")
+            console.print(table(status, console.width) if status.robots else "no robot is there")
             return 0
-        with Live(table(fleet.status()), console=console, auto_refresh=False) as live:
+        with Live(table(fleet.status(), console.width), console=console, auto_refresh=False) as live:
             while True:
                 time.sleep(EVERY)
-                live.update(table(fleet.status()), refresh=True)
+                live.update(table(fleet.status(), console.width), refresh=True)
 
 
-def table(status: FleetStatus) -> Table:
-    """One line a robot."""
+def table(status: FleetStatus, width: int) -> Table:
+    """One line a robot.
+
+    Args:
+        status: of the fleet.
+        width: characters of a line; what is long is cut, and nothing else.
+    """
     from rich.markup import escape
     from rich.table import Table
 
     rows = [cells(robot) for robot in status.robots]
-    lines = Table(box=None, pad_edge=False)
+    widest = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
+    doing, trouble = COLUMNS.index("doing"), COLUMNS.index("last trouble")
+    over = sum(widest) + len(COLUMNS) - 1 - width
+    for column in (trouble, doing):
+        cut = min(max(over, 0), max(widest[column] - LEAST, 0))
+        widest[column], over = widest[column] - cut, over - cut
+    lines = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for column, name in enumerate(COLUMNS):
-        # On a narrow terminal what is long is cut, and nothing else.
-        widest = max(len(name), *(len(row[column]) for row in rows)) if rows else len(name)
-        least = LEAST if name in ("doing", "last trouble") else widest
         number = name in ("nodes", "battery", "unsent")
-        lines.add_column(name, justify="right" if number else "left", no_wrap=True, min_width=least)
+        lines.add_column(
+            name,
+            justify="right" if number else "left",
+            no_wrap=True,
+            width=widest[column],
+            overflow="ellipsis",
+        )
     for row in rows:
         lines.add_row(*map(escape, row))
     return lines

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from mapweave.cli import main
 from mapweave.commands.missions import NOT_DONE
@@ -124,4 +126,9 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         "1.23,-5.00 180° in part 2", "12", "50%", "3", "7.0 s silent", "no map server answered (61 s ago)",
     )  # fmt: skip
     assert cells(RobotEntry("r1", False))[0] == "r1" and "gone" in cells(RobotEntry("r1", False))
-    assert table(FleetStatus((entry,))).row_count == 1
+    for width in (100, 240):
+        lines = Console(width=width, file=(printed := io.StringIO()))
+        lines.print(table(FleetStatus((entry,)), width))
+        _, line = printed.getvalue().splitlines()
+        assert len(line) <= width and "go to r1.1.5 (kitchen) running 25%" in line and "7.0 s silent" in line
+        assert ("0.4 m to node r1.1.5" in line) is (width == 240)
