@@ -82,9 +82,11 @@ def fleet_of(arguments: argparse.Namespace) -> Fleet:
 def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -> int:
     """Give a mission, and wait for its end if that is wanted."""
     from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.node import check_name
 
     if arguments.wait and not arguments.timeout > 0.0:
         raise InvalidValue(f"--timeout {arguments.timeout:g}: give seconds")
+    check_name(arguments.robot)
     with fleet_of(arguments) as fleet:
         report = give(fleet)
         if arguments.wait and report.open:
@@ -96,8 +98,11 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
 
 def run_stop(arguments: argparse.Namespace) -> int:
     """Stop robots."""
+    from mapweave.hybridmap.node import check_name
+
+    robot = check_name(arguments.robot) if arguments.robot else ""
     with fleet_of(arguments) as fleet:
-        reports = list(fleet.stop(arguments.robot or ""))
+        reports = list(fleet.stop(robot))
     if not reports and not arguments.json:
         print("no robot is there")
     _print(reports, arguments.json)

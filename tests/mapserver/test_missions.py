@@ -81,7 +81,7 @@ def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
     house.close()
 
 
-def test_a_robot_is_sent_and_reports_and_everybody_can_see_it(house: House) -> None:
+def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
     link, control = house.robot()
     entry = house.entry("r0")
     assert entry.alive and entry.component == 0
@@ -161,7 +161,7 @@ def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch
     assert "did not answer within 0 s" in house.person.missions()[-1].reason
 
 
-def test_nobody_is_sent_to_a_robot_that_was_never_heard_of(house: House) -> None:
+def test_a_robot_that_was_never_heard_of_gets_no_mission(house: House) -> None:
     with pytest.raises(InvalidValue, match="no robot r7 has been heard of"):
         house.person.explore("r7")
 

@@ -107,10 +107,10 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
 
 
 def test_without_a_router_one_line_says_what_to_do(capfd: pytest.CaptureFixture[str]) -> None:
-    nobody = f"tcp/127.0.0.1:{free_port()}"
+    closed = f"tcp/127.0.0.1:{free_port()}"
     for words in (["status"], ["map", "fetch", "out.mapweave"]):
-        output = complaint(capfd, *words, "--connect", nobody)
-        assert f"no router at {nobody}: start `mapweave server`" in output
+        output = complaint(capfd, *words, "--connect", closed)
+        assert f"no router at {closed}: start `mapweave server`" in output
 
 
 def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
@@ -126,7 +126,7 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         "1.23,-5.00 180° in part 2", "12", "50%", "3", "7.0 s silent", "no map server answered (61 s ago)",
     )  # fmt: skip
     assert cells(RobotEntry("r1", False))[0] == "r1" and "gone" in cells(RobotEntry("r1", False))
-    for width in (100, 240):
+    for width in (150, 240):
         lines = Console(width=width, file=(printed := io.StringIO()))
         lines.print(table(FleetStatus((entry,)), width))
         _, line = printed.getvalue().splitlines()
