@@ -56,6 +56,8 @@ class ServerSettings:
 
 STATUS_EVERY = 0.5
 """Time between two status messages, s."""
+RELAYS = 4
+"""Missions that wait for their robots' answers at once."""
 MERGE_SHARE = 0.4
 """Largest share of the time that is spent merging."""
 
@@ -116,8 +118,8 @@ class MapServer:
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
-            lambda: self._history.happenings, self._missions, self._roster, clock, clock.monotonic,
-            clock.executor(1),
+            lambda: self._history.happenings, self._missions, self._roster,
+            clock.executor(RELAYS), clock.monotonic, clock.executor(1),
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,

@@ -16,7 +16,6 @@ from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.packed_map import PackedMap
 from mapweave.mapserver.roster import Roster
-from mapweave.mapserver.schedule import Schedule
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
@@ -43,7 +42,7 @@ class Services:
         history: Callable[[], Iterable[MapEvent]],
         missions: MissionRelay,
         roster: Roster,
-        schedule: Schedule,
+        relays: Executor,
         clock: Callable[[], float],
         executor: Executor,
     ) -> None:
@@ -60,7 +59,7 @@ class Services:
             history: of the maps, for who takes them along.
             missions: hands missions on.
             roster: of the robots.
-            schedule: runs what waits for a robot's answer.
+            relays: waits for robots' answers; it is shut down with this.
             clock: only grows, s.
             executor: packs the whole map; it is shut down with this.
         """
@@ -71,7 +70,7 @@ class Services:
         self._status = status
         self._missions = missions
         self._roster = roster
-        self._schedule = schedule
+        self._relays = relays
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor
         )
@@ -91,6 +90,7 @@ class Services:
         """Stop answering."""
         for closing in self._closing:
             closing.close()
+        self._relays.shutdown()
         self._map.close()
 
     def map_file(self) -> Future[bytes]:
@@ -100,7 +100,7 @@ class Services:
     def _command_later(self, request: Request) -> None:
         # It waits for a robot, which nothing else of the server may do.
         command = guarded(lambda payload: encode(self._missions.command(decode(payload, MissionRequest))))
-        self._schedule.spawn(lambda: command(request))
+        self._relays.submit(command, request)
 
     def _relocalize_later(self, request: Request) -> None:
         done = self._admission.submit(lambda: self._relocalize(request.payload), hash(request.payload))
