@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.localization.place_recognition import lookalikes, recognise_places
+from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.agent.mission import WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Command
@@ -83,7 +83,7 @@ class OwnMap:
         recalled = recognise_places(self.map, view, self._rng)
         if not recalled:
             return Candidates((), "", f"none of {len(self.map.nodes)} nodes is recognised")
-        alike = lookalikes(recalled, RIVAL, APART)
+        alike = aliased_places(recalled, RIVAL, APART)
         ambiguous = "" if alike is None else f"nodes {alike[0].id} and {alike[1].id} look the same"
         places = tuple(
             Candidate(
