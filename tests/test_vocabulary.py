@@ -29,6 +29,7 @@ PLAIN = {
     "lookalike": "alias",
     "lookalikes": "aliases",
     "nobody": "no robot, no server, unknown",
+    "ruled": "constrained",
     "ruling": "manual constraint",
     "rulings": "manual constraints",
     "somebody": "a person",
