@@ -113,11 +113,14 @@ def test_images_become_settings_that_an_agent_reads(name, true, frames, capfd, t
 class EmulatedCamera:
     """Gives the frames one by one, each twice, as a person holds the board still."""
 
-    def __init__(self, frames: list[np.ndarray]) -> None:
+    def __init__(self, frames: list[np.ndarray], interrupted: bool = False) -> None:
+        self._interrupted = interrupted
         self._frames, self.given, self.closed = [frame for frame in frames for _ in range(2)], 0, False
 
     def newer(self, stamp_ns: int, patience: float) -> Frame | None:
         if self.given == len(self._frames):
+            if self._interrupted:
+                raise KeyboardInterrupt
             return None
         self.given += 1
         return Frame(self.given, self._frames[self.given - 1])
@@ -143,10 +146,11 @@ def test_a_person_is_guided_live_until_the_views_suffice(frames, monkeypatch, ca
     assert (table["source"], table["lens"], table["width"]) == ("rtsp://camera/1", "equidistant", 320)
 
 
+@pytest.mark.parametrize("interrupted", [False, True])
 def test_a_stream_that_ends_early_is_refused_with_what_is_missing(
-    frames, monkeypatch, capfd, tmp_path: Path
+    interrupted, frames, monkeypatch, capfd, tmp_path: Path
 ) -> None:
-    camera = EmulatedCamera(frames["pinhole"][:5])
+    camera = EmulatedCamera(frames["pinhole"][:5], interrupted)
     monkeypatch.setattr(mapweave.agent.drivers.camera, "Capture", lambda settings: camera)
     robot = tmp_path / "r1.toml"
     assert main(["calibrate", "camera", "--robot", str(robot), "--height", "0.3", *OPTIONS]) == 1
