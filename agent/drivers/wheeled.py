@@ -136,6 +136,7 @@ class WheeledRobot:
             None if frame is None else frame.image,
             reading.proximity if used else np.zeros(0),
             reading.bumped and fresh,
+            reading.battery,
         )
 
     def act(self, command: Command) -> Command:
