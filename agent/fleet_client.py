@@ -78,7 +78,7 @@ class FleetClient:
         self._server = server
         self._server_alive = False
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
-        self._stamp_ns = 0
+        self._stamp_ns = self._skipped = 0
         self._unsent, self._placed = unsent, placed
         self._timeout = answer_timeout
         self._missions: queue.SimpleQueue[Mission] = queue.SimpleQueue()
@@ -105,15 +105,16 @@ class FleetClient:
         """Whether the map server is known to be reachable in both directions."""
         return self._server_alive and self._bus.connected()
 
-    def report(self, status: Status, stamp_ns: int, publish: bool = True) -> None:
+    def report(self, status: Status, stamp_ns: int, publish: bool = True, skipped: int = 0) -> None:
         """Publish the robot's status: on request and, best effort, to subscribers.
 
         Args:
             status: of the pipeline.
             stamp_ns: time of the observation that it describes.
             publish: send it now; else only answer questions with it.
+            skipped: images that were skipped so far.
         """
-        self._status, self._stamp_ns = status, stamp_ns
+        self._status, self._stamp_ns, self._skipped = status, stamp_ns, skipped
         if publish:
             self._bus.publish(self._keys.agent_status(self._agent), encode_agent_status(self._now()))
 
@@ -152,6 +153,7 @@ class FleetClient:
             traffic,
             self.server_in_reach(),
             self._placed(),
+            self._skipped,
         )
 
     def _tell_status(self, request: Request) -> None:

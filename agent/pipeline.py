@@ -219,7 +219,8 @@ class Pipeline:
 
     def _map(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
         self._keep_up(observation)
-        if self._mapper.doubtful or self._mapper.astray or self._blind:
+        mapper = self._mapper
+        if mapper.doubtful or mapper.astray or mapper.between_episodes or self._blind:
             return Command(), []
         if isinstance(self._mission, Carried):
             assert self._passenger is not None
@@ -236,6 +237,8 @@ class Pipeline:
         """
         while isinstance(move := behaviour.next_move(), EpisodeRequest):
             self._mapper.meet(move, observation)
+            if self._mapper.between_episodes:
+                return Command()
         return move
 
     def _resume(self, observation: Observation) -> Command:

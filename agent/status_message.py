@@ -31,6 +31,7 @@ class AgentStatus:
         traffic: bytes that it has sent and received over the fleet's network since it began.
         linked: whether it sees its map server.
         placed: nodes of its map of which it knows where they lie in the merged map.
+        skipped: images that it has skipped because a tick took too long.
     """
 
     status: Status
@@ -40,6 +41,7 @@ class AgentStatus:
     traffic: int = 0
     linked: bool = False
     placed: int = 0
+    skipped: int = 0
 
     @property
     def fix_node(self) -> NodeId | None:
@@ -59,6 +61,7 @@ def encode_agent_status(report: AgentStatus) -> bytes:
             "traffic": report.traffic,
             "linked": report.linked,
             "placed": report.placed,
+            "skipped_images": report.skipped,
             "astray": status.astray,
             "doing": _one_line(status.doing),
             "detail": _one_line(status.detail),
@@ -122,6 +125,7 @@ def decode_agent_status(payload: bytes) -> AgentStatus:
             traffic=_typed(values, "traffic", int),
             linked=_typed(values, "linked", bool),
             placed=_typed(values, "placed", int),
+            skipped=_typed(values, "skipped_images", int),
         )
     except (KeyError, ValueError, InvalidValue) as error:
         raise InvalidMessage(f"agent status: {error}") from None

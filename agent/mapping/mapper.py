@@ -60,6 +60,7 @@ class Mapper:
         self._wayside = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
+        self._ended = self._placed = False
 
     # What behaviours read, see `Episode`
 
@@ -77,6 +78,11 @@ class Mapper:
     def astray(self) -> bool:
         """Whether there is a map and the robot does not know where on it it is: it must recognise a place."""
         return self._anchor is None and bool(self.map.nodes)
+
+    @property
+    def between_episodes(self) -> bool:
+        """Whether an episode has ended and no image has come yet that begins the next."""
+        return self._ended
 
     @property
     def doubtful(self) -> bool:
@@ -160,6 +166,8 @@ class Mapper:
             self._tracking.step(observation)
         elif self._anchor is not None and not self.doubtful:
             self._wayside.step(observation, self._tracking.pose.mean)
+            if self._ended:
+                self._begin_next(observation)
 
     def meet(self, request: EpisodeRequest, observation: Observation) -> None:
         """Do what a behaviour asks for, with the observation of the last step."""
@@ -169,7 +177,7 @@ class Mapper:
             case EpisodeRequest.ADD_VIEW:
                 self.leaf(observation)
             case EpisodeRequest.FINISH:
-                self.finish(observation)
+                self.finish()
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
@@ -184,7 +192,7 @@ class Mapper:
         """
         self._cartographer.lose(self._tracking.pose)
         self._tracking = Tracking(self._description, self._lens, self._settings)
-        self._anchor, self._leaves = None, []
+        self._anchor, self._leaves, self._ended = None, [], False
 
     def resume(
         self, observation: Observation, features: Features, node: Node, recognition: Recognition
@@ -217,28 +225,36 @@ class Mapper:
             self._tracking.remember(force=True)
             self._leaves.append(view)
 
-    def finish(self, observation: Observation) -> bool:
-        """End the episode: its views become nodes, and the current image becomes the next anchor.
+    def finish(self) -> bool:
+        """End the episode: its views become nodes. The next image becomes the next anchor.
+
+        Features take as long as nodes; an image later, no tick has to do both.
 
         Returns:
-            Whether the anchor view became a node. False without an image.
+            Whether the anchor view became a node.
         """
-        next_anchor = self._take(observation, HERE)
-        if next_anchor is None or self._anchor is None:
+        if self._anchor is None:
             return False
         self._tracking.remember(force=True)
         node = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
         if node is not None:
             self.typical_depth = float(np.median(node.landmarks.depths))
+        self._leaves, self._ended, self._placed = [], True, node is not None
+        return node is not None
+
+    def _begin_next(self, observation: Observation) -> None:
+        """Begin an episode where the last one has ended, if there is an image."""
+        anchor = self._take(observation, HERE)
+        if anchor is None:
+            return
         moved = self._tracking.reanchor()
         self._cartographer.move_anchor(moved)
-        if node is not None:
-            self._wayside.clear(next_anchor.stamp_ns)
+        if self._placed:
+            self._wayside.clear(anchor.stamp_ns)
         else:
             self._wayside.move_anchor(moved.mean)
-        self._anchor, self._leaves = next_anchor, []
-        self._tracking.follow(next_anchor, self.typical_depth)
-        return node is not None
+        self._anchor, self._ended = anchor, False
+        self._tracking.follow(anchor, self.typical_depth)
 
     def _take(self, observation: Observation, anchor_from_view: PoseGaussian) -> View | None:
         if observation.image is None:
