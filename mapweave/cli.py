@@ -10,7 +10,10 @@ from typing import Any
 from mapweave.commands import (
     agent,
     demo,
+    doctor,
     evaluate,
+    find_cameras,
+    find_port,
     info,
     map_file,
     record,
@@ -60,8 +63,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, robots, map_file, record, replay, info, relocalize, evaluate,
-        settings,
+        demo, server, router, sim, agent, robots, doctor, find_port, find_cameras, map_file, record, replay,
+        info, relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)
     return top

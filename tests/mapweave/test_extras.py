@@ -45,6 +45,9 @@ CASES: list[tuple[str, str, str]] = [
     ("server", "--listen {nobody} --data {tmp}", SERVER),
     ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its robot
     ("robots", "", "koala"),
+    ("doctor", "--offline --data {tmp}", "nothing is wrong"),
+    ("find-port", "--list", "tty"),
+    ("find-cameras", "{tmp}/none.avi", "no camera gives an image"),
     ("router", "--listen nowhere", "endpoints look like"),
     ("record", "R0 --out {tmp}/drive --connect {nobody}", "R0"),
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
