@@ -29,6 +29,8 @@ EQUAL_PARTS = 64
 
 def examine(description: RobotDescription) -> Iterator[Finding]:
     """Compare the declared camera with what cameras are like."""
+    from mapweave.vision.lens import NO_DISTORTION
+
     camera = description.camera
     view = 2.0 * math.atan(camera.width / (2.0 * camera.fx))
     faults = []
@@ -53,7 +55,7 @@ def examine(description: RobotDescription) -> Iterator[Finding]:
         f"{camera.width}x{camera.height} px, {math.degrees(view):.0f} degrees wide, lens "
         f"{camera.mount_height:g} m high and {camera.mount_forward:g} m ahead of the axle"
     )
-    if not any(description.distortion):
+    if description.distortion == NO_DISTORTION:
         yield warning(SUBJECT, f"{words}; no distortion is declared", f"most lenses have some: {CALIBRATE}")
     else:
         yield good(SUBJECT, words)
@@ -64,7 +66,10 @@ def folding_radius(description: RobotDescription) -> float | None:
 
     r (1 + k1 r^2 + k2 r^4 + k3 r^6) must grow with r up to the corner.
     """
-    camera, (k1, k2, _, _, k3) = description.camera, description.distortion
+    camera, lens = description.camera, description.distortion
+    if not isinstance(lens, tuple):
+        return None  # a fisheye that folds is refused by the settings
+    k1, k2, _, _, k3 = lens
     corner = math.hypot(
         max(camera.cx, camera.width - camera.cx) / camera.fx,
         max(camera.cy, camera.height - camera.cy) / camera.fy,

@@ -111,7 +111,7 @@ def _motion(
 ) -> Iterator[Finding]:
     from mapweave.agent.observation import Command
 
-    comparison = MotionComparison(description.camera)
+    comparison = MotionComparison(description)
     if drives:
         if description.max_forward <= 0.0:
             yield skipped(ENCODERS, "the robot takes no commands")

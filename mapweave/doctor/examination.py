@@ -83,7 +83,7 @@ def _camera(settings: Settings) -> Iterator[Finding]:
         return
     from mapweave.agent.observation import RobotDescription
 
-    yield from camera_model.examine(RobotDescription(declared.intrinsics, declared.distortion))
+    yield from camera_model.examine(RobotDescription(*declared.optics))
     yield from camera.examine(declared)
 
 

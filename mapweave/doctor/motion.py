@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mapweave.agent.observation import Observation
-    from mapweave.hybridmap.camera import Camera
+    from mapweave.agent.observation import Observation, RobotDescription
 
 SUBJECT = "encoders"
 CALIBRATE = "mapweave calibrate drive"
@@ -32,9 +31,12 @@ EXPANSION = 0.03
 class MotionComparison:
     """Adds up what encoders and image say of each step."""
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Nothing has moved."""
-        self._camera = camera
+        from mapweave.vision.lens import Lens
+
+        self._camera = description.camera
+        self._lens = Lens(description.camera, description.distortion)
         self._image: NDArray[np.uint8] | None = None
         self._way = self._turn = 0.0
         self.compared = 0
@@ -50,15 +52,16 @@ class MotionComparison:
         self._turn += observation.odometry.turn
         if observation.image is None:
             return
+        image = self._lens.rectified(observation.image)
         if self._image is not None:
-            motion = visual_motion(self._image, observation.image, self._camera)
+            motion = visual_motion(self._image, image, self._camera)
             if motion is not None:
                 self.compared += 1
                 pairs = ((self.turns, self._turn, motion.turn), (self.ways, self._way, motion.expansion))
                 for sums, wheels, image in pairs:
                     steps = (abs(wheels), abs(image), wheels * image, wheels**2)
                     sums[:] = [total + step for total, step in zip(sums, steps, strict=True)]
-        self._image, self._way, self._turn = observation.image, 0.0, 0.0
+        self._image, self._way, self._turn = image, 0.0, 0.0
 
     @property
     def moved(self) -> bool:

@@ -270,7 +270,7 @@ def push(walls: PhotoWalls) -> list:
     ],
 )  # fmt: skip
 def test_encoders_are_compared_with_the_image(push, spoil, verdict, words) -> None:
-    comparison = MotionComparison(DESCRIPTION.camera)
+    comparison = MotionComparison(DESCRIPTION)
     for one in push:
         comparison.see(spoil(one, push[0]))
     (finding,) = comparison.judge()
