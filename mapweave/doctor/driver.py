@@ -130,7 +130,7 @@ def _motion(
     else:
         yield skipped(
             ENCODERS,
-            "not compared with the image: nobody is there to push the robot",
+            "not compared with the image: there is no terminal to ask for a push",
             "mapweave doctor --drive",
         )
         return

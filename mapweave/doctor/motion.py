@@ -58,8 +58,8 @@ class MotionComparison:
             if motion is not None:
                 self.compared += 1
                 pairs = ((self.turns, self._turn, motion.turn), (self.ways, self._way, motion.expansion))
-                for sums, wheels, image in pairs:
-                    steps = (abs(wheels), abs(image), wheels * image, wheels**2)
+                for sums, wheels, seen in pairs:
+                    steps = (abs(wheels), abs(seen), wheels * seen, wheels**2)
                     sums[:] = [total + step for total, step in zip(sums, steps, strict=True)]
         self._image, self._way, self._turn = image, 0.0, 0.0
 

@@ -45,8 +45,8 @@ def lines(
         line = monitor.see(seen, status, command)
         if line:
             out.append(line)
-            told = monitor.explained(status)
-            assert mission == "idle" or f"{told.doing}: {told.detail}".endswith(line.split("s: ", 1)[1])
+            explained = monitor.explained(status)
+            assert mission == "idle" or f"{explained.doing}: {explained.detail}".endswith(line.split("s: ", 1)[1])
     return out
 
 

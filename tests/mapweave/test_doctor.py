@@ -213,7 +213,7 @@ def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> 
     assert status == 1 and first in ("image", "encoders")
 
 
-def test_a_robot_that_nobody_pushes_and_a_wrong_size(walls, sketch, tmp_path, capfd) -> None:
+def test_a_robot_that_is_not_pushed_and_a_wrong_size(walls, sketch, tmp_path, capfd) -> None:
     settings = robot_toml(tmp_path, film(tmp_path / "film.avi", walls), sketch.path, width=640)
     status, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
     assert status == 1 and first == "camera" and "320x240" in findings["camera"].detail
