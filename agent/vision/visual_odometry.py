@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 
+WINDOW_PX = (15, 15)
 POINTS = 200
 LEAST_POINTS = 12
 ROUNDS = 4
@@ -43,8 +44,12 @@ def visual_motion(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Cam
     start = cv2.goodFeaturesToTrack(before, POINTS, 0.01, 7)
     if start is None or len(start) < LEAST_POINTS:
         return None
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, now, start, None, winSize=(15, 15), maxLevel=4)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(now, before, there, None, winSize=(15, 15), maxLevel=4)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, now, start, start.copy(), winSize=WINDOW_PX, maxLevel=4
+    )
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+        now, before, there, there.copy(), winSize=WINDOW_PX, maxLevel=4
+    )
     good = (found[:, 0] == 1) & (found_back[:, 0] == 1) & (np.linalg.norm(back - start, axis=2)[:, 0] < 1.0)
     if good.sum() < LEAST_POINTS:
         return None

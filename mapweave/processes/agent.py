@@ -29,6 +29,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.node import NUMBER, MapId
+from mapweave.processes.service_manager import ServiceManager
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -321,9 +322,15 @@ def run_agent(
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
     console = Console(stderr=True)
-    show = _progress(console, options)
+    show, manager = _progress(console, options), ServiceManager()
     describe = partial(_describe, robot, console.print, options.name)
-    agent = Agent(describe, bus, keys, settings, options, show, console.print)
+
+    def stepped(observation: Observation, step: Step) -> None:
+        manager.alive()
+        show(observation, step)
+
+    agent = Agent(describe, bus, keys, settings, options, stepped, console.print)
+    manager.ready()
     with show:
         try:
             agent.run(robot, stop)

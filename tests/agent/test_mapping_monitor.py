@@ -45,8 +45,8 @@ def lines(
         line = monitor.see(seen, status, command)
         if line:
             out.append(line)
-            explained = monitor.explained(status)
-            assert mission == "idle" or f"{explained.doing}: {explained.detail}".endswith(line.split("s: ", 1)[1])
+            detail = f"{status.doing}: {monitor.explained(status).detail}"
+            assert mission == "idle" or detail.endswith(line.split("s: ", 1)[1])
     return out
 
 
