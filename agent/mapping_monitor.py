@@ -22,6 +22,8 @@ MAPPING = ("explore", "carried")
 """Missions that make nodes."""
 WINDOW = 4.0
 """s over which motion of image, wheels and commands is compared."""
+QUIET = 5.0
+"""s without a new node after which the cause is sought, once a second; it takes as long as a tick."""
 PATIENCE = 15.0
 """s without a new node after which the reason is reported; exploring robots need up to 10 s for a node."""
 AGAIN = 60.0
@@ -84,10 +86,10 @@ class MappingMonitor:
         """
         now = observation.stamp_ns
         if not self._last_node_ns or status.nodes != self._nodes or status.finished:
-            self._nodes, self._last_node_ns, self._reported = status.nodes, now, ""
+            self._nodes, self._last_node_ns, self._reported, self._fault = status.nodes, now, "", ""
         self._remember(observation)
         self._command = command
-        if now - self._last_look_ns >= 1e9:
+        if now - self._last_look_ns >= 1e9 and now - self._last_node_ns >= QUIET * 1e9:
             self._last_look_ns = now
             self._fault = self._find_fault(observation.image)
         if now - self._last_node_ns < PATIENCE * 1e9 or status.mission not in (*MAPPING, "idle"):

@@ -225,8 +225,7 @@ class Pipeline:
 
     def _map(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
         self._keep_up(observation)
-        mapper = self._mapper
-        if mapper.doubtful or mapper.astray or mapper.between_episodes or self._blind:
+        if self._mapper.doubtful or self._mapper.astray or self._blind:
             return Command(), []
         if isinstance(self._mission, Carried):
             assert self._passenger is not None

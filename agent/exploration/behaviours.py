@@ -114,10 +114,12 @@ class ExplorationBehaviours:
                 break
             self.detail = f"{left} features of the view left"
             yield Command(0.0, side * s.turn_rate)
-        # The image after these makes a better node than a moving one.
+        # A still image makes a better node than a moving one.
         yield Command()
+        yield Command()
+        turned = abs(wrap_angle(self._mapper.map_from_robot.mean.heading - start))
         yield EpisodeRequest.FINISH
-        return abs(wrap_angle(self._mapper.map_from_robot.mean.heading - start))
+        return turned
 
     def travel(self, path: list[Array]) -> Generator[Move, None, bool]:
         """Follow the corners of a way: turn toward each, then drive straight to it, adding nodes.
@@ -146,6 +148,7 @@ class ExplorationBehaviours:
                 return
             if self._mapper.anchored <= LEFT and abs(self._mapper.anchor_from_robot.heading) > LEAST_TURN:
                 yield Command()
+                yield Command()
                 yield EpisodeRequest.FINISH
             self.detail = f"turning {math.degrees(error):+.0f} deg toward the way"
             yield Command(0.0, float(np.clip(2.0 * error, -s.turn_rate, s.turn_rate)))
@@ -154,6 +157,7 @@ class ExplorationBehaviours:
         """Returns whether the corner was reached."""
         s = self._settings
         if abs(self._mapper.anchor_from_robot.heading) > 0.2 or self._mapper.anchored <= LEFT:
+            yield Command()
             yield EpisodeRequest.FINISH
         best, since_best = math.inf, 0.0
         while True:
@@ -169,6 +173,7 @@ class ExplorationBehaviours:
             anchor_from_start = self._mapper.anchor_from_robot
             way = math.hypot(anchor_from_start.x, anchor_from_start.y)
             if way > TRAVEL_STEP or (way > 0.3 and self._mapper.anchored < 2 * LEFT):
+                yield Command()
                 yield EpisodeRequest.FINISH
             self.detail = f"{distance:.1f} m to the next corner"
             speed = min(s.travel_speed, max(0.6 * distance, 0.05)) * max(0.0, 1.0 - abs(error) / 0.5)

@@ -18,8 +18,8 @@ class EpisodeRequest(Enum):
     ADD_VIEW = auto()
     """Keep the current image as a further node, for example at the far end of a drive."""
     FINISH = auto()
-    """End the episode: its views become nodes, and the next image becomes the next anchor. This ends the
-    tick, and the robot stands until that image comes."""
+    """End the episode: its views become nodes, and the current image becomes the next anchor. This ends the
+    tick."""
 
 
 Move = Command | EpisodeRequest

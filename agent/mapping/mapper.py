@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.update_report import Health
@@ -60,7 +62,11 @@ class Mapper:
         self._wayside = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
-        self._ended = self._placed = False
+        # Features take as long as all else in a tick that makes nodes. A thread extracts them while the robot
+        # waits for its next image. The next tick begins by waiting for them: no result depends on speed.
+        self._extraction = ThreadPoolExecutor(1, "features")
+        self._pending: tuple[Future[Features], Callable[[Features], None]] | None = None
+        self._ended = False
 
     # What behaviours read, see `Episode`
 
@@ -81,7 +87,7 @@ class Mapper:
 
     @property
     def between_episodes(self) -> bool:
-        """Whether an episode has ended and no image has come yet that begins the next."""
+        """Whether an episode has ended in this tick. The next begins with the next tick, at this image."""
         return self._ended
 
     @property
@@ -160,14 +166,13 @@ class Mapper:
 
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
+        self._take_pending()
         self._tracking.step(observation)
         if self._tracking.acceptance.carried_off or self._tracking.disputed:
             self.lose()
             self._tracking.step(observation)
         elif self._anchor is not None and not self.doubtful:
             self._wayside.step(observation, self._tracking.pose.mean)
-            if self._ended:
-                self._begin_next(observation)
 
     def meet(self, request: EpisodeRequest, observation: Observation) -> None:
         """Do what a behaviour asks for, with the observation of the last step."""
@@ -177,13 +182,13 @@ class Mapper:
             case EpisodeRequest.ADD_VIEW:
                 self.leaf(observation)
             case EpisodeRequest.FINISH:
-                self.finish()
+                self.finish(observation)
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
-        anchor = self._take(observation, HERE)
-        if anchor is not None:
-            self._begin_at(anchor)
+        if observation.image is not None:
+            features = self._extract(observation.image).result()
+            self._begin_at(self._tracking.take(observation, features, HERE))
 
     def lose(self) -> None:
         """The robot's pose is lost. Observations since the anchor view are dropped.
@@ -192,7 +197,8 @@ class Mapper:
         """
         self._cartographer.lose(self._tracking.pose)
         self._tracking = Tracking(self._description, self._lens, self._settings)
-        self._anchor, self._leaves, self._ended = None, [], False
+        self._anchor, self._leaves = None, []
+        self._pending, self._ended = None, False
 
     def resume(
         self, observation: Observation, features: Features, node: Node, recognition: Recognition
@@ -220,43 +226,52 @@ class Mapper:
 
     def leaf(self, observation: Observation) -> None:
         """Keep the current image as a further node, for example at the far end of a drive."""
-        view = self._take(observation, self._tracking.pose)
-        if view is not None:
-            self._tracking.remember(force=True)
-            self._leaves.append(view)
+        if observation.image is None:
+            return
+        pose = self._tracking.pose
+        self._tracking.remember(force=True)
 
-    def finish(self) -> bool:
-        """End the episode: its views become nodes. The next image becomes the next anchor.
+        def take(features: Features) -> None:
+            self._leaves.append(self._tracking.take(observation, features, pose))
 
-        Features take as long as nodes; an image later, no tick has to do both.
+        self._take_pending()
+        self._pending = self._extract(observation.image), take
+
+    def finish(self, observation: Observation) -> bool:
+        """End the episode: its views become nodes, and the current image becomes the next anchor.
 
         Returns:
-            Whether the anchor view became a node.
+            Whether the anchor view became a node. False without an image.
         """
-        if self._anchor is None:
+        self._take_pending()
+        if observation.image is None or self._anchor is None:
             return False
+        features = self._extract(observation.image)
         self._tracking.remember(force=True)
         node = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
         if node is not None:
             self.typical_depth = float(np.median(node.landmarks.depths))
-        self._leaves, self._ended, self._placed = [], True, node is not None
+
+        def begin_next(features: Features) -> None:
+            anchor = self._tracking.take(observation, features, HERE)
+            moved = self._tracking.reanchor()
+            self._cartographer.move_anchor(moved)
+            if node is not None:
+                self._wayside.clear(anchor.stamp_ns)
+            else:
+                self._wayside.move_anchor(moved.mean)
+            self._anchor, self._leaves = anchor, []
+            self._tracking.follow(anchor, self.typical_depth)
+
+        self._pending, self._ended = (features, begin_next), True
         return node is not None
 
-    def _begin_next(self, observation: Observation) -> None:
-        """Begin an episode where the last one has ended, if there is an image."""
-        anchor = self._take(observation, HERE)
-        if anchor is None:
-            return
-        moved = self._tracking.reanchor()
-        self._cartographer.move_anchor(moved)
-        if self._placed:
-            self._wayside.clear(anchor.stamp_ns)
-        else:
-            self._wayside.move_anchor(moved.mean)
-        self._anchor, self._ended = anchor, False
-        self._tracking.follow(anchor, self.typical_depth)
+    def _extract(self, image: NDArray[np.uint8]) -> Future[Features]:
+        """Have the features of an image extracted."""
+        return self._extraction.submit(self._sift.extract, image)
 
-    def _take(self, observation: Observation, anchor_from_view: PoseGaussian) -> View | None:
-        if observation.image is None:
-            return None
-        return self._tracking.take(observation, self._sift.extract(observation.image), anchor_from_view)
+    def _take_pending(self) -> None:
+        """Use the features of the image before. Nothing was tracked since."""
+        if self._pending is not None:
+            (features, take), self._pending, self._ended = self._pending, None, False
+            take(features.result())

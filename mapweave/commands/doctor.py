@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
     from mapweave.doctor.finding import Finding
     from mapweave.settings import Settings
+    from mapweave.wire.bus import Bus
 
 STYLES = {"good": "green", "warning": "yellow", "wrong": "bold red", "skipped": "dim"}
 
@@ -60,20 +61,26 @@ def run(arguments: argparse.Namespace) -> int:
 
         return load_settings(arguments.settings)
 
+    buses: list[Bus] = []
+
     def open_robot(settings: Settings) -> Callable[[], Robot] | None:
         from mapweave.agent.drivers.settings import REMOTE
 
         chosen = driver or settings.robot.driver
         if chosen == REMOTE and driver is None and arguments.settings is None:
             return None
-        return lambda: _robot(arguments, settings, chosen)
+        return lambda: _robot(arguments, settings, chosen, buses)
 
     people = sys.stdin.isatty() and sys.stdout.isatty() and not arguments.json
     options = ExaminationOptions(
         load, lambda settings: network_of(arguments, settings), open_robot, arguments.data, arguments.drive,
         arguments.offline, _ask if people else lambda words: False,
     )  # fmt: skip
-    findings = list(examine(options))
+    try:
+        findings = list(examine(options))
+    finally:
+        for bus in buses:
+            bus.close()
     first = first_wrong(findings)
     if arguments.json:
         print(json.dumps(report(findings)))
@@ -86,8 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
     return int(first is not None)
 
 
-def _robot(arguments: argparse.Namespace, settings: Settings, driver: str) -> Robot:
-    """Open the robot; one behind the bus has a bus of its own."""
+def _robot(arguments: argparse.Namespace, settings: Settings, driver: str, buses: list[Bus]) -> Robot:
+    """Open the robot; one behind the network has a bus of its own, which is added to `buses`."""
     from mapweave.agent.drivers.registry import find_driver
     from mapweave.agent.drivers.remote import RemoteRobot
     from mapweave.agent.drivers.settings import REMOTE
@@ -95,8 +102,10 @@ def _robot(arguments: argparse.Namespace, settings: Settings, driver: str) -> Ro
 
     if driver != REMOTE:
         return find_driver(driver)(settings.robot)
-    bus, _ = connect(network_of(arguments, settings))
-    return RemoteRobot(bus, network_of(arguments, settings).fleet, arguments.name, REMOTE_PATIENCE)
+    network = network_of(arguments, settings)
+    bus, _ = connect(network)
+    buses.append(bus)
+    return RemoteRobot(bus, network.fleet, arguments.name, REMOTE_PATIENCE)
 
 
 REMOTE_PATIENCE = 5.0

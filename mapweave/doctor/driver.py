@@ -69,12 +69,16 @@ def _observe(robot: Robot, seconds: float, command: Command | None = None) -> It
     from mapweave.agent.observation import Command
     from mapweave.agent.servo.proximity import guard
 
-    end = time.monotonic() + seconds
+    # By the robot's stamps: a simulated one may be faster. A clock that stands still ends it, too.
+    end, first_ns = time.monotonic() + 3.0 * seconds, None
     while time.monotonic() < end:
         observation = robot.sense()
         if observation is None:
             return
         yield observation
+        first_ns = observation.stamp_ns if first_ns is None else first_ns
+        if observation.stamp_ns - first_ns >= seconds * 1e9:
+            break
         safe, _ = guard(command or Command(), observation.proximity, robot.describe())
         robot.act(Command() if observation.bumped else safe)
     robot.act(Command())

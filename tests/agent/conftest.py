@@ -77,7 +77,7 @@ class PhotoWalls:
             if not mapper.started:
                 mapper.begin(observation)
             before = Pose2(x)
-        mapper.finish()
+        mapper.finish(observation)
         (node,) = mapper.map.nodes.values()
         return node
 

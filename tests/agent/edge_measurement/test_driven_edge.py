@@ -107,7 +107,7 @@ def two_nodes(walls) -> HybridMap:
         if tick == len(there) - 1:
             mapper.leaf(observation)
         before = Pose2(x)
-    mapper.finish()
+    mapper.finish(observation)
     assert len(mapper.map.nodes) == 2
     return mapper.map
 

@@ -29,9 +29,9 @@ def drive(mapper, walls, positions, start=1):
 def test_depths_of_a_node_are_those_of_the_walls(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
     there = np.arange(0.0, 0.6, 0.025)
-    drive(mapper, walls, [*there, *there[::-1]])
+    last = drive(mapper, walls, [*there, *there[::-1]])
     assert mapper.take_changes() == ()
-    assert mapper.finish()
+    assert mapper.finish(last)
     (node,) = mapper.map.nodes.values()
     assert mapper.take_changes() == (NodePut(node),)
     assert mapper.take_changes() == (), "each change leaves once"
@@ -45,10 +45,10 @@ def test_depths_of_a_node_are_those_of_the_walls(walls, description):
 
 def test_an_edge_is_the_drive_between_two_views(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
-    drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025)))
-    mapper.finish()
-    drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
-    mapper.finish()
+    first = drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025)))
+    mapper.finish(first)
+    second = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
+    mapper.finish(second)
     (edge,) = mapper.map.edges.values()
     a, b = mapper.map.nodes[edge.a], mapper.map.nodes[edge.b]
     assert abs(edge.a_from_b.mean.x - 0.5) < 0.01
@@ -70,15 +70,15 @@ def test_a_view_without_features_gives_no_node(walls, description):
         if not mapper.started:
             mapper.begin(observation)
     assert mapper.anchor_features == 0
-    assert not mapper.finish()
+    assert not mapper.finish(observation)
     assert mapper.take_changes() == ()
     assert not mapper.map.nodes
 
 
 def test_standing_still_gives_no_depth(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
-    drive(mapper, walls, [0.0] * 30)
-    mapper.finish()
+    last = drive(mapper, walls, [0.0] * 30)
+    mapper.finish(last)
     assert not mapper.map.nodes
 
 
@@ -114,6 +114,6 @@ def test_a_camera_that_turned_away_from_all_landmarks_has_not_failed(walls, desc
             mapper.begin(seen)
         collected.append(mapper.health)
     assert "landmark" in collected[-1], "it has turned away from what it mapped"
-    mapper.finish()
+    mapper.finish(seen)
     mapper.step(walls.observe(pose, pose, tick + 1))
     assert mapper.anchor_features > 0 and mapper.health == ""

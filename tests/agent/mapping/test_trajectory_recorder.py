@@ -96,7 +96,7 @@ def test_a_mapped_drive_records_the_trajectory(walls, clocked):
         if not mapper.started:
             mapper.begin(observation)
         before = Pose2(x)
-    mapper.finish()
+    mapper.finish(observation)
     (node,) = mapper.map.nodes.values()
     ticks = np.rint((node.segment.ages * 1e9 + node.stamp_ns) / 1e8).astype(int)
     assert len(ticks) == 3 and (np.diff(ticks) == 10).all()
@@ -105,6 +105,5 @@ def test_a_mapped_drive_records_the_trajectory(walls, clocked):
     assert node.segment.node_from_robot[:, 1:] == pytest.approx(0.0, abs=0.02)
     assert node.segment.distances[:, 0] == pytest.approx(true + clocked.radius)
     # The next node begins with none of it.
-    mapper.step(replace(observation, stamp_ns=observation.stamp_ns + 1))
-    mapper.finish()
+    mapper.finish(replace(observation, stamp_ns=observation.stamp_ns + 1))
     assert sum(len(one.segment) for one in mapper.map.nodes.values()) == 3
