@@ -65,7 +65,7 @@ class Mapper:
         # Features take as long as all else in a tick that makes nodes. A thread extracts them while the robot
         # waits for its next image. The next tick begins by waiting for them: no result depends on speed.
         self._extraction = ThreadPoolExecutor(1, "features")
-        self._pending: tuple[Future[Features], Callable[[Features], None]] | None = None
+        self._extracting: tuple[Future[Features], Callable[[Features], None]] | None = None
         self._ended = False
 
     # What behaviours read, see `Episode`
@@ -166,7 +166,7 @@ class Mapper:
 
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
-        self._take_pending()
+        self._use_extracted()
         self._tracking.step(observation)
         if self._tracking.acceptance.carried_off or self._tracking.disputed:
             self.lose()
@@ -198,7 +198,7 @@ class Mapper:
         self._cartographer.lose(self._tracking.pose)
         self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._leaves = None, []
-        self._pending, self._ended = None, False
+        self._extracting, self._ended = None, False
 
     def resume(
         self, observation: Observation, features: Features, node: Node, recognition: Recognition
@@ -234,8 +234,8 @@ class Mapper:
         def take(features: Features) -> None:
             self._leaves.append(self._tracking.take(observation, features, pose))
 
-        self._take_pending()
-        self._pending = self._extract(observation.image), take
+        self._use_extracted()
+        self._extracting = self._extract(observation.image), take
 
     def finish(self, observation: Observation) -> bool:
         """End the episode: its views become nodes, and the current image becomes the next anchor.
@@ -243,7 +243,7 @@ class Mapper:
         Returns:
             Whether the anchor view became a node. False without an image.
         """
-        self._take_pending()
+        self._use_extracted()
         if observation.image is None or self._anchor is None:
             return False
         features = self._extract(observation.image)
@@ -263,15 +263,15 @@ class Mapper:
             self._anchor, self._leaves = anchor, []
             self._tracking.follow(anchor, self.typical_depth)
 
-        self._pending, self._ended = (features, begin_next), True
+        self._extracting, self._ended = (features, begin_next), True
         return node is not None
 
     def _extract(self, image: NDArray[np.uint8]) -> Future[Features]:
         """Have the features of an image extracted."""
         return self._extraction.submit(self._sift.extract, image)
 
-    def _take_pending(self) -> None:
+    def _use_extracted(self) -> None:
         """Use the features of the image before. Nothing was tracked since."""
-        if self._pending is not None:
-            (features, take), self._pending, self._ended = self._pending, None, False
+        if self._extracting is not None:
+            (features, take), self._extracting, self._ended = self._extracting, None, False
             take(features.result())
