@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.agent.pipeline import Status
 from mapweave.agent.vision.image_quality import ImageQuality
+from mapweave.hybridmap.agent_status import Status
 
 MAPPING = ("explore", "carried")
 """Missions that make nodes."""

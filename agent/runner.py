@@ -11,6 +11,7 @@ from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation
 from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.replication.replicator import Replicator
@@ -37,6 +38,7 @@ class Runner:
         pipeline: Pipeline,
         fleet: FleetClient,
         replicator: Replicator,
+        missions: MissionControl,
         monitor: MappingMonitor,
         synchronization: Synchronization | None = None,
         on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
@@ -47,8 +49,9 @@ class Runner:
 
         Args:
             pipeline: the mind.
-            fleet: questions, missions, status.
+            fleet: questions and status.
             replicator: where changes go: to the own disk, then to the server.
+            missions: what the pipeline shall do.
             monitor: says why there are no nodes.
             synchronization: what the loop waits for; nothing if not given.
             on_step: called after each tick, for progress.
@@ -63,6 +66,7 @@ class Runner:
         self._pipeline = pipeline
         self._fleet = fleet
         self._replicator = replicator
+        self._missions = missions
         self._synchronization = synchronization or FreeRunning()
         self._on_step = on_step
         self._questions: tuple[Question, ...] = ()
@@ -71,7 +75,9 @@ class Runner:
 
     def tick(self, observation: Observation) -> Step:
         """Take one observation; changes and status go their way, questions wait for `exchange`."""
-        for mission in self._fleet.missions():
+        home = min(self._pipeline.map.nodes, default=None)
+        mission = self._missions.next(self._fleet.server_in_reach(), observation.stamp_ns * 1e-9, home)
+        if mission is not None:
             self._pipeline.set_mission(mission)
         answers, self._answers = (*self._answers, *self._fleet.answers()), ()
         step = self._pipeline.step(observation, answers)
@@ -82,9 +88,10 @@ class Runner:
         line = self._monitor.see(observation, step.status, step.command)
         if line:
             self._print(line)
-        now = self._ticks % REPORT_EVERY == 0 or bool(step.questions)
+        changed = self._missions.follow(step.status)
+        now = self._ticks % REPORT_EVERY == 0 or bool(step.questions) or changed
         status = self._monitor.explained(step.status)
-        self._fleet.report(status, observation.stamp_ns, publish=now, skipped=self.skipped)
+        self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
         self._ticks += 1
         self._on_step(observation, step)
         return step

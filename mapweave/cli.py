@@ -16,6 +16,7 @@ from mapweave.commands import (
     find_port,
     info,
     map_file,
+    missions,
     record,
     relocalize,
     replay,
@@ -24,6 +25,7 @@ from mapweave.commands import (
     server,
     settings,
     sim,
+    status,
 )
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
@@ -63,8 +65,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, robots, doctor, find_port, find_cameras, map_file, record, replay,
-        info, relocalize, evaluate, settings,
+        demo, server, router, sim, agent, status, missions, robots, doctor, find_port, find_cameras, map_file,
+        record, replay, info, relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)
     return top

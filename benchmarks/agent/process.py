@@ -52,7 +52,7 @@ def measure(drive: Path, folder: Path, endpoint: str, seed: int) -> dict[str, fl
     import mapweave.agent.drivers.checked
     import mapweave.agent.drivers.claim
     import mapweave.agent.drivers.registry  # noqa: F401 - for the time that it takes
-    from mapweave.agent.mission import Explore
+    from mapweave.hybridmap.mission_order import MissionKind
     from mapweave.processes.agent import Agent, AgentOptions
     from mapweave.settings import Settings
     from mapweave.wire.bus_settings import BusSettings
@@ -88,7 +88,7 @@ def measure(drive: Path, folder: Path, endpoint: str, seed: int) -> dict[str, fl
     bus = ZenohBus(BusSettings(endpoints=(endpoint,)))
     try:
         bus.wait_connected(5.0)
-        options = AgentOptions(NAME, folder, epoch=1, mission=Explore(), seed=seed, patience=0.0)
+        options = AgentOptions(NAME, folder, epoch=1, mission=MissionKind.EXPLORE, seed=seed, patience=0.0)
         agent = Agent(robot.describe, bus, Keys("benchmark"), Settings().agent, options)
         cpu = time.process_time()
         agent.run(robot, threading.Event())

@@ -9,12 +9,15 @@ import time
 from pathlib import Path
 
 from mapweave.agent.mapping_monitor import MappingMonitor
-from mapweave.agent.mission import Carried
+from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Status, Step
+from mapweave.agent.pipeline import Step
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.bus import Bus
@@ -57,7 +60,7 @@ def forth_and_back(walls, description: RobotDescription) -> Player:
 
 def run(robot: Player, bus: Bus, folder: Path) -> Agent:
     """Run an agent to the end of its observations; it stays open."""
-    options = AgentOptions("r0", folder, epoch=1, mission=Carried(), patience=0.0)
+    options = AgentOptions("r0", folder, epoch=1, mission=MissionKind.CARRIED, patience=0.0)
     agent = Agent(robot.describe, bus, Keys("fleet"), AgentSettings(), options)
     agent.run(robot, threading.Event())
     return agent
@@ -107,6 +110,7 @@ class Slow:
     """A pipeline whose ticks take long, by a clock of its own."""
 
     lost = False
+    map = HybridMap()
 
     def __init__(self, durations: list[float]) -> None:
         self.durations, self.now = durations, 0.0
@@ -125,13 +129,13 @@ class Fleet:
     def __init__(self) -> None:
         self.skipped: list[int] = []
 
-    def missions(self) -> list[object]:
-        return []
+    def server_in_reach(self) -> bool:
+        return True
 
     def answers(self) -> tuple[object, ...]:
         return ()
 
-    def report(self, status: Status, stamp_ns: int, publish: bool, skipped: int) -> None:
+    def report(self, status: Status, stamp_ns: int, battery: float | None, now: bool, skipped: int) -> None:
         self.skipped.append(skipped)
 
 
@@ -141,7 +145,7 @@ def test_images_that_come_during_a_long_tick_are_skipped_and_counted(description
     durations = [0.02, 0.35, 0.02, 0.02, 0.15, 0.02]
     robot = Player(description, [Observation(round(s * 1e9), Odometry(0.0, 0.0)) for s in stamps])
     slow, fleet = Slow(durations), Fleet()
-    runner = Runner(slow, fleet, None, MappingMonitor(description), clock=slow.clock)
+    runner = Runner(slow, fleet, None, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
     with caplog.at_level(logging.WARNING):
         assert runner.run(robot, threading.Event()) == 6
     assert fleet.skipped == [0, 0, 3, 3, 3, 3] and runner.skipped == 3

@@ -11,7 +11,7 @@ import pytest
 
 from mapweave.agent.mapping_monitor import AGAIN, PATIENCE, MappingMonitor
 from mapweave.agent.observation import Command, Observation, Odometry
-from mapweave.agent.pipeline import Status
+from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.pose import Pose2
 
 STOPPED = Odometry(0.0, 0.0)
