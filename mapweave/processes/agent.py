@@ -125,8 +125,9 @@ class Agent:
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
             self.missions = MissionControl(
-                options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server
-            )
+                options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server,
+                lambda save: threading.Thread(target=save, name="missions").start(),
+            )  # fmt: skip
             if options.mission is not None or self.missions.report is None:
                 self.missions.begin(options.mission or options.otherwise)
             self.missions.unknown_goal = self._unknown_goal
@@ -299,6 +300,7 @@ class Agent:
     def close(self) -> None:
         """Commit what was mapped and leave the fleet. The bus stays open."""
         self._leave()
+        self.missions.save()
         self.journal.close()
 
 

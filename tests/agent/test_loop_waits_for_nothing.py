@@ -6,9 +6,11 @@ import logging
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from mapweave.agent.mapping_monitor import MappingMonitor
+from mapweave.agent.mission import Idle
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Step
@@ -17,7 +19,7 @@ from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.mission_order import MissionKind
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.bus import Bus
@@ -25,6 +27,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.zenoh_bus import ZenohBus
+from tests.waiting import eventually
 
 LONGEST_TICK = 1.0
 """s; far above what a tick takes on a busy machine, and far below what is waited for here."""
@@ -88,6 +91,35 @@ def test_a_disk_that_hangs_holds_up_no_tick(walls, description, tmp_path, monkey
         ticks_over.set()
         agent.close()
         bus.close()
+
+
+def test_a_disk_that_hangs_holds_up_no_mission() -> None:
+    """An order comes, and a mission ends, while the disk hangs: the loop goes on, the sender waits."""
+    over, kept = threading.Event(), []
+
+    def keep(reports: object) -> None:
+        kept.append(over.wait(60.0))
+
+    savers: list[threading.Thread] = []
+
+    def defer(save: Callable[[], None]) -> None:
+        savers.append(threading.Thread(target=save))
+        savers[-1].start()
+
+    control = MissionControl("r0", keep=keep, defer=defer)
+    order = MissionOrder("m1", "r0", MissionKind.STOP, 1, "anna", None)
+    sender = threading.Thread(target=control.take, args=(order,))
+    sender.start()
+    try:
+        eventually(lambda: control.report is not None)
+        assert control.next(True, 0.0, None) == Idle()
+        assert control.follow(Status("idle", "", 0, 0, Pose2(), True)), "the stop is done"
+        assert sender.is_alive() and not kept, "nothing is on the disk yet"
+    finally:
+        over.set()
+        for thread in (sender, *savers):
+            thread.join(60.0)
+    assert kept == [True, True]
 
 
 def test_a_dead_network_holds_up_no_tick(walls, description, tmp_path) -> None:
