@@ -201,6 +201,8 @@ class Pipeline:
         """
         while isinstance(move := behaviour.next_move(), EpisodeRequest):
             self._mapper.meet(move, observation)
+            if self._mapper.between_episodes:
+                return Command()
         return move
 
     def _resume(self, observation: Observation) -> Command:

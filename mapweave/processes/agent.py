@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
@@ -29,6 +30,7 @@ from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NUMBER, MapId, NodeId
+from mapweave.processes.service_manager import ServiceManager
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -40,6 +42,9 @@ FIRST_PATIENCE = 3.0
 
 SILENCE = 2.0
 """s; a longer wait for the robot is reported."""
+
+SERVER_PATIENCE = 20.0
+"""s without the map server after which that is reported."""
 
 
 @dataclass(frozen=True)
@@ -115,12 +120,14 @@ class Agent:
         self._options = options
         self._on_step = on_step
         self._print = print_line
+        self._server_missing, self._server_ns = False, 0
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
             self.missions = MissionControl(
-                options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server
-            )
+                options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server,
+                lambda save: threading.Thread(target=save, name="missions").start(),
+            )  # fmt: skip
             if options.mission is not None or self.missions.report is None:
                 self.missions.begin(options.mission or options.otherwise)
             self.missions.unknown_goal = self._unknown_goal
@@ -187,13 +194,36 @@ class Agent:
         path = trajectory_path(options.data, map_id)
         self._trajectory = TrajectoryFile(path) if options.trajectories else None
         self.runner = Runner(
-            pipeline, self._fleet, self.replicator, self.missions, options.synchronization, self._stepped
-        )
+            pipeline, self._fleet, self.replicator, self.missions, MappingMonitor(self._description),
+            options.synchronization, self._stepped, self._say,
+        )  # fmt: skip
+
+    def _say(self, line: str) -> None:
+        self._print(f"{self._options.name}: {line}")
 
     def _stepped(self, observation: Observation, step: Step) -> None:
         if self._trajectory is not None and step.status.located:
             self._trajectory.add(observation.stamp_ns, step.status.map_from_robot)
+        self._look_for_server(observation.stamp_ns)
         self._on_step(observation, step)
+
+    def _look_for_server(self, stamp_ns: int) -> None:
+        """Say once that the map server is missing, and when it is there."""
+        if self._options.patience <= 0.0:
+            return
+        server = self._options.server
+        if self._fleet.server_in_reach():
+            if self._server_missing:
+                self._say(f"map server {server} is in reach")
+            self._server_missing, self._server_ns = False, stamp_ns
+        elif not self._server_ns:
+            self._server_ns = stamp_ns
+        elif not self._server_missing and stamp_ns - self._server_ns > SERVER_PATIENCE * 1e9:
+            self._server_missing = True
+            self._say(
+                f"no map server {server} in reach for {SERVER_PATIENCE:g} s: what is mapped stays on this "
+                "disk; start `mapweave server`, with the same --fleet"
+            )
 
     @property
     def map_id(self) -> MapId:
@@ -270,6 +300,7 @@ class Agent:
     def close(self) -> None:
         """Commit what was mapped and leave the fleet. The bus stays open."""
         self._leave()
+        self.missions.save()
         self.journal.close()
 
 
@@ -305,9 +336,15 @@ def run_agent(
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
     console = Console(stderr=True)
-    show = _progress(console, options)
+    show, manager = _progress(console, options), ServiceManager()
     describe = partial(_describe, robot, console.print, options.name)
-    agent = Agent(describe, bus, keys, settings, options, show, console.print)
+
+    def stepped(observation: Observation, step: Step) -> None:
+        manager.alive()
+        show(observation, step)
+
+    agent = Agent(describe, bus, keys, settings, options, stepped, console.print)
+    manager.ready()
     with show:
         try:
             agent.run(robot, stop)
