@@ -9,6 +9,7 @@ from typing import Any
 
 from mapweave.commands import (
     agent,
+    calibrate,
     demo,
     evaluate,
     info,
@@ -60,8 +61,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, robots, map_file, record, replay, info, relocalize, evaluate,
-        settings,
+        demo, server, router, sim, agent, robots, map_file, record, replay, info, calibrate, relocalize,
+        evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)
     return top

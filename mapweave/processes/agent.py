@@ -12,6 +12,7 @@ import cv2
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
+from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission import Idle, Mission
@@ -111,6 +112,7 @@ class Agent:
         self._settings = replace(settings, seed=options.seed)
         self._options = options
         self._on_step = on_step
+        self._causes = 0
         self._print = print_line
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
@@ -128,7 +130,7 @@ class Agent:
             self.journal.close()
             raise
 
-    def _begin(self) -> None:
+    def _begin(self, calibration: OnlineCalibration | None = None) -> None:
         """A fresh map, whose number no map of this robot has had."""
         options = self._options
         taken = [known_map.epoch for known_map in self.journal.maps()]
@@ -143,7 +145,8 @@ class Agent:
                 stored = newest_on_server(self._bus, self._keys, options.server, options.name, patience)
             epoch = next_epoch(taken, stored)
         map_id = self.journal.open_map(epoch)
-        self._start(map_id, Pipeline(map_id, self._description, self._settings))
+        pipeline = Pipeline(map_id, self._description, self._settings, calibration=calibration)
+        self._start(map_id, pipeline)
 
     def _resume(self, map_id: MapId) -> None:
         kept = RetainedMap.of(self.journal, map_id)
@@ -184,6 +187,11 @@ class Agent:
         if self._trajectory is not None and step.status.located:
             self._trajectory.add(observation.stamp_ns, step.status.map_from_robot)
         self._on_step(observation, step)
+        # A geometry that is found to be declared wrongly is reported once.
+        causes = self.pipeline.calibration.causes
+        for cause in causes[self._causes :]:
+            self._print(f"{self._options.name}: {cause}")
+        self._causes = len(causes)
 
     @property
     def map_id(self) -> MapId:
@@ -192,14 +200,14 @@ class Agent:
 
     def begin_new_map(self) -> None:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
-        mission, old = self.pipeline.mission, self.map_id
+        mission, old, calibration = self.pipeline.mission, self.map_id, self.pipeline.calibration
         self._leave()
         try:
             self.write_map()
         except InvalidFile as error:
             # The journal has it all.
             self._print(f"{self._options.name}: {error}")
-        self._begin()
+        self._begin(calibration)
         self.pipeline.set_mission(mission)
         self._print(
             f"{self._options.name}: cannot find itself on map {old}; it begins map {self.map_id}, "
