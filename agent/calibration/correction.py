@@ -56,6 +56,12 @@ def geometry_of(description: RobotDescription) -> DriveGeometry:
     return replace(declared, forward=camera.mount_forward, height=camera.mount_height)
 
 
+def declaring(description: RobotDescription, geometry: DriveGeometry) -> RobotDescription:
+    """A robot that declares this geometry."""
+    camera = replace(description.camera, mount_forward=geometry.forward, mount_height=geometry.height)
+    return replace(description, camera=camera, geometry=geometry)
+
+
 def corrected(description: RobotDescription, geometry: DriveGeometry) -> tuple[RobotDescription, Lens]:
     """The robot as everything behind the lens shall know it, and the lens.
 

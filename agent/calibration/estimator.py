@@ -68,13 +68,16 @@ FLOOR_WIDTHS = (0.1, 0.06)
 FLOOR_FLAT = 0.03
 """Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
 FLOOR_CONTRAST = 3.0
-"""The mode must be so many times as dense as what seems to lie below it ..."""
-FLOOR_VAGUE = 0.02
-"""... and known to this, as a share; else it is not taken for the floor."""
+"""The mode must be so many times as dense as what seems to lie below it, else it is not the floor."""
 FLOOR_SIGMA = 0.005
 """Least standard deviation of a scale by the floor: contact edges, mats, slopes."""
+LEAST_BLOCKS = 8
+"""Blocks of pairs that see the floor; the scatter of fewer tells no sigma."""
 LEAST_FLOOR = 60
 """Points on the floor; with fewer nothing is said of it."""
+DEPTH_SPREADS = 3.0
+"""Spreads of the scene's inverse depths within which a track's is expected. One spread draws near floor and
+far walls together, which shows as pitch and as a way 0.7 % too long (rendered room); three do not."""
 INNER = 6
 """Gauss-Newton steps between two reductions of the pairs."""
 
@@ -278,7 +281,7 @@ class Estimator:
         )
         which, logs, sigmas = which[fresh], logs[fresh], sigmas[fresh]
         self.floor_tracks = 0
-        if len(logs) < LEAST_FLOOR:
+        if len(logs) < LEAST_FLOOR or len(np.unique(which // BLOCK)) < LEAST_BLOCKS:
             self._floor = None
             return
         centres = np.arange(-0.6, 0.6, 0.02)
@@ -297,7 +300,9 @@ class Estimator:
         sigma = math.sqrt(float((pulls**2).sum())) / max(float(stiffness), 1e-9)
         self.floor_tracks = int((np.abs(off) < 2.0 * width).sum())
         heights = _kernel(logs - np.array([[mode], [mode - 4.0 * width]]), sigmas, width).sum(1)
-        clear = stiffness > 0.0 and sigma < FLOOR_VAGUE and heights[0] > FLOOR_CONTRAST * heights[1]
+        clear = (
+            self.floor_tracks >= LEAST_FLOOR and stiffness > 0.0 and heights[0] > FLOOR_CONTRAST * heights[1]
+        )
         self._floor = (float(used + mode), max(sigma, FLOOR_SIGMA)) if clear else None
 
     def _jacobian(
@@ -382,7 +387,7 @@ class Estimator:
         depths = np.array([i.inverse_depths for i in self.informations if i.tracks > 5])
         if len(depths):
             mean, spread = np.median(depths, axis=0)
-            self._depth = (float(mean), float(max(spread, 0.5 * mean)))
+            self._depth = (float(mean), DEPTH_SPREADS * float(max(spread, 0.5 * mean)))
 
     def _scatter(self, inverse_hessian: Array, scores: Array) -> Array:
         """(10, 10) covariance by how blocks of pairs pull apart."""

@@ -16,6 +16,7 @@ from mapweave.vision.lens import Lens
 CORNERS = 300
 QUALITY, APART_PX = 0.003, 7
 """Of corners: share of the strongest, and distance from each other."""
+WINDOW_PX = 15
 BACKWARD_PX = 0.5
 """A point that does not come back to within this is lost."""
 SHORTEST_S, LONGEST_S = 0.3, 1.0
@@ -29,6 +30,25 @@ LEAST_PX = 1.0
 """Half of the points must have moved this far: a robot that stands says nothing."""
 
 
+def centres(image: NDArray[np.uint8], points: Array, window: int) -> Array:
+    """(N, 2) px, the points of which Lucas-Kanade measures the motion, for windows about (N, 2) px.
+
+    A window moves as the middle of its gradients' energy does. Of floor that is the far side, where the
+    pattern is dense: taken for the middle of the window it seems 1.3 % slower than it is (rendered room).
+    """
+    if not len(points):
+        return points
+    dx, dy = cv2.spatialGradient(image)
+    energy = np.square(dx, dtype=np.float32) + np.square(dy, dtype=np.float32) + 1e-3
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
+    column, row = points.round().astype(int).T
+    total, across, down = (
+        cv2.boxFilter(part, -1, (window, window))[row, column].astype(np.float64)
+        for part in (energy, energy * x, energy * y)
+    )
+    return np.column_stack([across / total, down / total])
+
+
 class ImagePairs:
     """Follows corners from image to image and gives a pair whenever the view has moved enough."""
 
@@ -39,6 +59,7 @@ class ImagePairs:
         self._first_s = 0.0
         self._begin: Array = np.zeros((0, 2))
         self._here: NDArray[np.float32] = np.zeros((0, 1, 2), np.float32)
+        self._centre: Array = np.zeros((0, 2))
         self._count = 0
 
     def step(self, stamp_s: float, image: NDArray[np.uint8]) -> ImagePair | None:
@@ -58,8 +79,8 @@ class ImagePairs:
         if moved >= LEAST_PX:
             focal = [self._camera.fx, self._camera.fy]
             centre = [self._camera.cx, self._camera.cy]
-            before = (self._lens.undistort(self._begin) - centre) / focal
-            after = (self._lens.undistort(self._here[:, 0]) - centre) / focal
+            before = (self._lens.undistort(self._begin + self._centre) - centre) / focal
+            after = (self._lens.undistort(self._here[:, 0] + self._centre) - centre) / focal
             pair = ImagePair(self._first_s, stamp_s, before, after)
         self._start(stamp_s, image)
         return pair
@@ -74,6 +95,7 @@ class ImagePairs:
         corners[1] = corners[1] + [0.0, image.shape[0] // 2]
         self._begin = np.concatenate(corners)
         self._here = self._begin.astype(np.float32)[:, None]
+        self._centre = centres(image, self._begin, WINDOW_PX) - self._begin
         self._count = len(self._begin)
 
     def _follow(self, image: NDArray[np.uint8]) -> bool:
@@ -81,7 +103,7 @@ class ImagePairs:
         before, self._before = self._before, image
         if len(self._here) < LEAST_TRACKS:
             return False
-        options = {"winSize": (15, 15), "maxLevel": 3}
+        options = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": 3}
         there, found, _ = cv2.calcOpticalFlowPyrLK(before, image, self._here, None, **options)  # type: ignore[call-overload]
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(image, before, there, None, **options)  # type: ignore[call-overload]
         kept = (found[:, 0] == 1) & (found_back[:, 0] == 1)
@@ -89,7 +111,7 @@ class ImagePairs:
         height, width = image.shape
         place = there[:, 0]
         kept &= (place >= 3).all(axis=1) & (place[:, 0] < width - 3) & (place[:, 1] < height - 3)
-        self._here, self._begin = there[kept], self._begin[kept]
+        self._here, self._begin, self._centre = there[kept], self._begin[kept], self._centre[kept]
         return len(self._here) >= LEAST_TRACKS
 
 

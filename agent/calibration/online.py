@@ -16,7 +16,13 @@ from mapweave.agent.calibration.correction import OdometryCorrection, corrected,
 from mapweave.agent.calibration.drive_geometry import DriveGeometry, Parameter, WheelTrack
 from mapweave.agent.calibration.estimator import USEFUL_SIGMAS, Estimate, Estimator
 from mapweave.agent.calibration.floor_points import FloorPoints
-from mapweave.agent.calibration.image_pairs import LEAST_TRACKS, LONGEST_S, SHORTEST_S, sigma_of
+from mapweave.agent.calibration.image_pairs import (
+    LEAST_LEFT,
+    LEAST_TRACKS,
+    LONGEST_S,
+    SHORTEST_S,
+    sigma_of,
+)
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.report import Cause, causes
 from mapweave.agent.observation import Observation, RobotDescription
@@ -35,8 +41,6 @@ STALE = 0.25
 """A pair is reduced again when a parameter has moved by this share of a useful sigma since."""
 KEPT_NEW = 40
 """Of these the newest stay; of the others those go that turn least."""
-FLOOR_EVERY = 4
-"""Pairs; once the floor has shown the scale, it is looked at only now and then."""
 STEPS = 2
 """Gauss-Newton steps of a solution."""
 SETTLED = 0.5
@@ -79,7 +83,7 @@ class OnlineCalibration:
         self._first_s = 0.0
         self._ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self._begin: Array = np.zeros((0, 2))
-        self._floor, self._started = FloorPoints(description.camera), 0
+        self._floor = FloorPoints(description.camera)
         self._since_solution = 0
         self._stale = 0
         self._last: Estimate | None = None
@@ -130,13 +134,14 @@ class OnlineCalibration:
         )
         camera = self._declared.camera
         due = now - self._first_s >= LONGEST_S or moved > ENOUGH * camera.width
-        if not (due or len(common) < 0.6 * len(self._ids)):
+        leaving = len(common) < LEAST_LEFT * len(self._ids) or self._floor.left < LEAST_LEFT
+        if not (due or leaving):
             self._refresh()
             return ()
         pair = None
         if len(common) >= LEAST_TRACKS and moved > LEAST * camera.width:
-            floor = self._floor
-            ends = [self._begin[mine], floor.begin], [raw[theirs], floor.here]
+            begun, ended = self._floor.moved
+            ends = [self._begin[mine], begun], [raw[theirs], ended]
             before, after = (
                 (self._plain.undistort(np.concatenate(px)) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
                 for px in ends
@@ -159,11 +164,7 @@ class OnlineCalibration:
         self, image: NDArray[np.uint8], source: object, now: float, ids: NDArray[np.int64], raw: Array
     ) -> None:
         self._source, self._first_s, self._ids, self._begin = source, now, ids.copy(), raw.copy()
-        self._floor.clear()
-        self._started += 1
-        scale_shown = self._last is not None and self._last.shown[Parameter.WHEEL_SCALE]
-        if not scale_shown or self._started % FLOOR_EVERY == 0:
-            self._floor.start(image)
+        self._floor.start(image)
 
     def _wheels(self) -> WheelTrack:
         counts = np.array(self._counts)

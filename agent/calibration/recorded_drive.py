@@ -1,8 +1,8 @@
-"""Calibration from a recording: pairs of its images, wheels, and whether the drive is one to learn from."""
+"""Calibration from a whole drive: image pairs, wheels, and whether the drive is one to learn from."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from mapweave.agent.calibration.drive_geometry import WheelTrack, predict
 from mapweave.agent.calibration.estimator import Estimate, Estimator
 from mapweave.agent.calibration.image_pairs import ImagePairs, sigma_of
 from mapweave.agent.calibration.pair_information import ImagePair
-from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
@@ -43,25 +43,23 @@ class DriveCalibration:
 
 
 def calibrate(
-    robot: Replay, progress: Callable[[], None] = lambda: None, keep_wheels: bool = False
+    description: RobotDescription, observations: Iterable[Observation], keep_wheels: bool = False
 ) -> DriveCalibration:
-    """Estimate the geometry of the robot that made a recording.
+    """Estimate the geometry of a robot.
 
     Args:
-        robot: the recording, at its beginning; read to its end.
-        progress: called after each image.
+        description: what it declares.
+        observations: of the drive, in order.
         keep_wheels: hold the wheels' scale instead of the height.
 
     Raises:
-        DeviceError: it cannot be read.
-        InvalidValue: it is too short, or never turns; one line says so.
+        InvalidValue: the drive is too short, or never turns; one line says so.
     """
-    description = robot.describe()
     camera = description.camera
     images = ImagePairs(camera, Lens(camera, description.distortion))
     stamps, ways, turns = list[float](), list[float](), list[float]()
     pairs = []
-    while (observation := robot.sense()) is not None:
+    for observation in observations:
         stamps.append(1e-9 * observation.stamp_ns)
         ways.append(observation.odometry.forward)
         turns.append(observation.odometry.turn)
@@ -69,7 +67,6 @@ def calibrate(
             pair = images.step(stamps[-1], observation.image)
             if pair is not None:
                 pairs.append(pair)
-        progress()
     driven = sum(pair.last_s - pair.first_s for pair in pairs)
     if len(pairs) < FEWEST_PAIRS or driven < LEAST_S:
         raise InvalidValue(

@@ -20,7 +20,8 @@ from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Sift
 
 CARRIED_MOVING_VIEWS = 12
-"""A carried robot is lost after so many views in vain between which it has moved: a new map can be joined."""
+"""A carried robot is lost after so many views in vain between which it moves: six seconds of driving. A new
+map can be joined to the old one later, a stretch that is not mapped cannot."""
 MOVED = 0.02
 """m or rad between two views."""
 STILL = 0.2
@@ -134,16 +135,15 @@ class GlobalLocalization:
 
         A drive goes on meanwhile: a few views between which the robot has moved are enough.
         """
-        moving, before = 0, self._views
+        moving = 0
         while self._views < self._policy.carried_views and moving < CARRIED_MOVING_VIEWS:
-            driven = self._motion.way + self._motion.turned
+            views, driven = self._views, self._motion.way + self._motion.turned
             candidate = yield from self.look()
             if candidate is not None:
                 return candidate
             self.detail = f"waiting to recognise a place of its own map: {self.detail}"
             yield from self._motion.stand(self._policy.carried_pause)
-            moved = self._motion.way + self._motion.turned - driven > MOVED
-            moving, before = moving + (moved and self._views > before), self._views
+            moving += self._views > views and self._motion.way + self._motion.turned - driven > MOVED
         self._give_up(f"in {self._views} images")
         return None
 

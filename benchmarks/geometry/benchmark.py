@@ -1,13 +1,18 @@
 """What a wrongly declared geometry costs a map, with online calibration.
 
-    python -m benchmarks.geometry --recording FOLDER [--robot NAME] [--json]
+    python -m benchmarks.geometry --recording FOLDER [--robot NAME] [--seed N] [--json]
 
 The recording is replayed with the right geometry and with each parameter declared wrongly: camera 1 m too
 far ahead, looking 2 degrees aside, 3 degrees down, wheels 5 % too large, 50 ms of delay. The right geometry
 is the recording's own where nothing contradicts it, else what least squares over all of it show. The error
 is that of the trajectory of all images against truth.csv after one rigid alignment; while the robot does not
 know where it is the wheels lead on. error_ratio is the worst error over that with the right geometry,
-diagnosed whether every wrong parameter was named while mapping.
+wheels_ratio the worst error over that of dead reckoning by the wheels with the same declared geometry,
+diagnosed whether every wrong parameter was named while mapping. The scale of the wheels is named but never
+corrected while mapping (see docs/calibrate-drive.md), so its ratio shows what the wheels' own error costs.
+
+With --seed the wheels are drawn anew: the increments of truth.csv with 2 % of noise a step and 1 % a drive on
+the way, 0.15 degrees a step and 0.01 degrees a step all along on the turn.
 """
 
 from __future__ import annotations
@@ -18,6 +23,7 @@ import math
 import os
 import sys
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,7 +33,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mapweave.agent.calibration.correction import geometry_of
+from mapweave.agent.calibration.correction import OdometryCorrection, declaring, geometry_of
 from mapweave.agent.calibration.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.calibration.recorded_drive import calibrate
 from mapweave.agent.calibration.report import Cause, causes
@@ -35,6 +41,7 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.recordings.recording import Recording
 from mapweave.evaluation.drive import Truth
 from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
@@ -50,6 +57,10 @@ WRONG = {
     "delay 50 ms": (P.DELAY, 0.05),
 }
 
+SCALE, STEP_SHARE, STEP_TURN, DRIFT = 0.01, 0.02, math.radians(0.15), math.radians(0.01)
+"""Standard deviations of drawn wheels: of a drive's scale, of a step's way as a share, of a step's turn, and
+of a turn that is the same in each step, rad."""
+
 
 @dataclass(frozen=True)
 class Result:
@@ -57,6 +68,7 @@ class Result:
 
     Attributes:
         error: root mean square of the positions of all images, m.
+        wheels: the same by the wheels alone, with what is declared of them, m.
         used: share of the images that were mapped with.
         nodes: in all maps.
         maps: how many were begun.
@@ -64,16 +76,11 @@ class Result:
     """
 
     error: float
+    wheels: float
     used: float
     nodes: int
     maps: int
     causes: tuple[Cause, ...]
-
-
-def with_geometry(description: RobotDescription, geometry: DriveGeometry) -> RobotDescription:
-    """The robot as it would be with this declared."""
-    camera = replace(description.camera, mount_forward=geometry.forward, mount_height=geometry.height)
-    return replace(description, camera=camera, geometry=geometry)
 
 
 def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: float) -> Result:
@@ -88,11 +95,13 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
     pipeline = Pipeline(MapId("map", 1), description)
     pipeline.set_mission(Carried())
     here, first_from_map, maps, nodes, used = Pose2(), Pose2(), 1, 0, 0
-    estimated, true = [], []
+    reckoned, correction, declared = Pose2(), OdometryCorrection(), geometry_of(description)
+    mapped, by_wheels, true = [], [], []
     count = 0
     while (observation := robot.sense()) is not None:
         count += 1
         here = here @ observation.odometry.motion()
+        reckoned = reckoned @ correction.step(observation, declared).odometry.motion()
         if pipeline.lost:
             # As an agent does: the next map begins where the wheels have brought the robot.
             nodes += len(pipeline.map.nodes)
@@ -106,22 +115,44 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
             used += 1
         pose = truth.at(observation.stamp_ns)
         if pose is not None:
-            camera = here @ Pose2(lever)
-            estimated.append([camera.x, camera.y])
-            true.append([pose.x, pose.y])
+            mapped.append(here @ Pose2(lever))
+            by_wheels.append(reckoned @ Pose2(lever))
+            true.append(pose)
     if len(true) < 2:
         raise InvalidValue("the recording has no truth.csv for its images: no error can be told")
-    at, there = np.array(estimated), np.array(true)
-    off = align(at, there).apply(at) - there
-    error = float(np.sqrt((off**2).sum(axis=1).mean()))
     nodes += len(pipeline.map.nodes)
-    return Result(error, used / count, nodes, maps, tuple(pipeline.calibration.causes))
+    causes = tuple(pipeline.calibration.causes)
+    return Result(_error(mapped, true), _error(by_wheels, true), used / count, nodes, maps, causes)
+
+
+def _error(estimated: list[Pose2], true: list[Pose2]) -> float:
+    """Root mean square distance of (N,) positions after one rigid alignment, m."""
+    at, there = (np.array([[pose.x, pose.y] for pose in poses]) for poses in (estimated, true))
+    return float(np.sqrt(((align(at, there).apply(at) - there) ** 2).sum(axis=1).mean()))
+
+
+def drawn_wheels(recording: Recording, truth: Truth, seed: int) -> Recording:
+    """The recording with wheels drawn anew from the truth.
+
+    Raises:
+        InvalidValue: an image has no truth.
+    """
+    rng = np.random.default_rng(seed)
+    poses = [pose for stamp in recording.stamps_ns if (pose := truth.at(int(stamp))) is not None]
+    if len(poses) < len(recording):
+        raise InvalidValue("truth.csv lacks some of the images: no wheels can be drawn from it")
+    moved = [before.inverse() @ after for before, after in pairwise(poses)]
+    way = (1.0 + SCALE * rng.normal()) * np.array([0.0, *(pose.x for pose in moved)])
+    turn = np.array([0.0, *(pose.heading for pose in moved)])
+    way *= 1.0 + STEP_SHARE * rng.normal(size=len(way))
+    turn[1:] += STEP_TURN * rng.normal(size=len(moved)) + DRIFT * rng.normal()
+    return replace(recording, increments=np.column_stack([way, turn]))
 
 
 def right_geometry(robot: Replay, console: Console) -> DriveGeometry:
     """The recording's own, but for what the whole drive contradicts."""
     declared = geometry_of(robot.describe())
-    estimate = calibrate(robot).estimate
+    estimate = calibrate(robot.describe(), iter(robot.sense, None)).estimate
     vector = declared.vector
     for cause in causes(estimate):
         vector[cause.parameter] = estimate.vector[cause.parameter]
@@ -129,13 +160,22 @@ def right_geometry(robot: Replay, console: Console) -> DriveGeometry:
     return DriveGeometry.of(vector)
 
 
-def run(folder: Path, name: str | None, only: list[str], console: Console) -> dict[str, object]:
+def run(
+    folder: Path, name: str | None, seed: int | None, only: list[str], console: Console
+) -> dict[str, object]:
     """All replays; returns figures."""
     truth = Truth.read(folder / "truth.csv")
-    right = right_geometry(Replay(folder, name), console)
-    description = with_geometry(Replay(folder, name).describe(), right)
-    table = Table("declared", "error, m", "ratio", "used", "nodes", "maps", "named")
-    base = replay(Replay(folder, name), description, truth, right.forward)
+
+    def opened() -> Replay:
+        robot = Replay(folder, name)
+        if seed is not None:
+            robot.recording = drawn_wheels(robot.recording, truth, seed)
+        return robot
+
+    right = right_geometry(opened(), console)
+    description = declaring(opened().describe(), right)
+    table = Table("declared", "error, m", "ratio", "wheels alone, m", "used", "nodes", "maps", "named")
+    base = replay(opened(), description, truth, right.forward)
 
     def row(label: str, result: Result) -> None:
         named = ", ".join(
@@ -143,8 +183,8 @@ def run(folder: Path, name: str | None, only: list[str], console: Console) -> di
         )
         ratio = result.error / base.error
         table.add_row(
-            label, f"{result.error:.2f}", f"{ratio:.2f}", f"{result.used:.3f}", str(result.nodes),
-            str(result.maps), named or "-",
+            label, f"{result.error:.2f}", f"{ratio:.2f}", f"{result.wheels:.2f}", f"{result.used:.3f}",
+            str(result.nodes), str(result.maps), named or "-",
         )  # fmt: skip
         console.print(f"{label}: error {result.error:.2f} m, used {result.used:.3f}, named: {named or '-'}")
 
@@ -155,8 +195,8 @@ def run(folder: Path, name: str | None, only: list[str], console: Console) -> di
             continue
         vector = right.vector
         vector[parameter] += amount
-        wrong = with_geometry(description, DriveGeometry.of(vector))
-        results[label] = replay(Replay(folder, name), wrong, truth, right.forward)
+        wrong = declaring(description, DriveGeometry.of(vector))
+        results[label] = replay(opened(), wrong, truth, right.forward)
         row(label, results[label])
     console.print(table)
     named = {
@@ -167,6 +207,7 @@ def run(folder: Path, name: str | None, only: list[str], console: Console) -> di
         "error_ratio": max(ratios.values()),
         "frames_used": round(min(result.used for result in (base, *results.values())), 4),
         "diagnosed": all(named.values()),
+        "wheels_ratio": round(max(r.error / r.wheels for r in (base, *results.values())), 3),
         "right_m": round(base.error, 3),
         "ratios": ratios,
         "named": named,
@@ -180,13 +221,14 @@ def main() -> None:
     )
     parser.add_argument("--recording", type=Path, required=True, metavar="FOLDER", help="with truth.csv")
     parser.add_argument("--robot", metavar="NAME", help="one robot of its splits.toml (default: all frames)")
+    parser.add_argument("--seed", type=int, metavar="N", help="draw the wheels anew (default: as recorded)")
     parser.add_argument("--only", nargs="+", choices=tuple(WRONG), default=[], help="these alone")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json)
     try:
-        figures = run(arguments.recording, arguments.robot, arguments.only, console)
+        figures = run(arguments.recording, arguments.robot, arguments.seed, arguments.only, console)
     except (MapweaveError, OSError) as error:
         print(f"geometry: {error}", file=sys.stderr)
         raise SystemExit(1) from None

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.agent import add_calibration, calibration_of
 from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
 
 if TYPE_CHECKING:
@@ -29,14 +31,15 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
     )
+    add_calibration(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
+def add_recording(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     """Declare a recording, and what a person may have to say of it."""
     parser.add_argument(
-        "recording", type=Path,
+        "recording", type=Path, nargs="?" if optional else None,
         help="folder with images/, camera.toml and odometry.csv; ROS bag (.mcap, .bag, .db3, folder); video; "
         "sequence of KITTI odometry, EuRoC, TUM RGB-D or 4Seasons",
     )  # fmt: skip
@@ -52,6 +55,12 @@ def add_recording(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--odometry-topic", metavar="TOPIC", help="of a bag (default: by its type and name)")
 
 
+def name_of(arguments: argparse.Namespace) -> str:
+    """The name of a recording's robot: that of its splits.toml, else the file's or folder's."""
+    name: str = arguments.robot or arguments.recording.resolve().stem
+    return re.sub("[^a-z0-9_-]", "-", name.lower())
+
+
 def options_of(arguments: argparse.Namespace) -> RecordingOptions:
     """What a person said of a recording."""
     from mapweave.agent.recordings.options import RecordingOptions
@@ -62,8 +71,6 @@ def options_of(arguments: argparse.Namespace) -> RecordingOptions:
 
 def run(arguments: argparse.Namespace) -> int:
     """Play the recording to its end."""
-    import re
-
     from mapweave.agent.drivers.replay import Replay
     from mapweave.agent.mission import Carried
     from mapweave.hybridmap.node import check_name
@@ -72,11 +79,11 @@ def run(arguments: argparse.Namespace) -> int:
     robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
     for note in robot.recording.notes:
         print(note)
-    fallback = re.sub("[^a-z0-9_-]", "-", (arguments.robot or arguments.recording.resolve().stem).lower())
+    name = check_name(arguments.name or name_of(arguments))
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     options = AgentOptions(
-        name=check_name(arguments.name or fallback),
+        name=name,
         data=arguments.data,
         epoch=arguments.epoch,
         fresh=True,  # a recording begins where it began, not where another has ended
@@ -85,6 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         total=len(robot),
         trajectories=True,
         patience=0.0 if arguments.offline else arguments.patience,
+        calibration=calibration_of(arguments, name),
     )
     stop = stop_on_signals()
     bus, keys = connect(network)

@@ -12,12 +12,14 @@ import cv2
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
+from mapweave.agent.calibration.correction import declaring, geometry_of
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission import Idle, Mission
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile
 from mapweave.agent.replication.epochs import newest_on_server, next_epoch
 from mapweave.agent.replication.journal import Journal
@@ -59,6 +61,7 @@ class AgentOptions:
         total: observations that will come, if that is known.
         trajectories: whether the pose at each observation goes to a file beside the map's.
         patience: how long to wait at the end until the server has everything, s.
+        calibration: file with what `mapweave calibrate` has measured of this robot, if it exists.
     """
 
     name: str
@@ -73,6 +76,17 @@ class AgentOptions:
     total: int | None = None
     trajectories: bool = False
     patience: float = 5.0
+    calibration: Path | None = None
+
+
+def measured(description: RobotDescription, calibration: Path | None) -> RobotDescription:
+    """The robot with the geometry that was measured of it; as it declares itself if there is none.
+
+    Raises:
+        DeviceError: the file cannot be right.
+    """
+    given = read_geometry(calibration) if calibration is not None else {}
+    return declaring(description, replace(geometry_of(description), **given)) if given else description
 
 
 class Agent:
@@ -117,7 +131,7 @@ class Agent:
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
-            self._description = describe()
+            self._description = measured(describe(), options.calibration)
             maps = self.journal.maps()
             if options.resume is not None or (maps and not options.fresh):
                 self._resume(self._chosen(maps))
