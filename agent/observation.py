@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from mapweave.agent.calibration.drive_geometry import DriveGeometry
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.limits import NAME_OR_NOTHING, Angle, Share
 from mapweave.hybridmap.pose import Pose2

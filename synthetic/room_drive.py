@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.calibration.drive_geometry import DriveGeometry, WheelTrack, robot_from_camera
+from mapweave.agent.calibration.camera_motions import WheelTrack, robot_from_camera
 from mapweave.agent.calibration.pair_information import ImagePair
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 

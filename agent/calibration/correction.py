@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.calibration.drive_geometry import ROBOT_FROM_LEVEL, DriveGeometry, robot_from_camera
+from mapweave.agent.calibration.camera_motions import ROBOT_FROM_LEVEL, robot_from_camera
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array

@@ -16,15 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.calibration.drive_geometry import (
-    COUNT,
-    CameraMotions,
-    DriveGeometry,
-    Parameter,
-    WheelTrack,
-    predict,
-)
+from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, predict
 from mapweave.agent.calibration.pair_information import ImagePair, PairInformation, reduce_pair
+from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.hybridmap.pose import Array
 
 P = Parameter
@@ -158,7 +152,7 @@ class Estimator:
             prior[[P.WHEEL_SCALE, P.HEIGHT]] = prior[[P.HEIGHT, P.WHEEL_SCALE]]
         self._prior = np.diag(1.0 / prior**2)
         self._sigma, self._keep_wheels = sigma, keep_wheels
-        self._noise = FIRST_NOISE.copy()
+        self._noise: Array = FIRST_NOISE.copy()
         self._depth = (0.3, 0.5)
         self.reduced_at: list[Array] = []
         self._floor: tuple[float, float] | None = None

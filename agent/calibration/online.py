@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.calibration.camera_motions import WheelTrack
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
-from mapweave.agent.calibration.drive_geometry import DriveGeometry, Parameter, WheelTrack
 from mapweave.agent.calibration.estimator import USEFUL_SIGMAS, Estimate, Estimator
 from mapweave.agent.calibration.floor_points import FloorPoints
 from mapweave.agent.calibration.image_pairs import (
@@ -25,6 +25,7 @@ from mapweave.agent.calibration.image_pairs import (
 )
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.report import Cause, causes
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapweave.agent.calibration.drive_geometry import CameraMotions
+from mapweave.agent.calibration.camera_motions import CameraMotions
 from mapweave.hybridmap.pose import Array
 
 CAUCHY = 2.3849

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapweave.agent.calibration.camera_motions import WheelTrack, predict
 from mapweave.agent.calibration.correction import geometry_of
-from mapweave.agent.calibration.drive_geometry import WheelTrack, predict
 from mapweave.agent.calibration.estimator import Estimate, Estimator
 from mapweave.agent.calibration.image_pairs import ImagePairs, sigma_of
 from mapweave.agent.calibration.pair_information import ImagePair

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapweave.agent.calibration.drive_geometry import Parameter
 from mapweave.agent.calibration.estimator import USEFUL_SIGMAS, Estimate
+from mapweave.agent.drive_geometry import Parameter
 from mapweave.hybridmap.pose import Array
 
 P = Parameter

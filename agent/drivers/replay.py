@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapweave.agent.calibration.drive_geometry import DriveGeometry
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.agent.recordings.image_folder import read_split

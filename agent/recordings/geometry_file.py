@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
-from mapweave.agent.calibration.drive_geometry import DriveGeometry
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.recordings.camera_file import number
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.atomic_file import read_whole, write_whole

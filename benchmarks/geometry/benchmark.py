@@ -34,16 +34,16 @@ from rich.console import Console
 from rich.table import Table
 
 from mapweave.agent.calibration.correction import OdometryCorrection, declaring, geometry_of
-from mapweave.agent.calibration.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.calibration.recorded_drive import calibrate
 from mapweave.agent.calibration.report import Cause, causes
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.recording import Recording
-from mapweave.evaluation.drive import Truth
 from mapweave.evaluation.map_score import align
+from mapweave.evaluation.truth import Truth
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2

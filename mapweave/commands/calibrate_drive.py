@@ -97,7 +97,7 @@ def _recorded(
     robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
     observed = iter(robot.sense, None)
     shown = track(observed, name, total=len(robot), console=console, transient=True)
-    return robot.describe(), iter(shown)  # type: ignore[arg-type]
+    return robot.describe(), iter(shown)
 
 
 def _live(
@@ -138,8 +138,8 @@ def _print(console: Any, found: DriveCalibration) -> dict[str, str]:
     """Print a table of an estimate and what it finds wrong; returns a comment by field."""
     from rich.table import Table
 
-    from mapweave.agent.calibration.drive_geometry import Parameter
     from mapweave.agent.calibration.report import NAMES, causes, readable, readable_sigmas
+    from mapweave.agent.drive_geometry import Parameter
 
     estimate, notes = found.estimate, {}
     declared, value, sigma = readable(estimate.declared), readable(estimate.vector), readable_sigmas(estimate)
@@ -163,8 +163,8 @@ def _print(console: Any, found: DriveCalibration) -> dict[str, str]:
 
 
 def _figures(found: DriveCalibration, written: bool) -> dict[str, object]:
-    from mapweave.agent.calibration.drive_geometry import Parameter
     from mapweave.agent.calibration.report import readable, readable_sigmas
+    from mapweave.agent.drive_geometry import Parameter
 
     estimate: Estimate = found.estimate
     columns = {

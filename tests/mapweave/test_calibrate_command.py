@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.geometry.benchmark import main as benchmark
-from mapweave.agent.calibration.drive_geometry import DriveGeometry, Parameter
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.cli import main
 from synthetic.room_drive import CAMERA, drive, write
@@ -50,16 +49,16 @@ def folder(recording: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(recording, tmp_path / "Room-1"))
 
 
-def calibrated(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[str, object]:
+def calibrated(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
     """Figures of a calibration that succeeds."""
     assert main(["calibrate", "drive", *map(str, arguments), "--json"]) == 0
-    figures: dict[str, object] = json.loads(capfd.readouterr().out.splitlines()[-1])
+    figures: dict[str, Any] = json.loads(capfd.readouterr().out.splitlines()[-1])
     return figures
 
 
 def test_a_drive_is_calibrated_under_the_robots_name(
     recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-):
+) -> None:
     figures = calibrated(capfd, recording, "--calibration", tmp_path)
     parameters = figures["parameters"]
     assert set(parameters) == {p.name.lower() for p in Parameter}
@@ -83,7 +82,7 @@ def test_a_drive_is_calibrated_under_the_robots_name(
 
 def test_a_robot_is_watched_while_it_is_driven(
     recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-):
+) -> None:
     driver = tmp_path / "own.py"
     driver.write_text(OWN_ROBOT.format(folder=str(recording)))
     robot = f"{driver}:Recorded"
@@ -97,7 +96,7 @@ def test_a_robot_is_watched_while_it_is_driven(
     assert "too short" in complaint(capfd, "calibrate", "drive", *given[:-1], 3)
 
 
-def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     command = ["calibrate", "drive", folder, "--calibration", tmp_path]
     assert "--robot DRIVER" in complaint(capfd, "calibrate", "drive")
     assert "--name" in complaint(capfd, "calibrate", "drive", "--robot", "koala")
@@ -111,18 +110,3 @@ def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.Captu
     (folder / "splits.toml").write_text('[[robot]]\nname = "a"\nfirst = 0\nlast = 40\n')
     assert "too short" in complaint(capfd, *command, "--robot", "a")
     assert not list(tmp_path.glob("*.toml"))
-
-
-def test_the_benchmark_says_what_a_wrong_geometry_costs(
-    recording: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-):
-    only = ["--only", "heading 2 deg", "--seed", "1", "--json"]
-    monkeypatch.setattr(sys, "argv", ["geometry", "--recording", str(recording), *only])
-    benchmark()
-    figures = json.loads(capfd.readouterr().out.splitlines()[-1])
-    assert set(figures["ratios"]) == set(figures["named"]) == {"heading 2 deg"}
-    assert figures["error_ratio"] == figures["ratios"]["heading 2 deg"] > 0.0
-    assert figures["wheels_ratio"] > 0.0
-    assert figures["frames_used"] >= 0.95
-    assert figures["diagnosed"] is figures["named"]["heading 2 deg"]
-    assert 0.0 < figures["right_m"] < 1.0

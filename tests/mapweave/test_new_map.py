@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from mapweave.agent.calibration.drive_geometry import DriveGeometry
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.merging import changes

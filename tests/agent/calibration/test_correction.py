@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mapweave.agent.calibration.camera_motions import robot_from_camera
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
-from mapweave.agent.calibration.drive_geometry import DriveGeometry, robot_from_camera
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from synthetic.room_drive import CAMERA
 

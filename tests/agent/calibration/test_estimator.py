@@ -9,11 +9,12 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from mapweave.agent.calibration.drive_geometry import DriveGeometry, Parameter, WheelTrack
+from mapweave.agent.calibration.camera_motions import WheelTrack
 from mapweave.agent.calibration.estimator import Estimate, Estimator
 from mapweave.agent.calibration.image_pairs import sigma_of
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.report import causes
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from synthetic.room_drive import CAMERA, RoomDrive, drive, pairs
 
 P = Parameter

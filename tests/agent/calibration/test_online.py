@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.calibration.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.calibration.online import OnlineCalibration
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from synthetic.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
 

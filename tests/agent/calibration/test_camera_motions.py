@@ -9,15 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mapweave.agent.calibration.drive_geometry import (
+from mapweave.agent.calibration.camera_motions import (
     CameraMotions,
-    DriveGeometry,
-    Parameter,
     WheelTrack,
     predict,
     robot_from_camera,
     rotations,
 )
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 
 TRUE = DriveGeometry(1.04, 0.97, 0.01, 0.3, -0.1, 0.05, 0.12, -0.03, 0.4, 0.03)
 
