@@ -199,7 +199,7 @@ class Estimator:
         )  # fmt: skip
         a = np.stack([i.matrix for i in self.informations])
         b = np.stack([i.vector for i in self.informations])
-        told, spread = self._floor or (0.0, 1.0)
+        measured, spread = self._floor or (0.0, 1.0)
         fixed = np.outer(floor, floor) / spread**2
         for _ in range(iterations):
             predicted = predict(self.vector, wheels, first, last)
@@ -221,7 +221,7 @@ class Estimator:
             data = np.einsum("n,nji,njk,nkl->il", weight, jacobian, marginal, jacobian)
             hessian = data + information + fixed
             gradient = scores.sum(0) - information @ (self.vector - self.declared)
-            gradient = gradient + floor * (told - floor @ self.vector) / spread**2
+            gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
             self.vector = self.vector + np.linalg.solve(hessian, gradient)
         self._learn_scene()
         # What is not known of the scale is not known of all that is measured by it.

@@ -20,7 +20,7 @@ CAUCHY = 2.3849
 FLOOR_STEEPNESS = 0.12
 """Rays less below the horizon than this, rad, meet the floor too far off to tell it from other things."""
 LEAST_FLOOR_SHARE = 0.08
-"""Sigma of a floor point's depth as a share of it; with less parallax nothing is told by it."""
+"""Sigma of a floor point's depth as a share of it; with less parallax it shows nothing."""
 NO_PRIOR = 1e6
 """Spread of inverse depths of which nothing is known, 1/m."""
 ITERATIONS = 3
@@ -118,7 +118,7 @@ def reduce_pair(
 def floor_ratios(pair: ImagePair, at: CameraMotions, sigma: float) -> tuple[Array, Array]:
     """(K,) logarithms of depths below the horizon over those of the floor, negated, and their (K,) sigmas.
 
-    Most of what is seen there is floor, so the mode is by how much the way is told too short.
+    Most of what is seen there is floor, so the mode is the logarithm of true over assumed way.
     """
     x = np.column_stack([pair.before, np.ones(len(pair.before))])
     turned = x @ at.rotation.T
@@ -130,8 +130,8 @@ def floor_ratios(pair: ImagePair, at: CameraMotions, sigma: float) -> tuple[Arra
     y = turned + floor_depth[:, None] * at.translation
     z = np.maximum(y[:, 2], 0.05)
     parallax = np.linalg.norm(_projected(at.translation, y[:, :2] / z[:, None], z), axis=1) * floor_depth
-    told = steep & (sigma < LEAST_FLOOR_SHARE * parallax)
-    return np.log(np.clip(inverse_depth[told] / floor_depth[told], 0.05, 20.0)), sigma / parallax[told]
+    precise = steep & (sigma < LEAST_FLOOR_SHARE * parallax)
+    return np.log(np.clip(inverse_depth[precise] / floor_depth[precise], 0.05, 20.0)), sigma / parallax[precise]
 
 
 def _projected(direction: Array, seen: Array, z: Array) -> Array:

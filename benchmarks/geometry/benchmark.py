@@ -11,7 +11,7 @@ wheels_ratio the worst error over that of dead reckoning by the wheels with the 
 diagnosed whether every wrong parameter was named while mapping. The scale of the wheels is named but never
 corrected while mapping (see docs/calibrate-drive.md), so its ratio shows what the wheels' own error costs.
 
-With --seed the wheels are drawn anew: the increments of truth.csv with 2 % of noise a step and 1 % a drive on
+With --seed the wheels are simulated: the increments of truth.csv with 2 % of noise a step and 1 % a drive on
 the way, 0.15 degrees a step and 0.01 degrees a step all along on the turn.
 """
 
@@ -119,7 +119,7 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
             by_wheels.append(reckoned @ Pose2(lever))
             true.append(pose)
     if len(true) < 2:
-        raise InvalidValue("the recording has no truth.csv for its images: no error can be told")
+        raise InvalidValue("the recording has no truth.csv for its images: there is no error to compute")
     nodes += len(pipeline.map.nodes)
     causes = tuple(pipeline.calibration.causes)
     return Result(_error(mapped, true), _error(by_wheels, true), used / count, nodes, maps, causes)
@@ -132,7 +132,7 @@ def _error(estimated: list[Pose2], true: list[Pose2]) -> float:
 
 
 def drawn_wheels(recording: Recording, truth: Truth, seed: int) -> Recording:
-    """The recording with wheels drawn anew from the truth.
+    """The recording with wheels simulated from the truth.
 
     Raises:
         InvalidValue: an image has no truth.
@@ -221,7 +221,7 @@ def main() -> None:
     )
     parser.add_argument("--recording", type=Path, required=True, metavar="FOLDER", help="with truth.csv")
     parser.add_argument("--robot", metavar="NAME", help="one robot of its splits.toml (default: all frames)")
-    parser.add_argument("--seed", type=int, metavar="N", help="draw the wheels anew (default: as recorded)")
+    parser.add_argument("--seed", type=int, metavar="N", help="simulate the wheels by the truth (default: as recorded)")
     parser.add_argument("--only", nargs="+", choices=tuple(WRONG), default=[], help="these alone")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
