@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
 
 IDENTITY = Pose2()
@@ -122,6 +123,9 @@ class Pipeline:
             calibration: what this robot has learnt of its geometry on an earlier map.
         """
         jit.load()  # a robot that drives must not wait for a compiler
+        self._fisheye = Lens(description.camera, description.distortion)
+        if self._fisheye.rectifies:
+            description = replace(description, distortion=NO_DISTORTION)
         self._map_id = map_id
         self._settings = settings or AgentSettings()
         self.calibration = calibration or OnlineCalibration(description)
@@ -188,6 +192,9 @@ class Pipeline:
             answers: to questions of earlier steps.
         """
         command, questions = Command(), list[Question]()
+        if self._fisheye.rectifies and observation.image is not None:
+            # From here on the camera is a pinhole.
+            observation = replace(observation, image=self._fisheye.rectified(observation.image))
         observation = self.calibration.correct(observation)
         self._rangers.see(observation.proximity)
         match self._mission:

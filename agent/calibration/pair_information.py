@@ -131,7 +131,9 @@ def floor_ratios(pair: ImagePair, at: CameraMotions, sigma: float) -> tuple[Arra
     z = np.maximum(y[:, 2], 0.05)
     parallax = np.linalg.norm(_projected(at.translation, y[:, :2] / z[:, None], z), axis=1) * floor_depth
     precise = steep & (sigma < LEAST_FLOOR_SHARE * parallax)
-    return np.log(np.clip(inverse_depth[precise] / floor_depth[precise], 0.05, 20.0)), sigma / parallax[precise]
+    return np.log(np.clip(inverse_depth[precise] / floor_depth[precise], 0.05, 20.0)), sigma / parallax[
+        precise
+    ]
 
 
 def _projected(direction: Array, seen: Array, z: Array) -> Array:

@@ -56,7 +56,8 @@ def calibrate(
         InvalidValue: the drive is too short, or never turns; one line says so.
     """
     camera = description.camera
-    images = ImagePairs(camera, Lens(camera, description.distortion))
+    lens = Lens(camera, description.distortion)
+    images = ImagePairs(camera, Lens(camera) if lens.rectifies else lens)
     stamps, ways, turns = list[float](), list[float](), list[float]()
     pairs = []
     for observation in observations:
@@ -64,7 +65,7 @@ def calibrate(
         ways.append(observation.odometry.forward)
         turns.append(observation.odometry.turn)
         if observation.image is not None:
-            pair = images.step(stamps[-1], observation.image)
+            pair = images.step(stamps[-1], lens.rectified(observation.image))
             if pair is not None:
                 pairs.append(pair)
     driven = sum(pair.last_s - pair.first_s for pair in pairs)

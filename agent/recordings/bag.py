@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from mapweave.agent.recordings.bag_images import grey_of
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import heading_of, read_poses
-from mapweave.agent.recordings.recording import Distortion, Images, Recording, StampedPoses, assembled
+from mapweave.agent.recordings.recording import Images, Recording, StampedPoses, assembled
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
 from mapweave.hybridmap.pose import Array
+from mapweave.vision.lens import Distortion, LensModel, lens_of
 
 SUFFIXES = {".bag", ".mcap", ".db3"}
 IMAGE_TYPES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
@@ -30,6 +31,14 @@ POSE_TYPES = (
 ODOMETRY_TYPE, CAMERA_TYPE, TF_TYPE = POSE_TYPES[0], "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 TRUTH = ("truth", "gt", "amcl", "mocap", "vicon")
 """Parts of names of topics that are never taken for odometry."""
+LENS_MODELS = {
+    "plumb_bob": LensModel.RADIAL_TANGENTIAL,
+    "rational_polynomial": LensModel.RADIAL_TANGENTIAL,
+    "": LensModel.RADIAL_TANGENTIAL,
+    "equidistant": LensModel.EQUIDISTANT,
+    "fisheye": LensModel.EQUIDISTANT,
+}
+"""Lens models by ROS' names of them; some drivers write `fisheye`."""
 BASES = ("base_footprint", "base_link")
 """Frames of a robot on the floor, and above it (REP 105)."""
 CAMERA_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -213,13 +222,13 @@ def _camera(
     info = (near or infos)[0]
     _, message = next(opened.messages(info.name))
     model = str(message.distortion_model)
-    if model not in ("plumb_bob", "rational_polynomial", ""):
-        raise DeviceError(f"{opened.path}: {info.name}: lens model {model!r} is not supported; plumb_bob is")
+    if model not in LENS_MODELS:
+        known = " and ".join(name for name in LENS_MODELS if name)
+        raise DeviceError(f"{opened.path}: {info.name}: lens model {model!r} is not supported; {known} are")
     # ROS 1 writes these in capitals.
     k, d = (np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float) for name in "kd")
     if len(d) > 5 and np.any(d[5:]):
         raise DeviceError(f"{opened.path}: {info.name}: a lens of {len(d)} coefficients is not supported")
-    lens = [*d.tolist(), 0.0, 0.0, 0.0, 0.0, 0.0]
     mount = _mount(opened, str(message.header.frame_id))
     try:
         camera = Camera(
@@ -227,6 +236,8 @@ def _camera(
             mount_height=0.0 if mount is None else mount[2],
             mount_forward=0.0 if mount is None else mount[0],
         )  # fmt: skip
+        count = 4 if LENS_MODELS[model] is LensModel.EQUIDISTANT else 5
+        given = lens_of(camera, LENS_MODELS[model], [*d, 0.0, 0.0, 0.0, 0.0, 0.0][:count])
     except (InvalidValue, IndexError) as error:
         raise DeviceError(f"{opened.path}: {info.name}: {error}") from None
     if mount is not None:
@@ -237,8 +248,7 @@ def _camera(
             notes.append(
                 f"the camera looks {math.degrees(mount[3]):.0f} deg to the left: it should look ahead"
             )
-    distortion: Distortion = (lens[0], lens[1], lens[2], lens[3], lens[4])
-    return options.camera_of(opened.path, (camera, distortion), mount is not None)
+    return options.camera_of(opened.path, given, mount is not None)
 
 
 def _namespace(topic: str) -> str:

@@ -221,7 +221,9 @@ def main() -> None:
     )
     parser.add_argument("--recording", type=Path, required=True, metavar="FOLDER", help="with truth.csv")
     parser.add_argument("--robot", metavar="NAME", help="one robot of its splits.toml (default: all frames)")
-    parser.add_argument("--seed", type=int, metavar="N", help="simulate the wheels by the truth (default: as recorded)")
+    parser.add_argument(
+        "--seed", type=int, metavar="N", help="simulate the wheels by the truth (default: as recorded)"
+    )
     parser.add_argument("--only", nargs="+", choices=tuple(WRONG), default=[], help="these alone")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
