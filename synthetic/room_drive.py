@@ -89,13 +89,13 @@ def drive(
     # The reading that belongs to an image has a later stamp by the delay.
     read = np.concatenate([[-TICK], stamps, [stamps[-1] + TICK]]) - true.delay
     ways, headings = np.diff(np.interp(read, t, way)), np.diff(np.interp(read, t, heading))
-    told_way = ways / true.wheel_scale * (1.0 + wheel_noise * rng.normal(size=len(ways)))
-    told_turn = (headings - true.drift * ways) / true.turn_scale
-    told_turn = told_turn * (1.0 + wheel_noise * rng.normal(size=len(ways)))
-    told_turn += 0.2 * wheel_noise * np.abs(ways) / 0.24 * rng.normal(size=len(ways))
+    reported_way = ways / true.wheel_scale * (1.0 + wheel_noise * rng.normal(size=len(ways)))
+    reported_turn = (headings - true.drift * ways) / true.turn_scale
+    reported_turn = reported_turn * (1.0 + wheel_noise * rng.normal(size=len(ways)))
+    reported_turn += 0.2 * wheel_noise * np.abs(ways) / 0.24 * rng.normal(size=len(ways))
     wheels = WheelTrack(
-        read + true.delay, np.concatenate([[0.0], np.cumsum(told_way)]),
-        np.concatenate([[0.0], np.cumsum(told_turn)]),
+        read + true.delay, np.concatenate([[0.0], np.cumsum(reported_way)]),
+        np.concatenate([[0.0], np.cumsum(reported_turn)]),
     )  # fmt: skip
     return RoomDrive(camera, true, stamps, poses, wheels)
 

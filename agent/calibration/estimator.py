@@ -33,9 +33,10 @@ USEFUL_SIGMAS = {
     P.PITCH: 0.01, P.ROLL: 0.01, P.HEIGHT: 0.02, P.DELAY: 0.02,
 }  # fmt: skip
 """A drive shows a parameter if its sigma is below this: smaller errors do not show in a map of a room."""
-MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.01, 0.002, 0.001, 0.001, 0.002, 0.002])
+MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.035, 0.002, 0.001, 0.001, 0.002, 0.002])
 """Errors of the estimator itself, in the order of `Parameter`: depths are not Gaussian, pairs short. Measured
-on synthetic drives, where turns come out up to 0.5 % short; no sigma is smaller."""
+on synthetic drives, where turns come out up to 0.5 % short and the camera up to 5 cm
+aside; no sigma is smaller."""
 DELAY_SHARE = 0.12
 """And of the delay, as a share of the time between two readings: nothing is known of what happens within."""
 STEP = np.array([1e-5, 1e-5, 1e-6, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
@@ -69,9 +70,6 @@ LEAST_BLOCKS = 8
 """Blocks of pairs that see the floor; the scatter of fewer tells no sigma."""
 LEAST_FLOOR = 60
 """Points on the floor; with fewer nothing is said of it."""
-DEPTH_SPREADS = 3.0
-"""Spreads of the scene's inverse depths within which a track's is expected. One spread draws near floor and
-far walls together, which shows as pitch and as a way 0.7 % too long (rendered room); three do not."""
 INNER = 6
 """Gauss-Newton steps between two reductions of the pairs."""
 
@@ -220,7 +218,7 @@ class Estimator:
             scores = weight[:, None] * np.einsum("nji,nj->ni", jacobian, pull)
             data = np.einsum("n,nji,njk,nkl->il", weight, jacobian, marginal, jacobian)
             hessian = data + information + fixed
-            gradient = scores.sum(0) - information @ (self.vector - self.declared)
+            gradient: Array = scores.sum(0) - information @ (self.vector - self.declared)
             gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
             self.vector = self.vector + np.linalg.solve(hessian, gradient)
         self._learn_scene()
@@ -381,7 +379,7 @@ class Estimator:
         depths = np.array([i.inverse_depths for i in self.informations if i.tracks > 5])
         if len(depths):
             mean, spread = np.median(depths, axis=0)
-            self._depth = (float(mean), DEPTH_SPREADS * float(max(spread, 0.5 * mean)))
+            self._depth = (float(mean), float(max(spread, 0.5 * mean)))
 
     def _scatter(self, inverse_hessian: Array, scores: Array) -> Array:
         """(10, 10) covariance by how blocks of pairs pull apart."""

@@ -20,8 +20,8 @@ from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Sift
 
 CARRIED_MOVING_VIEWS = 12
-"""A carried robot is lost after so many views without success between which it moves: six seconds of driving. A new
-map can be joined to the old one later, a stretch that is not mapped cannot."""
+"""A carried robot is lost after so many views without success between which it moves: six seconds of driving.
+A new map can be joined to the old one later, a stretch that is not mapped cannot."""
 MOVED = 0.02
 """m or rad between two views."""
 STILL = 0.2

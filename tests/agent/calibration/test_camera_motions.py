@@ -54,11 +54,11 @@ def test_points_are_seen_where_the_motion_says():
     """A robot on a circle at constant speeds: the pose in closed form, points transformed one by one."""
     speed, rate = 0.4, 0.5
     stamps = np.arange(0.0, 5.0, 0.05)
-    told = WheelTrack(
+    reported = WheelTrack(
         stamps, speed * stamps / TRUE.wheel_scale, (rate - TRUE.drift * speed) * stamps / TRUE.turn_scale
     )
     first, last = np.array([1.0]), np.array([1.9])
-    predicted = predict(TRUE.vector, told, first, last)
+    predicted = predict(TRUE.vector, reported, first, last)
     mount = robot_from_camera(TRUE.heading, TRUE.pitch, TRUE.roll)
     centre = np.array([TRUE.forward, TRUE.left, TRUE.height])
     world = np.array([[2.0, 0.5, 0.0], [3.0, -1.0, 1.0], [1.5, 1.0, 0.0]])

@@ -80,7 +80,7 @@ def test_a_straight_drive_shows_no_lever():
     assert abs(estimate.vector[P.HEADING] - 0.04) < 3.0 * estimate.sigmas[P.HEADING]
 
 
-def test_without_floor_no_scale_is_told():
+def test_without_floor_no_scale_is_shown():
     true = DriveGeometry(wheel_scale=1.08, forward=0.08, height=0.25)
     estimate = estimated(drive(np.random.default_rng(2), true, 30.0), 2, floor=False)
     assert not estimate.shown[P.WHEEL_SCALE]
