@@ -60,6 +60,7 @@ class Observation:
         proximity: (K,) m, free distance along each of the robot's rangers from the robot's edge; the
             ranger's maximum where nothing is in reach. Empty if the robot has none.
         bumped: whether the bumper is pressed.
+        battery: charge, as a share; None if the robot does not tell.
     """
 
     stamp_ns: int
@@ -67,6 +68,7 @@ class Observation:
     image: NDArray[np.uint8] | None = None
     proximity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     bumped: bool = False
+    battery: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

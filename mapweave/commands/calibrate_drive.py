@@ -58,13 +58,12 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.calibration.recorded_drive import calibrate
     from mapweave.agent.recordings.geometry_file import write_geometry
     from mapweave.hybridmap.errors import InvalidValue
-    from mapweave.hybridmap.node import check_name
     from mapweave.processes.agent import measured
 
     if arguments.recording is None and not (arguments.robot and arguments.name):
         raise InvalidValue("give a recording, or --robot DRIVER and --name NAME of a robot")
     cv2.setNumThreads(1)
-    name = check_name(arguments.name or name_of(arguments))
+    name = name_of(arguments)
     file = calibration_of(arguments, name)
     console = Console(stderr=arguments.json)
     drive = _recorded if arguments.recording is not None else _live
