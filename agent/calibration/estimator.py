@@ -208,7 +208,7 @@ class Estimator:
             for _ in range(NOISE_STEPS):
                 noise = np.einsum("nik,nk,njk->nij", basis, growth * self._noise, basis)
                 inverse = np.linalg.inv(noise)
-                posterior: Array = np.linalg.inv(a + inverse)
+                posterior = np.asarray(np.linalg.inv(a + inverse), np.float64)
                 slip: Array = np.einsum("nij,nj->ni", posterior, rest)
                 weight = _weights(np.einsum("ni,nij,nj->n", slip, inverse, slip))
                 self._learn_noise(basis, growth, slip, posterior, weight)
