@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.limits import NAME_OR_NOTHING, Angle, Share
 from mapweave.hybridmap.pose import Pose2
@@ -104,6 +105,8 @@ class RobotDescription:
         tick: time between two observations, s.
         clock: name of the clock of the stamps, if other robots' stamps have the same (a network time to well
             under a second, a simulator); empty if unknown.
+        geometry: mount's angles and offsets, and scales and delay of the wheels, where they are known. Its
+            forward and height do not count: the camera has them.
     """
 
     camera: Camera
@@ -119,6 +122,7 @@ class RobotDescription:
     tick: Annotated[float, Meta(ge=1e-4, le=3600.0)] = 0.1
     clock: Annotated[str, Meta(pattern=NAME_OR_NOTHING)] = ""
     ranges_see_robots: bool = False
+    geometry: DriveGeometry | None = None
 
     def ranges(self, proximity: NDArray[np.float64]) -> Ranges:
         """Ranger readings to store with a node; empty if the rangers cannot see other robots."""

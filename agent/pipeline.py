@@ -14,6 +14,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.random_exploration import RandomExploration
@@ -63,6 +67,7 @@ class Pipeline:
         settings: AgentSettings | None = None,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
+        calibration: OnlineCalibration | None = None,
     ) -> None:
         """Start with nothing to do, and with an empty map or one that was begun.
 
@@ -74,6 +79,7 @@ class Pipeline:
             settings: of the parts.
             contents: of the map, as `Journal.resume` gives it.
             next_number: the first that no node or edge of the map has ever had.
+            calibration: what this robot has learnt of its geometry on an earlier map.
         """
         jit.load()  # a robot that drives must not wait for a compiler
         self._fisheye = Lens(description.camera, description.distortion)
@@ -81,11 +87,13 @@ class Pipeline:
             description = replace(description, distortion=NO_DISTORTION)
         self._map_id = map_id
         self._settings = settings or AgentSettings()
+        self.calibration = calibration or OnlineCalibration(description)
+        self.calibration.switched()
+        description, lens = self.calibration.description, self.calibration.lens
         self._description = description
-        lens = Lens(description.camera, description.distortion)
         self._lens = lens
         self._sift = Sift(lens, self._settings.sift)
-        self._mapper = Mapper(map_id, description, self._settings, contents, next_number)
+        self._mapper = Mapper(map_id, description, self._settings, contents, next_number, lens)
         self._floor = OccupancyGrid(description, self._settings.occupancy_grid)
         self._rangers = RangerMonitor(description)
         self._mission: Mission = Idle()
@@ -146,6 +154,7 @@ class Pipeline:
         if self._fisheye.rectifies and observation.image is not None:
             # From here on the camera is a pinhole.
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
+        observation = self.calibration.correct(observation)
         self._rangers.see(observation.proximity)
         match self._mission:
             case Idle() if self._mapper.started:
@@ -185,7 +194,10 @@ class Pipeline:
     def _map(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
         self._keep_up(observation)
         if self._mapper.doubtful or self._mapper.astray or self._blind:
+            self.calibration.pause()
             return Command(), []
+        if observation.image is not None and self._mapper.started:
+            self._calibrate(observation.image)
         if isinstance(self._mission, Carried):
             assert self._passenger is not None
             return self._act(self._passenger, observation), []
@@ -204,6 +216,17 @@ class Pipeline:
             if self._mapper.between_episodes:
                 return Command()
         return move
+
+    def _calibrate(self, image: NDArray[np.uint8]) -> None:
+        """Hold the tracks against the wheels; what they show is used from the next node on."""
+        calibration = self.calibration
+        if calibration.pending is not None and self._mapper.description is calibration.pending[0]:
+            calibration.switched()
+            self._description, self._lens = calibration.description, calibration.lens
+            self._sift = Sift(self._lens, self._settings.sift)
+        calibration.watch(image, *self._mapper.tracks)
+        if calibration.pending is not None:
+            self._mapper.recalibrate(*calibration.pending)
 
     def _resume(self, observation: Observation) -> Command:
         """Find the robot on its own map; then map on from there."""

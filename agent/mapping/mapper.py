@@ -49,13 +49,15 @@ class Mapper:
         settings: AgentSettings | None = None,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
+        lens: Lens | None = None,
     ) -> None:
         """Start an empty map at the robot's pose, or resume one; see KeyframeBuilder."""
         settings = settings or AgentSettings()
         self.typical_depth = DEPTHS_PER_HEIGHT * max(description.camera.mount_height, 0.05)
         self._description = description
         self._settings = settings
-        self._lens = Lens(description.camera, description.distortion)
+        self._lens = lens or Lens(description.camera, description.distortion)
+        self._pending: tuple[RobotDescription, Lens] | None = None
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
         self._cartographer = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
@@ -125,6 +127,16 @@ class Mapper:
         return self._cartographer.map_from_anchor @ self._tracking.pose
 
     @property
+    def description(self) -> RobotDescription:
+        """The robot as it is mapped with now."""
+        return self._description
+
+    @property
+    def tracks(self) -> tuple[object, NDArray[np.int64], Array]:
+        """Whose tracks, their (N,) ids and (N, 2) px in the real image."""
+        return (self._tracking, *self._tracking.raw_tracks)
+
+    @property
     def tracked(self) -> int:
         """Tracks alive."""
         return len(self._tracking.ids)
@@ -174,6 +186,10 @@ class Mapper:
         elif self._anchor is not None and not self.doubtful:
             self._wayside.step(observation, self._tracking.pose.mean)
 
+    def recalibrate(self, description: RobotDescription, lens: Lens) -> None:
+        """Know the robot's geometry better from the next node on."""
+        self._pending = description, lens
+
     def meet(self, request: EpisodeRequest, observation: Observation) -> None:
         """Do what a behaviour asks for, with the observation of the last step."""
         match request:
@@ -196,6 +212,7 @@ class Mapper:
         With nodes it is astray and must `resume`; without any it may `begin` again.
         """
         self._cartographer.lose(self._tracking.pose)
+        self._take_up_pending()
         self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._leaves = None, []
         self._extracting, self._ended = None, False
@@ -261,7 +278,13 @@ class Mapper:
             else:
                 self._wayside.move_anchor(moved.mean)
             self._anchor, self._leaves = anchor, []
-            self._tracking.follow(anchor, self.typical_depth)
+            if self._take_up_pending():
+                # Tracks and features of another lens are of no use to a filter of this one.
+                self._tracking = Tracking(self._description, self._lens, self._settings)
+                self._tracking.step(observation)
+                self.begin(observation)
+            else:
+                self._tracking.follow(anchor, self.typical_depth)
 
         self._extracting, self._ended = (features, begin_next), True
         return node is not None
@@ -275,3 +298,12 @@ class Mapper:
         if self._extracting is not None:
             (features, take), self._extracting, self._ended = self._extracting, None, False
             take(features.result())
+
+    def _take_up_pending(self) -> bool:
+        """Change to another geometry, between two episodes; returns whether there was any."""
+        if self._pending is None:
+            return False
+        (self._description, self._lens), self._pending = self._pending, None
+        self._sift = Sift(self._lens, self._settings.sift)
+        self._cartographer.recalibrate(self._description)
+        return True

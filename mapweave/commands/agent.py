@@ -49,6 +49,7 @@ def add_to(commands: Any) -> None:
         "--fresh", action="store_true", help="begin a new map; else the newest map of the journal goes on"
     )
     which.add_argument("--resume", metavar="MAP", help="go on with this map of the journal, for example r0.3")
+    add_calibration(parser)
     parser.add_argument("--record", type=Path, metavar="DIR", help="record what the robot senses, as MCAP")
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
@@ -119,6 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             synchronization=synchronization,
             server=network.server,
+            calibration=calibration_of(arguments, name),
         )
         run_agent(CheckedRobot(robot), bus, keys, settings.agent, options, stop)
     finally:
@@ -130,6 +132,20 @@ def run(arguments: argparse.Namespace) -> int:
             body.close()
         bus.close()
     return 0
+
+
+def add_calibration(parser: argparse.ArgumentParser) -> None:
+    """Declare where the measured geometry of robots is."""
+    parser.add_argument(
+        "--calibration", type=Path, default=Path("out/calibration"), metavar="DIR",
+        help="folder of what `mapweave calibrate` has measured, a file per robot (default: out/calibration)",
+    )  # fmt: skip
+
+
+def calibration_of(arguments: argparse.Namespace, name: str) -> Path:
+    """The file of what was measured of a robot."""
+    folder: Path = arguments.calibration
+    return folder / f"{name}.toml"
 
 
 def print_error(line: str) -> None:

@@ -12,12 +12,15 @@ import cv2
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
+from mapweave.agent.calibration.correction import declaring, geometry_of
+from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile
 from mapweave.agent.replication.epochs import newest_on_server, next_epoch
 from mapweave.agent.replication.journal import Journal
@@ -65,6 +68,7 @@ class AgentOptions:
         total: observations that will come, if that is known.
         trajectories: whether the pose at each observation goes to a file beside the map's.
         patience: how long to wait at the end until the server has everything, s.
+        calibration: file with what `mapweave calibrate` has measured of this robot, if it exists.
     """
 
     name: str
@@ -80,6 +84,17 @@ class AgentOptions:
     total: int | None = None
     trajectories: bool = False
     patience: float = 5.0
+    calibration: Path | None = None
+
+
+def measured(description: RobotDescription, calibration: Path | None) -> RobotDescription:
+    """The robot with the geometry that was measured of it; as it declares itself if there is none.
+
+    Raises:
+        DeviceError: the file cannot be right.
+    """
+    given = read_geometry(calibration) if calibration is not None else {}
+    return declaring(description, replace(geometry_of(description), **given)) if given else description
 
 
 class Agent:
@@ -119,6 +134,7 @@ class Agent:
         self._settings = replace(settings, seed=options.seed)
         self._options = options
         self._on_step = on_step
+        self._causes = 0
         self._print = print_line
         self._server_missing, self._server_ns = False, 0
         options.data.mkdir(parents=True, exist_ok=True)
@@ -131,7 +147,7 @@ class Agent:
             if options.mission is not None or self.missions.report is None:
                 self.missions.begin(options.mission or options.otherwise)
             self.missions.unknown_goal = self._unknown_goal
-            self._description = describe()
+            self._description = measured(describe(), options.calibration)
             maps = self.journal.maps()
             if options.resume is not None or (maps and not options.fresh):
                 self._resume(self._chosen(maps))
@@ -144,7 +160,7 @@ class Agent:
             self.journal.close()
             raise
 
-    def _begin(self) -> None:
+    def _begin(self, calibration: OnlineCalibration | None = None) -> None:
         """A fresh map, whose number no map of this robot has had."""
         options = self._options
         taken = [known_map.epoch for known_map in self.journal.maps()]
@@ -159,7 +175,8 @@ class Agent:
                 stored = newest_on_server(self._bus, self._keys, options.server, options.name, patience)
             epoch = next_epoch(taken, stored)
         map_id = self.journal.open_map(epoch)
-        self._start(map_id, Pipeline(map_id, self._description, self._settings))
+        pipeline = Pipeline(map_id, self._description, self._settings, calibration=calibration)
+        self._start(map_id, pipeline)
 
     def _resume(self, map_id: MapId) -> None:
         kept = RetainedMap.of(self.journal, map_id)
@@ -206,6 +223,11 @@ class Agent:
             self._trajectory.add(observation.stamp_ns, step.status.map_from_robot)
         self._look_for_server(observation.stamp_ns)
         self._on_step(observation, step)
+        # A geometry that is found to be declared wrongly is reported once.
+        causes = self.pipeline.calibration.causes
+        for cause in causes[self._causes :]:
+            self._print(f"{self._options.name}: {cause}")
+        self._causes = len(causes)
 
     def _look_for_server(self, stamp_ns: int) -> None:
         """Say once that the map server is missing, and when it is there."""
@@ -232,14 +254,14 @@ class Agent:
 
     def begin_new_map(self) -> None:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
-        mission, old = self.pipeline.mission, self.map_id
+        mission, old, calibration = self.pipeline.mission, self.map_id, self.pipeline.calibration
         self._leave()
         try:
             self.write_map()
         except InvalidFile as error:
             # The journal has it all.
             self._print(f"{self._options.name}: {error}")
-        self._begin()
+        self._begin(calibration)
         self.pipeline.set_mission(mission)
         self._print(
             f"{self._options.name}: cannot find itself on map {old}; it begins map {self.map_id}, "
