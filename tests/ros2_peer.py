@@ -1,7 +1,7 @@
 """A second implementation of ROS 2 over Zenoh, from the design document of rmw_zenoh and the bridge's manual.
 
-It shares no code with the product. Its session is a peer, as those of ROS 2 processes are, and it is as strict
-as they are: what arrives without a valid attachment is a failure.
+It shares no code with the product. Its session is a peer, as those of ROS 2 processes are, and it is as
+strict as they are: what arrives without a valid attachment is a failure.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class RosPeer:
         failures: why a ROS 2 process would have ended by now.
     """
 
-    def __init__(self, endpoint: str, domain: int = 0, bridge: str | None = None, node: str = "robot") -> None:
+    def __init__(self, endpoint: str, domain: int = 0, bridge: str | None = None) -> None:
         config = zenoh.Config()
         values = {
             "mode": "peer",
@@ -105,19 +105,20 @@ class RosPeer:
             "connect/retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2},
             "listen/endpoints": ["tcp/127.0.0.1:0"],
             "scouting/multicast/enabled": False,
+            "scouting/delay": 1,
             "timestamping/enabled": True,
         }
         for path, value in values.items():
             config.insert_json5(path, json.dumps(value))
         self.session = zenoh.open(config)
         self.zid = str(self.session.zid())
-        self.domain, self.bridge, self.node = domain, bridge, node
+        self.domain, self.bridge = domain, bridge
         self.failures: list[str] = []
         self._held: list[Any] = []
         self._count = 0
         self._lock = threading.Lock()
         if bridge is None:
-            self._token(f"@ros2_lv/{domain}/{self.zid}/0/0/NN/%/%/{node}")
+            self._token(f"@ros2_lv/{domain}/{self.zid}/0/0/NN/%/%/robot")
 
     def key(self, topic: str, kind: str, type_hash: str) -> str:
         if self.bridge is not None:
@@ -153,7 +154,9 @@ class RosPeer:
         key = self.key(topic, kind, type_hash)
         if latched:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-            self._held.append(zenoh.ext.declare_advanced_subscriber(self.session, key, receive, history=history))
+            self._held.append(
+                zenoh.ext.declare_advanced_subscriber(self.session, key, receive, history=history)
+            )
         else:
             self._held.append(self.session.declare_subscriber(key, receive))
         self.announce("MS", topic, kind, type_hash, "::,10:,:,:,,")
@@ -163,7 +166,7 @@ class RosPeer:
         self._count += 1
         if self.bridge is None:
             name = topic.replace("/", "%")
-            who = f"{self.zid}/0/{self._count}/{role}/%/%/{self.node}"
+            who = f"{self.zid}/0/{self._count}/{role}/%/%/robot"
             self._token(f"@ros2_lv/{self.domain}/{who}/{name}/{dds(kind)}/{type_hash}/{qos}")
         else:
             name = self.key(topic, kind, "").replace("/", "§")
@@ -253,7 +256,9 @@ def transforms(*all_of_them: tuple[int, str, str, tuple[float, ...], tuple[float
     return out
 
 
-def scan(stamp_ns: int, frame: str, begin: float, step: float, nearest: float, farthest: float, ranges: Any) -> Cdr:
+def scan(
+    stamp_ns: int, frame: str, begin: float, step: float, nearest: float, farthest: float, ranges: Any
+) -> Cdr:
     out = Cdr().header(stamp_ns, frame)
     out.put("f", begin, begin + step * (len(ranges) - 1), step, 0.0, 0.1, nearest, farthest)
     return out.many("f", ranges).many("f", [])

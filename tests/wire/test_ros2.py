@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -21,6 +22,12 @@ from tests.waiting import eventually
 from tests.wire.fleets import ZenohFleet
 
 STRING, TWIST, ODOMETRY = "std_msgs/msg/String", "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry"
+
+
+def twist_message(forward: float, turn: float) -> Any:
+    vector = "geometry_msgs/msg/Vector3"
+    linear, angular = make(vector, x=forward, y=0.0, z=0.0), make(vector, x=0.0, y=0.0, z=turn)
+    return make(TWIST, linear=linear, angular=angular)
 
 
 @pytest.fixture
@@ -56,7 +63,12 @@ def test_keys_and_tokens_are_those_of_the_design_document() -> None:
     theirs = f"{session}/std_msgs::msg::dds_::String_/{HASHES[STRING]}/::,7:,:,:,,"
     assert keys.parse(theirs) == keys.parse(token) == chatter
     assert keys.parse(theirs.replace(HASHES[STRING], "TypeHashNotSupported")) is not None
-    for wrong in (theirs.replace("RIHS01_d", "RIHS01_*"), theirs.replace("::msg", "::srv"), theirs.rpartition("/")[0], "x"):
+    for wrong in (
+        theirs.replace("RIHS01_d", "RIHS01_*"),
+        theirs.replace("::msg", "::srv"),
+        theirs.rpartition("/")[0],
+        "x",
+    ):
         assert keys.parse(wrong) is None
 
 
@@ -65,7 +77,9 @@ def test_hashes_are_those_that_ros_prints(kind: str) -> None:
     assert type_hash(kind) == HASHES[kind]
 
 
-@given(st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1), st.binary(min_size=16, max_size=16))
+@given(
+    st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1), st.binary(min_size=16, max_size=16)
+)
 def test_attachments_have_33_bytes_and_both_forms_are_read(sequence: int, stamp_ns: int, gid: bytes) -> None:
     data = encode_attachment(Attachment(sequence, stamp_ns, gid))
     assert data == struct.pack("<qq", sequence, stamp_ns) + b"\x10" + gid
@@ -91,8 +105,7 @@ def test_both_sides_see_and_hear_each_other(ros: RosPeer, node: Ros2Node) -> Non
     command = node.publisher(node.link.topic("cmd_vel"), TWIST)
     odom = ros.publisher("/bot/odom", ODOMETRY)
     eventually(lambda: command.subscribers)
-    vector = "geometry_msgs/msg/Vector3"
-    message = make(TWIST, linear=make(vector, x=0.25, y=0.0, z=0.0), angular=make(vector, x=0.0, y=0.0, z=-0.5))
+    message = twist_message(0.25, -0.5)
 
     def heard() -> bool:
         odom.publish(peer.odometry(1_700_000_000_123_456_789, 1.0, 2.0, 0.5), named=len(got) == 0)
@@ -110,10 +123,11 @@ def test_both_sides_see_and_hear_each_other(ros: RosPeer, node: Ros2Node) -> Non
     # What `ros2 node list` and `ros2 topic list` show, and a publisher that waits for subscribers.
     parts = [token.split("/")[5:] for token in ros.tokens() if ros.zid not in token]
     assert ["NN", "%", "%bot", "mapweave"] in parts
-    twist = [*"MP % %bot mapweave %bot%cmd_vel geometry_msgs::msg::dds_::Twist_".split(), HASHES[TWIST]]
-    assert [*twist, "1:2:1,10:,:,:,,"] in parts
-    read = [*"MS % %bot mapweave %bot%odom nav_msgs::msg::dds_::Odometry_".split(), ANY_HASH]
-    assert [*read, "1:2:1,10:,:,:,,"] in parts
+    who = ["%", "%bot", "mapweave"]
+    twist = ["%bot%cmd_vel", "geometry_msgs::msg::dds_::Twist_", HASHES[TWIST], "1:2:1,10:,:,:,,"]
+    assert ["MP", *who, *twist] in parts
+    odometry = ["%bot%odom", "nav_msgs::msg::dds_::Odometry_", ANY_HASH, "1:2:1,10:,:,:,,"]
+    assert ["MS", *who, *odometry] in parts
     assert not ros.failures
 
 
@@ -131,7 +145,7 @@ def test_late_subscribers_get_the_last_message(router: ZenohFleet, ros: RosPeer,
     # And the other way round.
     ros.publisher("/tf_static", STRING, latched=True).publish(Cdr().text("kept"))
     got: list[Arrival] = []
-    node.subscribe("/tf_static", [STRING], got.append)
+    node.subscribe("/tf_static", [STRING], got.append, latched=True)
     eventually(lambda: got)
     assert Reader(got[0].data).text() == "kept"
 
@@ -140,11 +154,9 @@ def test_humble_has_no_hashes(ros: RosPeer, node: Ros2Node) -> None:
     twists = ros.subscriber("/cmd_vel", TWIST, type_hash="TypeHashNotSupported")
     command = node.publisher("/cmd_vel", TWIST)
     eventually(lambda: command.subscribers)
-    vector = "geometry_msgs/msg/Vector3"
-    zero = make(vector, x=0.0, y=0.0, z=0.0)
 
     def heard() -> bool:
-        command.publish(make(TWIST, linear=zero, angular=zero))
+        command.publish(twist_message(0.0, 0.0))
         return bool(twists)
 
     eventually(heard)
@@ -182,12 +194,10 @@ def test_a_bridge_has_plain_keys(router: ZenohFleet) -> None:
         odom = bridge.publisher("/odom", ODOMETRY)
         eventually(lambda: command.subscribers)
         eventually(lambda: node.publishers([ODOMETRY]) == ["/bot1/odom"])
-        vector = "geometry_msgs/msg/Vector3"
-        zero = make(vector, x=0.0, y=0.0, z=0.0)
 
         def heard() -> bool:
             odom.publish(peer.odometry(5, 1.0, 2.0, 0.5))
-            command.publish(make(TWIST, linear=zero, angular=zero))
+            command.publish(twist_message(0.0, 0.0))
             return bool(got) and bool(twists)
 
         eventually(heard)

@@ -55,4 +55,5 @@ def decode_attachment(data: bytes) -> Attachment:
         values.append(data[begin:at])
     if at != len(data) or values[2][0] != GID_BYTES:
         raise InvalidMessage(f"attachment: {len(data)} bytes of an unknown form")
-    return Attachment(*struct.unpack("<qq", values[0] + values[1]), values[2][1:])
+    sequence, stamp_ns = struct.unpack("<qq", values[0] + values[1])
+    return Attachment(sequence, stamp_ns, values[2][1:])

@@ -13,14 +13,17 @@ from mapweave.wire.zenoh_entities import Declared, Owner, Subscription
 
 
 class TopicSubscription(Subscription):
-    """Messages of a topic; those that its publishers keep for late subscribers come first."""
+    """Messages of a topic; first those that its publishers have kept, if it is latched."""
 
-    def __init__(self, owner: Owner, key: str, handler: Callable[[Sample], None], depth: int) -> None:
+    def __init__(self, owner: Owner, key: str, handler: Callable[[Sample], None], latched: bool) -> None:
         super().__init__(owner, key, handler)
-        self._depth = depth
+        self._latched = latched
 
     def _declare_in(self, session: zenoh.Session) -> Any:
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=self._depth)
+        if not self._latched:
+            remote = zenoh.Locality.REMOTE
+            return session.declare_subscriber(self.key, self._receive, allowed_origin=remote)
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
         # What this session publishes itself is no news.
         return zenoh.ext.declare_advanced_subscriber(
             session, self.key, self._receive, allowed_origin=zenoh.Locality.REMOTE, history=history

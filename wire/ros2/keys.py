@@ -2,10 +2,11 @@
 
 rmw_zenoh (its docs/design.md):
 
-    <domain>/<topic>/<type>/<hash>                                                      messages
-    @ros2_lv/<domain>/<session>/<node>/<node>/NN/<enclave>/<namespace>/<name>           a node
+    <domain>/<topic>/<type>/<hash>                                 messages
+    @ros2_lv/<domain>/<session>/<node>/<node>/NN/<enclave>/<namespace>/<name>
+                                                                   a node
     @ros2_lv/<domain>/<session>/<node>/<entity>/MP|MS/<enclave>/<namespace>/<name>/
-        <topic>/<type>/<hash>/<quality of service>                                      who publishes, subscribes
+        <topic>/<type>/<hash>/<quality of service>                 a publisher, a subscriber
 
 In a token `%` stands for each `/` of a name. The bridge's key is the topic itself; its tokens are
 `@/<session>/@ros2_lv/MP|MS/<topic>/<type>/<quality of service>`, where `§` stands for each `/`.

@@ -87,15 +87,18 @@ class Ros2Node:
 
         return self._bus.declare(Watcher(self._bus.owner, self.keys.all_tokens(role, topic), presence))
 
-    def subscribe(self, topic: str, kinds: Sequence[str], handler: Callable[[Arrival], None]) -> Subscriber:
+    def subscribe(
+        self, topic: str, kinds: Sequence[str], handler: Callable[[Arrival], None], latched: bool = False
+    ) -> Subscriber:
         """Call the handler with each message of a topic that has one of these types.
 
         Args:
             topic: full name.
             kinds: types; where keys do not tell the type, and nobody announces it, it is the first.
             handler: runs on the bus's worker; it must be quick.
+            latched: whether messages of before are wanted that a publisher has kept (transient local).
         """
-        return Subscriber(self, topic, kinds, handler)
+        return Subscriber(self, topic, kinds, handler, latched)
 
     def publisher(self, topic: str, kind: str, latched: bool = False) -> Publisher:
         """A publisher of a topic.
@@ -116,10 +119,10 @@ class Ros2Node:
             self._bus.declare(Token(self._bus.owner, token))
         return token or f"{endpoint.topic}/{self._entities}"
 
-    def listen(self, topic: str, handler: Callable[[Sample], None]) -> Closing:
+    def listen(self, topic: str, handler: Callable[[Sample], None], latched: bool) -> Closing:
         """Call the handler with each message of a topic, of any type."""
         key = self.keys.all_messages(topic)
-        return self._bus.declare(TopicSubscription(self._bus.owner, key, handler, DEPTH))
+        return self._bus.declare(TopicSubscription(self._bus.owner, key, handler, latched))
 
     def publication(self, endpoint: Endpoint, latched: bool) -> TopicPublication:
         """Declare a publication."""
@@ -155,14 +158,19 @@ class Subscriber:
     """
 
     def __init__(
-        self, node: Ros2Node, topic: str, kinds: Sequence[str], handler: Callable[[Arrival], None]
+        self,
+        node: Ros2Node,
+        topic: str,
+        kinds: Sequence[str],
+        handler: Callable[[Arrival], None],
+        latched: bool,
     ) -> None:
         """Subscribe; see `Ros2Node.subscribe`."""
         self.topic, self.kinds, self.refused = topic, tuple(kinds), ""
-        self._node, self._handler = node, handler
+        self._node, self._handler, self._latched = node, handler, latched
         self._announced: dict[Endpoint, str] = {}
         node.watch(Role.PUBLISHER, topic, self._presence)
-        node.listen(topic, self._receive)
+        node.listen(topic, self._receive, latched)
 
     def _presence(self, endpoint: Endpoint, token: str, alive: bool) -> None:
         if not alive:
@@ -170,7 +178,7 @@ class Subscriber:
         if endpoint.kind not in self.kinds:
             self.refused = endpoint.kind
         elif endpoint not in self._announced:
-            self._announced[endpoint] = self._node.announce(Role.SUBSCRIBER, endpoint)
+            self._announced[endpoint] = self._node.announce(Role.SUBSCRIBER, endpoint, self._latched)
 
     def _receive(self, sample: Sample) -> None:
         kind, _ = self._node.keys.kind_of(sample.key)

@@ -68,8 +68,9 @@ class Ros2Link:
         """
         check_name(name)
         # A bridge puts its namespace before every topic, those with a leading slash included.
-        full = name if name.startswith("/") and not self.bridge else f"{self.namespace.strip('/')}/{name.strip('/')}"
-        return "/" + full.strip("/")
+        absolute = name.startswith("/") and not self.bridge
+        parts = (name,) if absolute else (self.namespace, name)
+        return "".join(f"/{part.strip('/')}" for part in parts if part.strip("/"))
 
 
 def check_name(name: str) -> str:
@@ -77,6 +78,7 @@ def check_name(name: str) -> str:
     parts = name.removeprefix("/").split("/")
     if not all(NAME.fullmatch(part) for part in parts):
         raise SettingsError(
-            f"{name!r} is no ROS name: its parts, joined by '/', have a-z, A-Z, 0-9 and '_' and begin with no digit"
+            f"{name!r} is no ROS name: use parts of a-z, A-Z, 0-9 and '_' that begin with no digit, "
+            "joined by '/'"
         )
     return name
