@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -28,9 +29,11 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.node import NUMBER, MapId
+from mapweave.processes.ros2_publisher import Ros2Publisher
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
+from mapweave.wire.ros2.settings import Ros2Link
 from mapweave.wire.traffic_meter import TrafficMeter
 from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -58,6 +61,7 @@ class AgentOptions:
         total: observations that will come, if that is known.
         trajectories: whether the pose at each observation goes to a file beside the map's.
         patience: how long to wait at the end until the server has everything, s.
+        ros2: where pose and map are published as ROS 2 topics; None if they are not.
     """
 
     name: str
@@ -72,6 +76,7 @@ class AgentOptions:
     total: int | None = None
     trajectories: bool = False
     patience: float = 5.0
+    ros2: Ros2Link | None = None
 
 
 class Agent:
@@ -193,6 +198,7 @@ class Agent:
     def begin_new_map(self) -> None:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
         mission, old = self.pipeline.mission, self.map_id
+        cause = "was lifted" if self.pipeline.put_elsewhere else f"cannot find itself on map {old}"
         self._leave()
         try:
             self.write_map()
@@ -201,10 +207,7 @@ class Agent:
             self._print(f"{self._options.name}: {error}")
         self._begin()
         self.pipeline.set_mission(mission)
-        self._print(
-            f"{self._options.name}: cannot find itself on map {old}; it begins map {self.map_id}, "
-            "and the old one stays"
-        )
+        self._print(f"{self._options.name}: {cause}; it begins map {self.map_id}, and the old one stays")
 
     def tick(self, observation: Observation) -> Step:
         """One tick; see Runner.tick. Begins a fresh map where that is needed."""
@@ -293,8 +296,18 @@ def run_agent(
     console = Console(stderr=True)
     show = _progress(console, options)
     describe = partial(_describe, robot, console.print, options.name)
-    agent = Agent(describe, bus, keys, settings, options, show, console.print)
-    with show:
+    publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
+
+    def stepped(observation: Observation, step: Step) -> None:
+        show(observation, step)
+        if publisher is not None:
+            publisher.step(observation, bool(step.changes), agent.pipeline, agent.merged_poses)
+
+    with contextlib.ExitStack() as closing:
+        if publisher is not None:
+            closing.callback(publisher.close)
+        agent = Agent(describe, bus, keys, settings, options, stepped, console.print)
+        closing.enter_context(show)
         try:
             agent.run(robot, stop)
         finally:
