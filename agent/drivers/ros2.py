@@ -145,7 +145,7 @@ class Ros2Base:
         assert self._guard is not None
         stops = self._stops()
         if stops.keys() != self._guard.stop.keys():
-            # Somebody subscribes to another type than before.
+            # There is a subscriber of another type.
             self._guard.close()
             self._guard = Ros2Guard(self._options.endpoint, stops)
         moving = any(speeds)
@@ -153,11 +153,11 @@ class Ros2Base:
         self.publish(Command((speeds.left + speeds.right) / 2, (speeds.right - speeds.left) / self._axle))
         unheard = not (self._twist.subscribers or self._stamped.subscribers)
         if moving and unheard and not self._unheard and self._node.connected():
-            log.warning("nobody subscribes to %s: the robot does not move", self._options.command)
+            log.warning("no node subscribes to %s: the robot does not move", self._options.command)
         self._unheard = unheard
 
     def publish(self, command: Command) -> None:
-        """Publish a command in the type or types that somebody subscribes to."""
+        """Publish a command in the type or types of its subscribers."""
         twist = making.twist(make, command)
         if not self._only_stamped():
             self._twist.publish(twist)
@@ -277,7 +277,7 @@ class Ros2Base:
     def _stops(self) -> dict[str, bytes]:
         """What stops the wheels, on each key."""
         zero = making.twist(make, Command())
-        # A time of zero stands for the time of arrival.
+        # ros2_control takes a time of zero for the time of arrival.
         stamped = make(STAMPED_TYPE, header=making.header(make, 0, BASE), twist=zero)
         stops = dict.fromkeys(self._stamped.keys, encode(stamped))
         if not (self._options.bridge and self._only_stamped()):

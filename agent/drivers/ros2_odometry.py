@@ -14,10 +14,10 @@ JOINTS_TYPE, TICKS_TYPE = "sensor_msgs/msg/JointState", "irobot_create_msgs/msg/
 KINDS = (ODOMETRY_TYPE, JOINTS_TYPE, TICKS_TYPE)
 TICKS_PER_TURN = 508.8
 TICKS_RANGE = 1 << 32
-CREATE_3_RADIUS = 0.036
-"""Of its wheels, m."""
+CREATE_3_RADIUS = 0.03575
+"""Of its wheels, m, by create3_sim."""
 FASTEST = 5.0
-"""m/s; a greater step means that the robot has begun to count anew."""
+"""m/s; a greater step means that the robot counts from zero again."""
 COASTING = 0.1
 """m that a step may be longer: messages may be late."""
 

@@ -86,14 +86,14 @@ class Topic:
 
     @property
     def silent(self) -> bool:
-        """Whether no message has come lately."""
+        """Whether no message has come in the last moments."""
         arrival = self._arrival
         if arrival is None or self._clock is None:
             return arrival is None
         return time.monotonic_ns() - arrival.arrived_ns > STALE * 1e9
 
     def first(self, what: str, patience: float) -> Received:
-        """Wait for a message unless one has come lately, and return the newest.
+        """Wait for a message if it is silent, and return the newest.
 
         Args:
             what: it is, for the error.

@@ -3,7 +3,7 @@
 Below the link's namespace, in the frame `map`: the merged map once the server has placed the robot, its own
 map before that.
 
-    tf                      map to odom (and odom to base_footprint, if nobody else publishes that)
+    tf                      map to odom (and odom to base_footprint, if no other node publishes that)
     mapweave/<agent>/pose   PoseWithCovarianceStamped
     mapweave/<agent>/path   Path
     mapweave/<agent>/map    MarkerArray: nodes, and edges by their kind
@@ -41,7 +41,7 @@ MAP, ODOM = "map", "odom"
 AHEAD_NS = 300_000_000
 """The transform of map to odom is dated ahead by this much, for those who look it up a moment later."""
 PATIENCE = 2.0
-"""s that somebody else's odometry frame is waited for."""
+"""s that another node's odometry frame is waited for."""
 SLOWLY = 1.0
 """s between two paths or maps."""
 STEP, TURN = 0.1, 0.2
@@ -82,7 +82,7 @@ class Moment:
 
 
 class OdometryFrame:
-    """Where the robot is in its odometry frame, as somebody else publishes it."""
+    """Where the robot is in its odometry frame, as another node publishes it."""
 
     def __init__(self, node: Ros2Node, clock: RemoteClock) -> None:
         """Subscribe."""
@@ -93,7 +93,7 @@ class OdometryFrame:
         node.subscribe(node.link.topic("tf"), (TF_TYPE,), self._take)
 
     def at(self, stamp_ns: int) -> Pose2 | None:
-        """`odom_from_robot` at a time; None if nobody publishes it."""
+        """`odom_from_robot` at a time; None if no node publishes it."""
         with self._lock:
             poses = list(self._poses)
         k = bisect(poses, stamp_ns, key=lambda one: one[0])

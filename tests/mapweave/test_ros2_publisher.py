@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import argparse
 import math
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.mission import Carried
+from mapweave.commands.agent import open_robot, ros2_link
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes import ros2_publisher
+from mapweave.processes.agent import AgentOptions, run_agent
 from mapweave.processes.ros2_publisher import Ros2Publisher
+from mapweave.settings import load_settings
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose
+from mapweave.wire.ros2.messages import type_hash
 from mapweave.wire.ros2.settings import Ros2Link
+from mapweave.wire.zenoh_bus import ZenohBus
 from tests import ros2_peer as peer
 from tests.agent.conftest import PhotoWalls
+from tests.agent.drivers.ros2_robot import Ros2Robot
 from tests.agent.ranged_body import on
 from tests.ros2_peer import Reader, RosPeer
 from tests.waiting import eventually
@@ -225,3 +237,42 @@ def test_names_of_agents_become_names_of_topics() -> None:
         publisher.close()
         robot.close()
         router.close()
+
+
+def test_an_agent_publishes_where_the_topics_of_its_robot_are(tmp_path: Path) -> None:
+    emulator = Ros2Robot()
+    path = tmp_path / "robot.toml"
+    path.write_text(f"""
+[robot]
+driver = "ros2"
+[robot.options]
+endpoint = "{emulator.endpoint}"
+namespace = "/"
+image = "/camera/image_raw"
+[robot.geometry]
+radius = 0.15
+axle = 0.25
+""")
+    settings, arguments = (
+        load_settings(path),
+        argparse.Namespace(robot=None, ros2="", lockstep=False, body=None),
+    )
+    link = ros2_link(arguments, settings.robot)
+    assert ros2_link(argparse.Namespace(robot="koala", ros2="tcp/a:1"), settings.robot).endpoint == "tcp/a:1"
+    bus, stop = ZenohBus(BusSettings(endpoints=("tcp/127.0.0.1:9",))), threading.Event()
+    robot, _ = open_robot(arguments, settings.robot, bus, "f", "r0")
+    options = AgentOptions("r0", tmp_path, mission=Carried(), patience=0.0, ros2=link)
+    run = (CheckedRobot(robot), bus, Keys("f"), settings.agent, options, stop)
+    agent = threading.Thread(target=run_agent, args=run)
+    agent.start()
+    try:
+        kind = KINDS["/mapweave/r0/map"]
+        eventually(lambda: any("%mapweave%r0%map" in token for token in emulator.peer.tokens()))
+        maps = emulator.peer.subscriber("/mapweave/r0/map", kind, type_hash(kind), latched=True)
+        eventually(lambda: maps)
+        assert set(read_markers(maps[-1])) == {"nodes", "mapped", "turned", "driven", "loop", "merged"}
+    finally:
+        stop.set()
+        agent.join()
+        bus.close()
+        emulator.close()

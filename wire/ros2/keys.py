@@ -8,8 +8,8 @@ rmw_zenoh (its docs/design.md):
     @ros2_lv/<domain>/<session>/<node>/<entity>/MP|MS/<enclave>/<namespace>/<name>/
         <topic>/<type>/<hash>/<quality of service>                 a publisher, a subscriber
 
-In a token `%` stands for each `/` of a name. The bridge's key is the topic itself; its tokens are
-`@/<session>/@ros2_lv/MP|MS/<topic>/<type>/<quality of service>`, where `§` stands for each `/`.
+In a token `%` replaces each `/` of a name. The bridge's key is the topic itself; its tokens are
+`@/<session>/@ros2_lv/MP|MS/<topic>/<type>/<quality of service>`, where `§` replaces each `/`.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class Ros2Node:
         return self._bus.connected()
 
     def publishers(self, kinds: Sequence[str]) -> list[str]:
-        """Topics on which somebody publishes messages of these types."""
+        """Topics with a publisher of messages of these types."""
         return sorted({one.topic for one in tuple(self._publishers.values()) if one.kind in kinds})
 
     def watch(self, role: Role, topic: str | None, handler: Callable[[Endpoint, str, bool], None]) -> Closing:
@@ -94,7 +94,7 @@ class Ros2Node:
 
         Args:
             topic: full name.
-            kinds: types; where keys do not tell the type, and nobody announces it, it is the first.
+            kinds: types; where keys do not tell the type, and no token announces it, it is the first.
             handler: runs on the bus's worker; it must be quick.
             latched: whether messages of before are wanted that a publisher has kept (transient local).
         """
@@ -111,7 +111,7 @@ class Ros2Node:
         return Publisher(self, topic, kind, latched)
 
     def announce(self, role: Role, endpoint: Endpoint, latched: bool = False) -> str:
-        """Announce a publisher or subscriber; returns its token, or with the bridge what stands for it."""
+        """Announce a publisher or subscriber; returns its token, or with the bridge another unique name."""
         with self._lock:
             self._entities += 1
             token = self.keys.token(role, self._entities, endpoint, latched, 1 if latched else DEPTH)
@@ -150,8 +150,8 @@ class Ros2Node:
 class Subscriber:
     """A subscription of a node.
 
-    A publisher may publish only while somebody announces to subscribe, so each type of a publisher that is
-    wanted is announced in turn.
+    A publisher may publish only while it has subscribers, so a subscription is announced for each publisher
+    of a type that is wanted.
 
     Attributes:
         refused: the type of a publisher or message that is not wanted; empty if there is none.

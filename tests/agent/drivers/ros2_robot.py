@@ -156,7 +156,7 @@ class Ros2Robot:
         self._publish("odom", peer.odometry(now, *self.pose))
         names = ["wheel_left_joint", "wheel_right_joint"]
         self._publish("joint_states", peer.joint_states(now, names, [one / 0.033 for one in way]))
-        ticks = [round(508.8 * one / (2 * math.pi * 0.036)) for one in way]
+        ticks = [round(508.8 * one / (2 * math.pi * 0.03575)) for one in way]
         # Counters that wrap around soon.
         ticks = [(tick + 2**31 - 50 + 2**31) % 2**32 - 2**31 for tick in ticks]
         self._publish("wheel_ticks", peer.wheel_ticks(now, *ticks))

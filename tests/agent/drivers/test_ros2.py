@@ -241,4 +241,4 @@ def test_that_nobody_listens_is_said_once(start: Start, caplog: pytest.LogCaptur
     robot = start(emulator, command="drive")
     with caplog.at_level(logging.WARNING):
         drive(robot, Command(0.1, 0.0), 0.5)
-    assert [r.message for r in caplog.records] == ["nobody subscribes to drive: the robot does not move"]
+    assert [r.message for r in caplog.records] == ["no node subscribes to drive: the robot does not move"]
