@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.exploration.carried_mapping import CarriedMapping
@@ -33,7 +33,7 @@ from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.vision.lens import Lens
+from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
 
 IDENTITY = Pose2()
@@ -117,6 +117,9 @@ class Pipeline:
             next_number: the first that no node or edge of the map has ever had.
         """
         jit.load()  # a robot that drives must not wait for a compiler
+        self._fisheye = Lens(description.camera, description.distortion)
+        if self._fisheye.rectifies:
+            description = replace(description, distortion=NO_DISTORTION)
         self._map_id = map_id
         self._settings = settings or AgentSettings()
         self._description = description
@@ -203,6 +206,9 @@ class Pipeline:
             answers: to questions of earlier steps.
         """
         command, questions = Command(), list[Question]()
+        if self._fisheye.rectifies and observation.image is not None:
+            # From here on the camera is a pinhole.
+            observation = replace(observation, image=self._fisheye.rectified(observation.image))
         self._rangers.see(observation.proximity)
         match self._mission:
             case _ if self._in_the_air(observation) or self._put_elsewhere:

@@ -18,7 +18,7 @@ from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.blockages import Blockages
-from mapweave.mapserver.explainer import Explainer, RulingBook
+from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_history import MapHistory
@@ -92,8 +92,8 @@ class MapServer:
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
-        self._rulings = RulingBook(self._store)
-        self._worker.rule(self._rulings.rulings)
+        self._constraints = ConstraintRecord(self._store)
+        self._worker.constrain(self._constraints.constraints)
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
@@ -109,8 +109,8 @@ class MapServer:
             lambda: self._history.happenings, clock.monotonic, clock.executor(1),
         )  # fmt: skip
         self._explainer = Explainer(
-            self._bus, self._keys, self._name, worker.current, self._admission, self._rulings, worker.rule,
-            lambda: worker.settled, self._settings.merge.consistency,
+            self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,
+            worker.constrain, lambda: worker.settled, self._settings.merge.consistency,
             lambda: self._blockages.known(clock.monotonic()), lambda: self._history.happenings,
         )  # fmt: skip
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
@@ -153,7 +153,7 @@ class MapServer:
             "loops": loops,
             "refused": sum(refusal.link is not None for refusal in merged.refused),
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
-            "rulings": len(merged.rulings.in_force),
+            "constraints": len(merged.constraints.in_force),
             "set_apart": len(merged.set_apart),
             "event": self._ingest.failure or self._worker.event,
             "settled": self._worker.settled,

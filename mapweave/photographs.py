@@ -27,7 +27,7 @@ from mapweave.hybridmap.quantization import settle
 from mapweave.registration.selection import choose, worth
 from mapweave.storage.image_file import read_grey
 from mapweave.structure_from_motion import PIXEL_SIGMA, Structure, reconstruct
-from mapweave.vision.lens import Lens
+from mapweave.vision.lens import Distortion, Lens
 from mapweave.vision.sift import Sift
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -45,7 +45,7 @@ FLOOR = (0.01, 0.01)
 def map_of_photographs(
     images: Sequence[Path],
     camera: Camera,
-    distortion: tuple[float, ...],
+    distortion: Distortion,
     spacing: float,
     map_id: MapId,
 ) -> list[ChangeBody]:
@@ -54,7 +54,7 @@ def map_of_photographs(
     Args:
         images: in the order in which they were taken, by one camera that was held about level.
         camera: that took them; `mount_height` is how high it was held.
-        distortion: of its lens, OpenCV's five coefficients.
+        distortion: of its lens.
         spacing: how far apart they were taken, on average, m; 30 % more or less does not matter.
         map_id: whose nodes they become; the k-th photograph is node k.
 
@@ -64,7 +64,7 @@ def map_of_photographs(
     """
     if not (math.isfinite(spacing) and spacing > 0.0):
         raise InvalidValue(f"spacing {spacing:g}: give the metres between photographs")
-    sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
+    sift = Sift(Lens(camera, distortion))
     features = [sift.extract(read_grey(image, camera)) for image in images]
     views = [extracted.view(camera) for extracted in features]
     structure = reconstruct(views, spacing)

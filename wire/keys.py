@@ -8,7 +8,8 @@
     mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
-    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, rule, history
+    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain and
+                                                      history
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot base; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of the driver of that base
@@ -161,13 +162,13 @@ class Keys:
         """Pattern: any server."""
         return f"{self.root}/server/*/explain"
 
-    def rule(self, server: str) -> str:
+    def constrain(self, server: str) -> str:
         """Manual constraints to a server."""
-        return self._of_server("rule", server)
+        return self._of_server("constrain", server)
 
-    def any_rule(self) -> str:
+    def any_constrain(self) -> str:
         """Pattern: every server of the fleet."""
-        return f"{self.root}/server/*/rule"
+        return f"{self.root}/server/*/constrain"
 
     def history(self, server: str) -> str:
         """The history of the maps, from a server."""

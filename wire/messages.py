@@ -1,4 +1,4 @@
-"""Questions about the fleet's map, their answers, and what people rule, as bytes.
+"""Questions about the fleet's map, their answers, and manual constraints, as bytes.
 
 See mapweave.hybridmap.query and mapweave.hybridmap.explanation for what they mean. Their fields travel under
 their own names.
@@ -64,7 +64,7 @@ LIMITS: dict[type, Limit] = {
     PairExplanation: Limit("explanation", 2 * MAX_BODY_BYTES + 4_000_000, 200_000),
     FleetExplanation: Limit("explanation", 8_000_000, 500_000),
     RouteExplanation: Limit("explanation of a route", 16_000_000, 200_000),
-    ManualConstraint: Limit("ruling", 4096),
+    ManualConstraint: Limit("manual constraint", 4096),
     History: Limit("history", 2**26, 1_000_000),
     KeptHistory: Limit("history", 2**26, 2_000_000),
 }

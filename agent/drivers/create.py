@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass
 
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
+from mapweave.agent.drivers.guarded_base import GuardedBase
 from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheel_guard import WheelGuard
@@ -36,16 +37,14 @@ class CreateOptions:
     port: str
 
 
-class CreateBase:
+class CreateBase(GuardedBase):
     """The base. It has no watchdog, so a `WheelGuard` stops its wheels."""
 
     geometry = Geometry(radius=0.175, axle=0.235, max_forward=0.3, max_turn=0.8)
 
     def __init__(self, port: str) -> None:
         """Create a base without opening the port."""
-        self._path = port
-        self._port: SerialPort | None = None
-        self._guard: WheelGuard | None = None
+        super().__init__(port)
         self._passive = False
         self._counters = [WheelCounter(METRES_PER_COUNT, 16, FASTEST_MM / 1e3) for _ in range(2)]
 
@@ -58,15 +57,6 @@ class CreateBase:
         self._guard = WheelGuard(self._port.descriptor, STOP * 2)
         self.drive(Wheels())
         self.read()
-
-    def close(self) -> None:
-        """Stop the wheels by the guard, and close the port."""
-        if self._guard is not None:
-            self._guard.close()
-            self._guard = None
-        if self._port is not None:
-            self._port.close()
-            self._port = None
 
     def nearest(self, speeds: Wheels) -> Wheels:
         """Round to whole mm/s."""

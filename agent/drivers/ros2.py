@@ -23,7 +23,7 @@ from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import BASE, CAMERA_TYPE, IMAGE_TYPES, camera_of
-from mapweave.hybridmap.errors import DeviceError, SettingsError
+from mapweave.hybridmap.errors import DeviceError, InvalidValue, SettingsError
 from mapweave.storage.settings_file import build
 from mapweave.wire.ros2.messages import encode, make
 from mapweave.wire.ros2.node import Ros2Node
@@ -210,7 +210,7 @@ class Ros2Base:
     def _camera_by_info(self, info: Topic, frame: str, end: float) -> CameraSettings:
         received = info.first("camera calibration ([robot.camera] can replace it)", end - time.monotonic())
         try:
-            camera, distortion = camera_of(received.message, self._rectified)
+            c, lens, distortion = camera_of(received.message, self._rectified)
         except DeviceError as error:
             raise DeviceError(f"{info.name}: {error}; calibrate it, or give [robot.camera]") from None
         height, forward = self._options.height_m, self._options.forward_m
@@ -225,10 +225,12 @@ class Ros2Base:
             height, forward = mount.up, mount.forward
             if abs(mount.heading) > math.radians(3.0):
                 log.warning("%s looks %.0f deg to the left", frame, math.degrees(mount.heading))
-        c = camera
-        return CameraSettings(
-            c.width, c.height, c.fx, c.fy, c.cx, c.cy, height, forward, distortion, self.images.name
-        )
+        try:
+            return CameraSettings(
+                c.width, c.height, c.fx, c.fy, c.cx, c.cy, height, forward, lens, distortion
+            )
+        except InvalidValue as error:
+            raise DeviceError(f"{info.name}: {error}; calibrate it, or give [robot.camera]") from None
 
     def _with_rangers(self, end: float) -> Geometry:
         """The directions and reach of all sensors."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Distortion, Images, Recording, StampedPoses, assembled
+from mapweave.agent.recordings.recording import Images, Recording, StampedPoses, assembled
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import (
     CAMERA_TYPE,
@@ -28,7 +28,8 @@ from mapweave.agent.ros_messages.values import (
     stamp_of,
 )
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.errors import DeviceError, MapweaveError
+from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
+from mapweave.vision.lens import Distortion, lens_of
 
 SUFFIXES = {".bag", ".mcap", ".db3"}
 POSE_TYPES = (
@@ -211,12 +212,14 @@ def _camera(
     info = (near or infos)[0]
     _, message = next(opened.messages(info.name))
     try:
-        camera, distortion = camera_of(message)
-    except DeviceError as error:
+        camera, model, coefficients = camera_of(message)
+        mount = _mount(opened, str(message.header.frame_id))
+        if mount is not None:
+            camera = replace(camera, mount_height=mount.up, mount_forward=mount.forward)
+        given = lens_of(camera, model, coefficients)
+    except (DeviceError, InvalidValue) as error:
         raise DeviceError(f"{opened.path}: {info.name}: {error}") from None
-    mount = _mount(opened, str(message.header.frame_id))
     if mount is not None:
-        camera = replace(camera, mount_height=mount.up, mount_forward=mount.forward)
         notes.append(f"camera {mount.forward:.2f} m ahead of the axle and {mount.up:.2f} m high, by tf")
         if abs(mount.left) > 0.05:
             notes.append(f"the camera is {mount.left:.2f} m to the left, which is not taken into account")
@@ -224,7 +227,7 @@ def _camera(
             notes.append(
                 f"the camera looks {math.degrees(mount.heading):.0f} deg to the left: it should look ahead"
             )
-    return options.camera_of(opened.path, (camera, distortion), mount is not None)
+    return options.camera_of(opened.path, given, mount is not None)
 
 
 def _namespace(topic: str) -> str:

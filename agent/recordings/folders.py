@@ -13,13 +13,13 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_in, images_of, read_increments, read_times
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Distortion, Images, Recording, Stamps, assembled
+from mapweave.agent.recordings.recording import Images, Recording, Stamps, assembled
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.image_file import image_size, read_grey
+from mapweave.vision.lens import NO_DISTORTION, Distortion, LensModel, lens_of
 
-NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
 
@@ -61,14 +61,18 @@ def euroc(folder: Path, options: RecordingOptions) -> Recording:
         _yaml_list(cam, text, "distortion_coefficients", 4),
     )
     model = re.search(r"^distortion_model:\s*(\S+)", text, re.M)
-    if model is not None and model[1] != "radial-tangential":
-        raise DeviceError(
-            f"{cam / 'sensor.yaml'}: lens model {model[1]} is not supported; radial-tangential is"
-        )
+    name = str(LensModel.RADIAL_TANGENTIAL) if model is None else model[1]
+    if name not in list(LensModel):
+        known = " and ".join(LensModel)
+        raise DeviceError(f"{cam / 'sensor.yaml'}: lens model {name} is not supported; {known} are")
     if not paths:
         raise DeviceError(f"{cam / 'data.csv'}: no images")
     fx, fy, cx, cy = intrinsics
-    given = _camera(paths[0], (fx, fy, cx, cy)), (lens[0], lens[1], lens[2], lens[3], 0.0)
+    try:
+        coefficients = [*lens, 0.0] if name == LensModel.RADIAL_TANGENTIAL else lens
+        given = lens_of(_camera(paths[0], (fx, fy, cx, cy)), LensModel(name), coefficients)
+    except InvalidValue as error:
+        raise DeviceError(f"{cam / 'sensor.yaml'}: {error}") from None
     return _folder(folder, "EuRoC", paths, stamps, given, options)
 
 

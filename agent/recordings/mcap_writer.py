@@ -17,6 +17,7 @@ from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.values import FOOTPRINT as BASE
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
+from mapweave.vision.equidistant import Equidistant
 
 PART_S = 60.0
 """A recording is a row of files. One that the power fails in is lost, so none is longer, s."""
@@ -198,11 +199,15 @@ class _Part:
         region = self._make(
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
-        k = np.array([c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0])
+        lens = self._description.distortion
+        real, model, d = (
+            (lens, "equidistant", lens.k) if isinstance(lens, Equidistant) else (c, "plumb_bob", lens)
+        )
+        k = np.array([real.fx, 0.0, real.cx, 0.0, real.fy, real.cy, 0.0, 0.0, 1.0])
         p = np.array([c.fx, 0.0, c.cx, 0.0, 0.0, c.fy, c.cy, 0.0, 0.0, 0.0, 1.0, 0.0])
         return {
-            "height": c.height, "width": c.width, "distortion_model": "plumb_bob", "k": k, "p": p,
-            "d": np.array(self._description.distortion), "r": np.eye(3).ravel(),
+            "height": c.height, "width": c.width, "k": k, "p": p, "r": np.eye(3).ravel(),
+            "distortion_model": model, "d": np.array(d),
             "binning_x": 0, "binning_y": 0, "roi": region,
         }  # fmt: skip
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mapweave.agent.recordings.camera_file import read_camera
-from mapweave.agent.recordings.recording import Distortion
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.vision.lens import Distortion
 
 
 @dataclass(frozen=True)

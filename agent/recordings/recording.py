@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
+from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import Distortion
 
-Distortion = tuple[float, float, float, float, float]
-"""(k1, k2, p1, p2, k3) of the lens, OpenCV's order."""
 Stamps = NDArray[np.int64]
 
 MOST_WIDTH = 800
@@ -166,6 +166,8 @@ def assembled(
     factor = math.ceil(camera.width / MOST_WIDTH)
     if factor > 1:
         notes = (*notes, f"images are reduced {factor} times")
+    if isinstance(distortion, Equidistant):
+        distortion = distortion.reduced(factor)
     return Recording(
         path,
         kind,

@@ -10,9 +10,16 @@ import numpy as np
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.pose import Array
+from mapweave.vision.lens import LensModel
 
-Distortion = tuple[float, float, float, float, float]
-"""(k1, k2, p1, p2, k3), OpenCV's order."""
+LENS_MODELS = {
+    "plumb_bob": LensModel.RADIAL_TANGENTIAL,
+    "rational_polynomial": LensModel.RADIAL_TANGENTIAL,
+    "": LensModel.RADIAL_TANGENTIAL,
+    "equidistant": LensModel.EQUIDISTANT,
+    "fisheye": LensModel.EQUIDISTANT,
+}
+"""Lens models by ROS' names of them; some drivers write `fisheye`."""
 ODOMETRY_TYPE, CAMERA_TYPE, TF_TYPE = (
     "nav_msgs/msg/Odometry", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage",
 )  # fmt: skip
@@ -57,33 +64,38 @@ def pose_of(message: Any) -> tuple[float, float, float]:
     return pose.position.x, pose.position.y, heading_of(q.x, q.y, q.z, q.w)
 
 
-def camera_of(message: Any, rectified: bool = False) -> tuple[Camera, Distortion]:
-    """The camera of a CameraInfo, with no mount.
+def camera_of(message: Any, rectified: bool = False) -> tuple[Camera, LensModel, tuple[float, ...]]:
+    """The camera of a CameraInfo, with no mount; `lens_of` makes the ideal camera and the lens of it.
 
     Args:
         message: of ROS 2, or of ROS 1.
         rectified: whether it is the camera of images from which the distortion has been removed.
 
+    Returns:
+        The camera of the real image, the model of its lens, and the coefficients.
+
     Raises:
         DeviceError: its lens is not supported, or its numbers are of no camera.
     """
-    model = str(message.distortion_model)
-    if model not in ("plumb_bob", "rational_polynomial", ""):
-        raise DeviceError(f"lens model {model!r} is not supported; plumb_bob is")
+    name = str(message.distortion_model)
+    if name not in LENS_MODELS:
+        known = " and ".join(name for name in LENS_MODELS if name)
+        raise DeviceError(f"lens model {name!r} is not supported; {known} are")
+    model = LENS_MODELS[name]
     # ROS 1 writes these in capitals.
     k, d, p = (
         np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float) for name in "kdp"
     )
     if rectified:
-        k, d = np.delete(p, [3, 7, 11]), d[:0]
+        k, d, model = np.delete(p, [3, 7, 11]), d[:0], LensModel.RADIAL_TANGENTIAL
     if len(d) > 5 and np.any(d[5:]):
         raise DeviceError(f"a lens of {len(d)} coefficients is not supported")
-    lens = [*d.tolist(), 0.0, 0.0, 0.0, 0.0, 0.0]
+    count = 4 if model is LensModel.EQUIDISTANT else 5
     try:
         camera = Camera(int(message.width), int(message.height), k[0], k[4], k[2], k[5], 0.0)
     except (InvalidValue, IndexError) as error:
         raise DeviceError(str(error)) from None
-    return camera, (lens[0], lens[1], lens[2], lens[3], lens[4])
+    return camera, model, tuple([*d.tolist(), *[0.0] * count][:count])
 
 
 class FixedTransforms:

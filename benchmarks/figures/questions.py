@@ -317,7 +317,18 @@ RULES = (
         "merge/outlier_rejection/independent_support.py",
         (_fleets("chance support"),),
     ),
-    Rule("dominance", "merge/outlier_rejection/pairwise_consistency.py", (_fleets("dominance"),)),
+    Rule(
+        "dominance",
+        "merge/outlier_rejection/pairwise_consistency.py",
+        (
+            (
+                "pairs of robots with as many links to a similar place, joined falsely: "
+                "{twins/dominance/joined_falsely} instead of {twins/all rules/joined_falsely} of "
+                "{twins/dominance/fleets}",
+                "rules_twins",
+            ),
+        ),
+    ),
     Rule(
         "refused links heard again",
         "merge/outlier_rejection/agglomerative_joining.py",

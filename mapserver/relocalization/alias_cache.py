@@ -20,7 +20,7 @@ from mapweave.mapserver.relocalization.aliased_landmarks import (
 )
 from mapweave.mapserver.relocalization.candidates import Retrieval
 from mapweave.registration.matching import match
-from mapweave.registration.recognition import Recognition, RecognitionSettings
+from mapweave.registration.recognition import RecognitionSettings
 
 Between = Callable[[NodeId, NodeId], Pose2 | None]
 """Pose `a_from_b` of two nodes on the merged map; None if that does not join them."""
@@ -70,10 +70,6 @@ class AliasCache:
             candidates,
         )
         self._entries: dict[NodeId, _Entry] = {}
-
-    def compare(self, a: Node, b: Node) -> Recognition | None:
-        """See Doubles.compare."""
-        return self._doubles.compare(a, b)
 
     def forget(self) -> None:
         """Drop all results: nodes that were hidden at the search are active again."""

@@ -88,10 +88,9 @@ def _rivalry(rivals: Sequence[PlaceHypothesis], merged: MergedMap) -> str:
     names = " or ".join(str(place.best.node) for place in rivals)
     most, least = len(rivals[0].features), len(rivals[-1].features)
     words = f"it may be {names}: they explain {most} to {least} features"
-    if any(place.is_double for place in rivals):
-        words += ", and look the same on the map"
-    if any(place.nodes_around for place in rivals):
-        words += f", and so do {max(place.nodes_around for place in rivals)} nodes around them"
+    around = max(place.nodes_around for place in rivals)
+    if around:
+        words += f", and {around} nodes around them look the same"
     if any(between(merged, rivals[0].best.node, place.best.node) is None for place in rivals):
         words += ", and nothing joins their parts of the map yet"
     return words

@@ -30,7 +30,7 @@ from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.registration.evidence import cells
 from mapweave.registration.matching import match
 from mapweave.storage.image_file import read_grey
-from mapweave.vision.lens import Lens
+from mapweave.vision.lens import Distortion, Lens
 from mapweave.vision.sift import Sift
 
 
@@ -136,10 +136,10 @@ COMPARABLE = 0.6
 class AppearanceMap:
     """Places by their appearance alone."""
 
-    def __init__(self, camera: Camera, distortion: tuple[float, ...]):
+    def __init__(self, camera: Camera, distortion: Distortion):
         """Begin with none, for a camera and its lens."""
         self._camera = camera
-        self._sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
+        self._sift = Sift(Lens(camera, distortion))
         self._index = PlaceIndex()
         self._nodes: dict[int, Node] = {}
 

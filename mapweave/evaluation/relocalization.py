@@ -23,6 +23,7 @@ from mapweave.evaluation.verdict import Verdict, figures
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.image_file import read_grey
+from mapweave.vision.lens import NO_DISTORTION, Distortion
 
 STAND_IN_HEIGHT = 0.8
 """Of a camera of which only the focal length is known, m: bearings do not depend on it."""
@@ -126,9 +127,7 @@ def _examine_photographs(
     return RelocalizationEvaluation(about, {"looks": verdicts})
 
 
-def _camera_of(
-    folder: Path, camera_file: Path | None, focal_px: float | None
-) -> tuple[Camera, tuple[float, ...]]:
+def _camera_of(folder: Path, camera_file: Path | None, focal_px: float | None) -> tuple[Camera, Distortion]:
     if camera_file is not None and focal_px is not None:
         raise DeviceError("give --camera or --focal, not both")
     if focal_px is None:
@@ -136,4 +135,4 @@ def _camera_of(
     first: Sequence[Path] = images_of(folder)[:1]
     height, width = read_grey(first[0]).shape
     middle = 0.5 * (width - 1), 0.5 * (height - 1)
-    return Camera(width, height, focal_px, focal_px, *middle, STAND_IN_HEIGHT), (0.0,) * 5
+    return Camera(width, height, focal_px, focal_px, *middle, STAND_IN_HEIGHT), NO_DISTORTION

@@ -135,8 +135,8 @@ def test_figures_count_failures_as_such(mapped: Mapped) -> None:
     assert figures["collisions"] == 2 and figures["path_over_shortest"] == pytest.approx(1.3)
     assert (figures["edges_driven"], figures["nodes_skipped"]) == (9, 2)
     assert (figures["relocalizations"], figures["blocks"]) == (5, 3)
-    nobody = summary(outcomes[2:])
-    assert nobody["success"] == 0.0 and nobody["goal_error_m_median"] is None
+    failed = summary(outcomes[2:])
+    assert failed["success"] == 0.0 and failed["goal_error_m_median"] is None
 
 
 def test_a_drive_fails_for_each_reason(mapped: Mapped) -> None:

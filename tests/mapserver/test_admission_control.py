@@ -98,7 +98,7 @@ def test_a_refused_crowd_comes_back_in_sequence() -> None:
     for k, pause in enumerate(pauses):
         waiting = open_ones + k - pause / step - workers
         assert waiting * step + seconds <= settings.in_time
-    assert pauses[-1] < 50 * step + 0.1, "and nobody waits for nothing"
+    assert pauses[-1] < 50 * step + 0.1, "and no client waits for nothing"
     counter.end()
 
 

@@ -37,7 +37,7 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
     assert worker.settled
     worker.start()
     constraints = ManualConstraints([ManualConstraint((MapId("a", 1), MapId("b", 1)), True, "anna", 0)])
-    worker.rule(constraints)
+    worker.constrain(constraints)
     assert entered.wait(20)
     assert not worker.settled
     go.set()
@@ -45,7 +45,7 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
     while not worker.settled:
         assert time.monotonic() < end
         time.sleep(0.001)
-    assert worker.answers.merged.rulings is constraints
+    assert worker.answers.merged.constraints is constraints
     worker.close()
 
 
@@ -112,7 +112,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(Merger, "merged", held)
     worker = MergeWorker(LiveSchedule(), 1.0)
     worker.start()
-    worker.rule(ManualConstraints())
+    worker.constrain(ManualConstraints())
     assert entered.wait(20)
     assert worker.answers.relocalizer.answer(view).certainty is Certainty.UNKNOWN
     for change in changes:

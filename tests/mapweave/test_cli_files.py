@@ -106,12 +106,12 @@ def test_an_image_of_a_recording_that_is_broken(tmp_path, capfd, recording):
     assert (tmp_path / "data" / "walk.1.mapweave").exists(), "what was mapped before is kept"
 
 
-def test_places_that_cannot_be_written(tmp_path, capfd, recording, nobody):
+def test_places_that_cannot_be_written(tmp_path, capfd, recording, closed):
     taken = tmp_path / "taken"
     taken.write_text("a file where a folder should be")
     for folder, words in ((taken, "is a file; give a folder"), (taken / "in" / "it", "is a file")):
         assert words in complaint(capfd, "replay", recording, "--offline", "--data", folder)
-        assert words in complaint(capfd, "server", "--listen", nobody, "--data", folder)
+        assert words in complaint(capfd, "server", "--listen", closed, "--data", folder)
         assert words in complaint(capfd, "demo", "--out", folder)
         for command in (
             ["sim", "batch", "office"],
@@ -137,7 +137,7 @@ def one_node():
     return (NodePut(Node(NodeId("r0", 1, 1), 0, here, camera, Landmarks.empty())),)
 
 
-def test_a_recording_without_a_server_is_mapped_all_the_same(recording, tmp_path, capfd, nobody):
+def test_a_recording_without_a_server_is_mapped_all_the_same(recording, tmp_path, capfd, closed):
     data = tmp_path / "data"
     arguments = ["replay", recording, "--data", data, "--name", "r0", "--epoch", 1, "--offline"]
     assert main([str(a) for a in arguments]) == 0

@@ -80,7 +80,7 @@ def network(tmp_path: Path) -> Iterator[tuple[Children, ZenohBus, str]]:
 
 
 @pytest.mark.timeout(600)
-def test_agents_that_are_killed_begun_afresh_and_robbed_of_their_disk_lose_no_map(
+def test_agents_that_are_killed_begun_again_and_robbed_of_their_disk_lose_no_map(
     network: tuple[Children, ZenohBus, str], tmp_path: Path
 ) -> None:
     children, bus, endpoint = network
@@ -217,8 +217,8 @@ def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, 
     assert (tmp_path / "out" / "r0.2.mapweave").exists()
 
 
-def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, nobody, simulator):
-    output = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", tmp_path, "--resume", "r0.3")
+def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, closed, simulator):
+    output = complaint(capfd, "agent", "r0", "--connect", closed, "--data", tmp_path, "--resume", "r0.3")
     assert "there is no journal of r0" in output
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 

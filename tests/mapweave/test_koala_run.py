@@ -123,7 +123,7 @@ def test_a_koala_maps_is_carried_off_and_parks(
                 assert len(nodes) >= least_nodes
                 assert score.ate < 0.15
 
-                # It is carried off and turned around, and not told.
+                # It is carried off and turned around without odometry.
                 goal = next(n.id for n in nodes.values() if len(n.landmarks) >= 30)
                 with koala.world:
                     simulation.kidnap("r0", truth[goal] @ Pose2(-0.1, 0.15, 2.0))

@@ -52,7 +52,7 @@ def walls() -> PhotoWalls:
 
 @dataclass
 class Placed:
-    """Stands for what the server says of the nodes."""
+    """Is what the server says of the nodes."""
 
     poses: dict[NodeId, MergedPose] = field(default_factory=dict)
 
@@ -253,10 +253,8 @@ image = "/camera/image_raw"
 radius = 0.15
 axle = 0.25
 """)
-    settings, arguments = (
-        load_settings(path),
-        argparse.Namespace(robot=None, ros2="", lockstep=False, body=None),
-    )
+    settings = load_settings(path)
+    arguments = argparse.Namespace(robot=None, ros2="", lockstep=False, body=None)
     link = ros2_link(arguments, settings.robot)
     assert ros2_link(argparse.Namespace(robot="koala", ros2="tcp/a:1"), settings.robot).endpoint == "tcp/a:1"
     bus, stop = ZenohBus(BusSettings(endpoints=("tcp/127.0.0.1:9",))), threading.Event()

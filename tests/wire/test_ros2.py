@@ -133,7 +133,7 @@ def test_both_sides_see_and_hear_each_other(ros: RosPeer, node: Ros2Node) -> Non
 
 def test_late_subscribers_get_the_last_message(router: ZenohFleet, ros: RosPeer, node: Ros2Node) -> None:
     said = node.publisher("/chatter", STRING, latched=True)
-    # Nobody is there yet, perhaps not even a session.
+    # No subscriber is there yet, perhaps not even a session.
     said.publish(make(STRING, data="first"))
     said.publish(make(STRING, data="last"))
     eventually(lambda: any("%chatter" in token for token in ros.tokens()))

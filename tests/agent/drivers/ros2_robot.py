@@ -40,7 +40,7 @@ TOPICS = {
 
 
 class Ros2Robot:
-    """Publishes, and drives as it is told, for ever: while it is in reach it has no time-out of its own.
+    """Publishes, and drives as commands say, for ever: while it is in reach it has no time-out of its own.
 
     Attributes:
         wheels: what drives.

@@ -18,6 +18,7 @@ from mapweave.agent.drivers.ros2 import Ros2
 from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
 from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.errors import DeviceError, SettingsError
+from mapweave.vision.equidistant import Equidistant
 from tests.agent.drivers.contract import HEIGHT, WIDTH, RobotContract, drive, until
 from tests.agent.drivers.ros2_robot import Ros2Robot
 
@@ -95,6 +96,13 @@ def test_the_camera_is_what_the_robot_says(start: Start) -> None:
     assert camera.mount_height == pytest.approx(0.26)
 
 
+def test_a_fisheye_lens_is_taken_from_camera_info(start: Start) -> None:
+    emulator = Ros2Robot(lens={"model": "equidistant", "lens": (0.01, -0.002, 0.0, 0.0)})
+    lens = start(emulator).describe().distortion
+    assert isinstance(lens, Equidistant)
+    assert (lens.fx, lens.k) == (60.0, (0.01, -0.002, 0.0, 0.0))
+
+
 @pytest.mark.parametrize(
     ("odometry", "more"),
     [("joint_states", {"wheel_radius": 0.033}), ("wheel_ticks", {})],
@@ -155,7 +163,7 @@ def test_range_and_infrared_sensors(start: Start) -> None:
     until(lambda: not len(last(robot, 1).proximity), 5.0)
 
 
-def test_touch_and_being_lifted_are_told(start: Start) -> None:
+def test_touch_and_being_lifted_are_reported(start: Start) -> None:
     emulator = Ros2Robot()
     robot = start(emulator)
     assert not last(robot).bumped
@@ -195,7 +203,7 @@ def test_another_clock_is_translated(start: Start) -> None:
         ),
         ({"pose": [math.nan, 0.0, 0.0]}, {}, "/odom: odometry is not finite"),
         ({"lens": {"width": 128}}, {}, "images of 64x48 px, but /camera/camera_info is for 128x48"),
-        ({"lens": {"model": "equidistant"}}, {}, "/camera/camera_info: lens model 'equidistant'"),
+        ({"lens": {"model": "thin_prism"}}, {}, "/camera/camera_info: lens model 'thin_prism'"),
         ({"lens": {"focal": 0.0}}, {}, "focal lengths must be positive; calibrate it"),
         ({"encoding": "bayer_rggb8"}, {}, "/camera/image_raw: images of encoding 'bayer_rggb8'"),
     ],
@@ -236,7 +244,7 @@ def test_without_a_router_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> N
         robot.close()
 
 
-def test_that_nobody_listens_is_said_once(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+def test_that_no_node_listens_is_said_once(start: Start, caplog: pytest.LogCaptureFixture) -> None:
     emulator = Ros2Robot()
     robot = start(emulator, command="drive")
     with caplog.at_level(logging.WARNING):

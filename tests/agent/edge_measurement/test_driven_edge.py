@@ -53,7 +53,7 @@ def test_drives_both_ways_make_one_edge_with_counts():
     edge = book.note(there, back, there)
     assert (edge.a, edge.b, edge.kind) == (A, B, EdgeKind.DRIVEN)
     assert edge.evidence == {"there": 2.0, "back": 1.0, "inliers": 12.0}
-    assert list(book.map.edges) == [NodeId(*MAP, 100)], "one id, and none drawn in vain"
+    assert list(book.map.edges) == [NodeId(*MAP, 100)], "one id, and none drawn for nothing"
     assert edge.a_from_b.mean.vector == pytest.approx(TRUE.vector, abs=1e-9)
 
 

@@ -118,8 +118,8 @@ def test_endless_parking_is_retried_before_it_is_a_block(home):
 
     trial = Trial(nav, eyes, fleet, held=True)
     trial.run(20.0, lambda: len(routes) == 3)
-    assert [question.blocked for question in routes] == [(), (), ((A, B),)], "nobody is told at first"
-    assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself anew"
+    assert [question.blocked for question in routes] == [(), (), ((A, B),)], "no robot is informed at first"
+    assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself rebuilt"
 
 
 def test_blocks_are_kept_for_a_time_that_doubles():

@@ -24,6 +24,8 @@ from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
+from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import Distortion
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -165,13 +167,13 @@ def test_a_bag_cut_off_in_the_middle_is_refused_or_used_up_to_there(drive: Drive
 class Driven:
     """A robot that senses a drive."""
 
-    def __init__(self, drive: Drive) -> None:
-        self._drive, self._at, self.closed = drive, 0, False
+    def __init__(self, drive: Drive, lens: Distortion = (-0.1, 0.02, 0.001, 0.0, 0.0)) -> None:
+        self._drive, self._lens, self._at, self.closed = drive, lens, 0, False
 
     def describe(self) -> RobotDescription:
         return RobotDescription(
             camera=self._drive.camera,
-            distortion=(-0.1, 0.02, 0.001, 0.0, 0.0),
+            distortion=self._lens,
             ranger_bearings=(0.0, 0.5),
             ranger_reach=2.0,
         )
@@ -192,8 +194,8 @@ class Driven:
         self.closed = True
 
 
-def record(drive: Drive, folder: Path, lossless: bool = True) -> Driven:
-    robot = Driven(drive)
+def record(drive: Drive, folder: Path, lossless: bool = True, *lens: Distortion) -> Driven:
+    robot = Driven(drive, *lens)
     recorded = RecordedRobot(robot, folder, lossless)
     recorded.describe()
     while recorded.sense() is not None:
@@ -215,6 +217,21 @@ def test_what_a_robot_recorded_is_replayed_as_it_sensed_it(drive: Drive, tmp_pat
         assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx(
             tuple(increment), abs=1e-9
         )
+
+
+def test_a_fisheyes_recording_names_its_lens_as_ros_does(drive: Drive, tmp_path: Path) -> None:
+    fisheye = Equidistant(115.0, 115.5, 158.7, 120.9, (-0.02, 0.004, -0.003, 0.0005))
+    ideal = fisheye.ideal(320, 240, drive.camera.mount_height)
+    record(replace(drive, camera=ideal), tmp_path / "walk", True, fisheye)
+    with AnyReader([tmp_path / "walk" / "walk_0"]) as reader:
+        (topic,) = (c for c in reader.connections if c.topic.endswith("camera_info"))
+        _, _, data = next(reader.messages([topic]))
+        message: Any = reader.deserialize(data, topic.msgtype)
+    assert message.distortion_model == "equidistant"
+    assert message.k.tolist() == [115.0, 0, 158.7, 0, 115.5, 120.9, 0, 0, 1]
+    assert tuple(message.d) == fisheye.k
+    described = Replay(tmp_path / "walk").describe()
+    assert (described.camera, described.distortion) == (ideal, fisheye)
 
 
 def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> None:

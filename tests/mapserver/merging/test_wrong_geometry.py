@@ -52,9 +52,9 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     gone = [
         ManualConstraint((item, item), True, "anna", 1, "moved") for item in (MapId("r0", 1), MapId("r1", 1))
     ]
-    merger.rule(ManualConstraints(gone))
+    merger.constrain(ManualConstraints(gone))
     assert not merger.merged().wrong
-    merger.rule(ManualConstraints())
+    merger.constrain(ManualConstraints())
     assert merger.merged().wrong.keys() == {ODD}
 
 

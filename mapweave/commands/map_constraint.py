@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.manual_constraint import Ends, ManualConstraint
 
 
-def add_ruling(parser: argparse.ArgumentParser) -> None:
+def add_constraint_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of every manual constraint."""
     parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
     parser.add_argument("--by", metavar="NAME", help="your name (default: the login name)")
@@ -25,7 +25,7 @@ def add_ruling(parser: argparse.ArgumentParser) -> None:
     add_network(parser)
 
 
-def rule(arguments: argparse.Namespace, ends: Ends) -> None:
+def constrain(arguments: argparse.Namespace, ends: Ends) -> None:
     """Set the constraint, and print its effect; afterwards `arguments.map` is the file that holds it.
 
     Raises:
@@ -59,7 +59,7 @@ def _send_to_server(arguments: argparse.Namespace, constraint: ManualConstraint)
     from mapweave.wire.log_messages import decode_record
     from mapweave.wire.messages import encode
 
-    for reply in ask(arguments, Keys.any_rule, encode(constraint)):
+    for reply in ask(arguments, Keys.any_constrain, encode(constraint)):
         print(decode_record(reply.payload)["said"])
     _settled(arguments)
 
@@ -95,9 +95,9 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     settings = settings_of(arguments).merge
     content = read_map_file(arguments.map, "merged")
     before = merged_of(content, settings)
-    check_manual_constraint(before, ManualConstraints(content.rulings), constraint)
+    check_manual_constraint(before, ManualConstraints(content.constraints), constraint)
     parts = parts_of({arguments.map: content})
-    merged = merged_with_progress(parts.maps, parts.rulings + ManualConstraints([constraint]), settings)
+    merged = merged_with_progress(parts.maps, parts.constraints + ManualConstraints([constraint]), settings)
     out = arguments.out or arguments.map
     history = (*parts.history, *between(before, merged, constraint.stamp_ns))
     write_map_file(out, map_file_of(merged, history))
