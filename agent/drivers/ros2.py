@@ -144,7 +144,7 @@ class Ros2Base:
         """Publish speeds."""
         assert self._guard is not None
         stops = self._stops()
-        if stops.keys() != self._guard.stop.keys():
+        if stops != self._guard.stop:
             # There is a subscriber of another type.
             self._guard.close()
             self._guard = Ros2Guard(self._options.endpoint, stops)
