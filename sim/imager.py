@@ -58,7 +58,6 @@ class Imager:
         self._falloff = _falloff(camera, setup.exposure.vignetting) if setup.exposure.vignetting else None
         self._log_gain = 0.0
         self._mean: float | None = None
-        self._image_tick = 0
 
     @property
     def gain(self) -> float:

@@ -190,10 +190,6 @@ class Keys:
         """Under which a server is alive."""
         return self._of_server("alive", server)
 
-    def servers_alive(self) -> str:
-        """Pattern: every server."""
-        return f"{self.root}/server/*/alive"
-
     # Keys of a robot base.
 
     def robot_describe(self, robot: str) -> str:
@@ -252,14 +248,6 @@ class Keys:
         """Which server, to which agent."""
         server, agent = self._parse_names("server/*/poses/*", key)
         return server, agent
-
-    def parse_server_alive(self, key: str) -> str:
-        """Which server."""
-        return self._parse_names("server/*/alive", key)[0]
-
-    def parse_server_status(self, key: str) -> str:
-        """Which server."""
-        return self._parse_names("server/*/status", key)[0]
 
     def _of_map(self, what: str, map_id: MapId) -> str:
         return f"{self.root}/agent/{check_name(map_id.agent)}/{what}/{check_epoch(map_id.epoch)}"

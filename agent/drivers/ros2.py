@@ -26,7 +26,7 @@ from mapweave.agent.ros_messages.values import BASE, CAMERA_TYPE, IMAGE_TYPES, c
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, SettingsError
 from mapweave.storage.settings_file import build
 from mapweave.wire.ros2.messages import encode, make
-from mapweave.wire.ros2.node import Ros2Node
+from mapweave.wire.ros2.node import Publisher, Ros2Node
 from mapweave.wire.ros2.settings import Ros2Link
 
 log = logging.getLogger(__name__)
@@ -113,6 +113,7 @@ class Ros2Base:
         self._hazards = Topic(node, "hazard_detection", (HAZARDS_TYPE,), clock)
         topic = node.link.topic(options.command)
         self._twist, self._stamped = (node.publisher(topic, kind) for kind in (TWIST_TYPE, STAMPED_TYPE))
+        self._subscribed: list[Publisher] = []
         self._guard: Ros2Guard | None = None
         self._unheard = False
 
@@ -159,11 +160,12 @@ class Ros2Base:
     def publish(self, command: Command) -> None:
         """Publish a command in the type or types of its subscribers."""
         twist = making.twist(make, command)
-        if not self._only_stamped():
-            self._twist.publish(twist)
-        if self._stamped.subscribers and (self._only_stamped() or not self._options.bridge):
-            head = making.header(make, self._clock.remote(now_ns()), BASE)
-            self._stamped.publish(make(STAMPED_TYPE, header=head, twist=twist))
+        for publisher in self._publishers():
+            if publisher is self._twist:
+                publisher.publish(twist)
+            else:
+                head = making.header(make, self._clock.remote(now_ns()), BASE)
+                publisher.publish(make(STAMPED_TYPE, header=head, twist=twist))
 
     def read(self) -> BaseReading:
         """The newest of each topic.
@@ -272,19 +274,27 @@ class Ros2Base:
             readings.append(ranger.distances(received.message, chosen))
         return np.minimum(np.concatenate(readings), reach) if readings else np.zeros(0)
 
-    def _only_stamped(self) -> bool:
-        """Whether all who subscribe to commands want them with a time."""
-        return bool(self._stamped.subscribers) and not self._twist.subscribers
+    def _publishers(self) -> list[Publisher]:
+        """Those of the types that are subscribed to, or were before all subscribers vanished.
+
+        A key of the bridge does not tell the type: there, only one type may be published, and none before a
+        subscriber is announced.
+        """
+        wanted = [one for one in (self._twist, self._stamped) if one.subscribers]
+        if wanted:
+            self._subscribed = wanted[:1] if self._options.bridge else wanted
+        return self._subscribed
 
     def _stops(self) -> dict[str, bytes]:
         """What stops the wheels, on each key."""
         zero = making.twist(make, Command())
         # ros2_control takes a time of zero for the time of arrival.
         stamped = make(STAMPED_TYPE, header=making.header(make, 0, BASE), twist=zero)
-        stops = dict.fromkeys(self._stamped.keys, encode(stamped))
-        if not (self._options.bridge and self._only_stamped()):
-            stops |= dict.fromkeys(self._twist.keys, encode(zero))
-        return stops
+        return {
+            key: encode(zero if publisher is self._twist else stamped)
+            for publisher in self._publishers()
+            for key in publisher.keys
+        }
 
 
 class Ros2(WheeledRobot):

@@ -11,19 +11,6 @@ from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.registration.recognition import Recognition, recognise
 
-
-def recognise_place(
-    hybrid_map: HybridMap,
-    view: View,
-    rng: np.random.Generator,
-) -> tuple[Node, Recognition] | None:
-    """The node of a robot's own map that a view shows best, and how it was recognised; or None.
-
-    See `recall_all`.
-    """
-    return next(iter(recognise_places(hybrid_map, view, rng)), None)
-
-
 TRIES = 5
 """Nodes that are verified, by descending votes."""
 VOTES = 6

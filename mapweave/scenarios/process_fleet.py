@@ -35,7 +35,6 @@ class ProcessFleet:
         self._fleet_port, self._simulator_port = free_port(), free_port()
         self._children = Children(stage.out / "logs")
         self._cables: dict[str, NetworkEmulator] = {}
-        self._started = False
         self.bus = _client(self._fleet_port)
         self._sim_bus = _client(self._simulator_port)
         self.control = SimControl(self._sim_bus, FLEET, timeout=60.0)

@@ -73,7 +73,7 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path:
             started.append(
                 Started(
                     tmp_path, name, "agent", "r0", "--robot", f"{driver}:Still", "--connect", endpoint,
-                    "--settings", settings(tmp_path, name), "--data", tmp_path / name,
+                    "--settings", settings(tmp_path, name), "--data", tmp_path / name, "--epoch", "1",
                 )
             )  # fmt: skip
             return started[-1]
@@ -111,7 +111,7 @@ def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: P
     driver.write_text(DRIVER.replace("{stamp}", stamp))
     agent = Started(
         tmp_path, "agent", "agent", "r0", "--robot", f"{driver}:Still", "--connect", closed,
-        "--settings", settings(tmp_path, "agent"), "--data", tmp_path / "data",
+        "--settings", settings(tmp_path, "agent"), "--data", tmp_path / "data", "--epoch", "1",
     )  # fmt: skip
     assert agent.process.wait(60) == 1
     *_, last = agent.said.read_text().splitlines()

@@ -13,8 +13,8 @@ from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.mapserver.retrieval.inverted_file import InvertedFile
 from mapweave.mapserver.retrieval.landmark_index import MOST_WITHIN, LandmarkIndexSettings
 from mapweave.mapserver.retrieval.place_index import SLOT_BITS, PlaceIndex, PlaceIndexSettings
-from mapweave.merge.pose_graph.candidates import overlaps
 from synthetic.world import CAMERA, World, random_vectors, room, take_map, take_view
+from tests.merge.pose_graph.all_pairs import overlaps
 
 
 @pytest.fixture(scope="module")
