@@ -239,9 +239,9 @@ def compressed(stamp_ns: int, form: str, data: bytes) -> Cdr:
 
 def camera_info(
     stamp_ns: int, width: int, height: int, focal: float, lens: tuple[float, ...] = (0.0,) * 5,
-    model: str = "plumb_bob",
+    model: str = "plumb_bob", centre: tuple[float, float] | None = None,
 ) -> Cdr:  # fmt: skip
-    cx, cy = width / 2, height / 2
+    cx, cy = centre or (width / 2, height / 2)
     out = Cdr().header(stamp_ns, "camera_optical_frame").put("I", height, width).text(model).many("d", lens)
     out.put("d", focal, 0, cx, 0, focal, cy, 0, 0, 1).put("d", 1, 0, 0, 0, 1, 0, 0, 0, 1)
     out.put("d", focal, 0, cx, 0, 0, focal, cy, 0, 0, 0, 1, 0)

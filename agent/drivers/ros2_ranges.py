@@ -93,8 +93,7 @@ class Ranger:
         else:
             count = max(round(span / SECTOR), 1)
             middles = float(angles.min()) + span * (np.arange(count) + 0.5) / count
-        wrapped = (middles + math.pi) % math.tau - math.pi
-        return tuple(float(bearing) for bearing in wrapped)
+        return tuple(float(bearing) for bearing in wrapped(middles))
 
     def _angles(self, message: Any) -> Array:
         """(N,) rad, of the rays in the robot."""
@@ -115,9 +114,17 @@ class Ranger:
         free = np.hypot(x, y) - self._radius
         outside = free > -BODY
         free, towards = np.maximum(free[outside], 0.0), np.arctan2(y, x)[outside]
-        aside = np.abs((towards - bearings[:, None] + math.pi) % math.tau - math.pi)
-        near = np.where(aside <= SECTOR / 2 + BORDER, free, self.reach)
+        # Bearings that are nearer to each other than sectors each have the rays about them, at least one.
+        between = float(np.min(np.abs(wrapped(np.diff(bearings))), initial=SECTOR))
+        width = max(between, abs(float(message.angle_increment)))
+        aside = np.abs(wrapped(towards - bearings[:, None]))
+        near = np.where(aside <= width / 2 + BORDER, free, self.reach)
         return np.asarray(near.min(axis=1, initial=self.reach), np.float64)
+
+
+def wrapped(angles: Array) -> Array:
+    """The same angles within half a turn, rad."""
+    return np.asarray((angles + math.pi) % math.tau - math.pi)
 
 
 def _infrared(values: dict[str, float], name: str) -> float:

@@ -15,10 +15,13 @@ import pytest
 
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.drivers.ros2 import Ros2
+from mapweave.agent.drivers.ros2_ranges import Ranger
 from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
 from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.errors import DeviceError, SettingsError
 from mapweave.vision.equidistant import Equidistant
+from mapweave.wire.ros2.messages import decode
+from tests import ros2_peer as peer
 from tests.agent.drivers.contract import HEIGHT, WIDTH, RobotContract, drive, until
 from tests.agent.drivers.ros2_robot import Ros2Robot
 
@@ -141,6 +144,20 @@ def test_a_scan_is_free_room_from_the_robots_edge(start: Start) -> None:
     assert seen[-97.5] == pytest.approx(math.hypot(x, y) - 0.15, abs=1e-6)
     # What is nearer than the scanner can see, or part of the robot, is nothing.
     assert sorted(seen.values())[3] == 3.5
+
+
+def test_bearings_near_to_each_other_have_rays_of_their_own() -> None:
+    ranges = [2.0] * 360
+    ranges[10] = 0.5
+    data = peer.scan(0, "laser", 0.0, math.radians(1.0), 0.1, 3.5, ranges).bytes()
+    message = decode("sensor_msgs/msg/LaserScan", data)
+    ranger = Ranger("sensor_msgs/msg/LaserScan", message, None, 0.15)
+    bearings = np.radians(np.arange(-175.0, 181.0, 5.0))
+    near = ranger.distances(message, bearings) < 1.0
+    assert np.degrees(bearings[near]).round() == pytest.approx([10.0])
+    # Rays that are farther apart than bearings leave no bearing without one.
+    few = decode("sensor_msgs/msg/LaserScan", peer.scan(0, "laser", 0.0, 0.2, 0.1, 3.5, [0.5] * 31).bytes())
+    assert (ranger.distances(few, np.radians(np.arange(0.0, 340.0, 5.0))) < 1.0).all()
 
 
 def test_range_and_infrared_sensors(start: Start) -> None:
