@@ -37,6 +37,7 @@ class Recording:
         read: gives an image by its number, (H, W) grey of the camera's size. Raises DeviceError.
         increments: (N, 2) way of the middle of the axle, m, and turn, rad, since the image before.
         notes: what was guessed or left out, a line each.
+        damage: what cannot be read of it, a line each; what comes before is used.
     """
 
     path: Path
@@ -47,6 +48,7 @@ class Recording:
     read: Callable[[int], NDArray[np.uint8]]
     increments: Array
     notes: tuple[str, ...] = ()
+    damage: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """How many images there are."""
@@ -73,10 +75,25 @@ class StampedPoses:
     Attributes:
         stamps_ns: (M,) ascending, by the images' clock.
         poses: (M, 3) x m, y m, heading rad, in a frame that drifts.
+        damage: what follows and cannot be read, in one line; empty if nothing does.
     """
 
     stamps_ns: Stamps
     poses: Array
+    damage: str = ""
+
+
+class NoOdometry(DeviceError):
+    """A recording has all but odometry.
+
+    Attributes:
+        recording: the rest; its increments are zero.
+    """
+
+    def __init__(self, message: str, recording: Recording) -> None:
+        """Take the line for people, and what there is."""
+        super().__init__(message)
+        self.recording = recording
 
 
 def increments_between(odometry: StampedPoses, stamps_ns: Stamps) -> tuple[NDArray[np.bool_], Array]:
@@ -126,6 +143,7 @@ def assembled(
     images: Images,
     odometry: StampedPoses | Array,
     notes: tuple[str, ...] = (),
+    damage: tuple[str, ...] = (),
 ) -> Recording:
     """Put images and odometry together; large images are reduced.
 
@@ -137,6 +155,7 @@ def assembled(
         images: all of them.
         odometry: poses with stamps, or (N, 2) increments since the image before.
         notes: for people.
+        damage: likewise, of what cannot be read.
 
     Raises:
         DeviceError: they do not fit together.
@@ -151,6 +170,7 @@ def assembled(
             inside, increments = increments_between(odometry, stamps)
         except DeviceError as error:
             raise DeviceError(f"{path}: {error}") from None
+        damage = (*damage, odometry.damage) if odometry.damage else damage
         if not inside.all():
             notes = (*notes, f"{int((~inside).sum())} of {len(stamps)} images have no odometry: left out")
         numbers = np.flatnonzero(inside)
@@ -177,7 +197,24 @@ def assembled(
         _reader(path, read, camera, factor),
         increments,
         notes,
+        damage,
     )
+
+
+def without_odometry(
+    path: Path,
+    kind: str,
+    camera: Camera,
+    distortion: Distortion,
+    images: Images,
+    message: str,
+    notes: tuple[str, ...] = (),
+    damage: tuple[str, ...] = (),
+) -> NoOdometry:
+    """The error of a recording that has no odometry, with the images. Arguments as of `assembled`."""
+    nothing = np.zeros((len(images.stamps_ns), 2))
+    recording = assembled(path, kind, camera, distortion, images, nothing, notes, damage)
+    return NoOdometry(f"{path}: {message}", recording)
 
 
 def reduced(camera: Camera, factor: int) -> Camera:

@@ -108,6 +108,8 @@ def run_replay(arguments: argparse.Namespace) -> int:
         evaluated = evaluate_replay(
             replay, settings_of(arguments).agent, truth, lambda frame: progress.advance(task)
         )
+    for line in replay.damage:
+        console.print(line, highlight=False)
     for written in evaluated.write(out):
         console.print(f"{written}", highlight=False)
     report = evaluated.report()
