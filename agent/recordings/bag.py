@@ -32,6 +32,7 @@ from mapweave.agent.ros_messages.values import (
     Mount,
     camera_of,
     pose_of,
+    stamp_of,
 )
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
