@@ -69,6 +69,7 @@ class Observation:
         proximity: (K,) m, free distance along each of the robot's rangers from the robot's edge; the
             ranger's maximum where nothing is in reach. Empty if the robot has none.
         bumped: whether the bumper is pressed.
+        battery: charge, as a share; None if the robot does not tell.
         kidnapped: whether the robot notices that it has been lifted. The wheels have not measured how it is
             moved; once this ends, it is at an unknown place.
     """
@@ -78,6 +79,7 @@ class Observation:
     image: NDArray[np.uint8] | None = None
     proximity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     bumped: bool = False
+    battery: float | None = None
     kidnapped: bool = False
 
 

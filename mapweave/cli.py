@@ -13,6 +13,7 @@ from mapweave.commands import (
     evaluate,
     info,
     map_file,
+    missions,
     record,
     relocalize,
     replay,
@@ -21,6 +22,7 @@ from mapweave.commands import (
     server,
     settings,
     sim,
+    status,
 )
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
@@ -60,8 +62,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, robots, map_file, record, replay, info, relocalize, evaluate,
-        settings,
+        demo, server, router, sim, agent, status, missions, robots, map_file, record, replay, info,
+        relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)
     return top

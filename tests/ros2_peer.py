@@ -284,6 +284,11 @@ def kidnap_status(stamp_ns: int, kidnapped: bool) -> Cdr:
     return Cdr().header(stamp_ns, "base_link").put("B", kidnapped)
 
 
+def battery_state(stamp_ns: int, percentage: float) -> Cdr:
+    out = Cdr().header(stamp_ns, "").put("f", 14.4, 25.0, -0.8, 1.0, 2.0, 2.6, percentage)
+    return out.put("B", 2, 1, 2, 1).many("f", []).many("f", []).text("").text("")
+
+
 def hazards(stamp_ns: int, kinds: list[int]) -> Cdr:
     out = Cdr().header(stamp_ns, "base_link").put("I", len(kinds))
     for kind in kinds:

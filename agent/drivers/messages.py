@@ -28,7 +28,7 @@ from mapweave.agent.observation import (
     RobotDescription,
 )
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.limits import MAX_NUMBER, Stamp
+from mapweave.hybridmap.limits import MAX_NUMBER, Share, Stamp
 from mapweave.storage.image_file import decode_grey, image_size
 from mapweave.wire import typed
 from mapweave.wire.packing import Limit, pack, unpack
@@ -89,6 +89,7 @@ class _Observation(msgspec.Struct):
     size: tuple[Side, Side] = msgspec.field(name="s", default=(1, 1))
     encoding: str = RAW
     image: bytes | None = msgspec.field(name="i", default=None)
+    battery: Share | None = None
 
 
 def encode_step(step: StepRequest) -> bytes:
@@ -118,6 +119,8 @@ def encode_observation(observation: Observation) -> bytes:
         "r": observation.proximity.tolist(),
         "b": observation.bumped,
     }
+    if observation.battery is not None:
+        fields["battery"] = observation.battery
     if observation.kidnapped:
         fields["k"] = True
     if observation.image is not None:
@@ -143,7 +146,8 @@ def decode_observation(data: bytes) -> Observation:
         )
     image = None if seen.image is None else _image(seen.encoding, seen.size, seen.image)
     odometry, proximity = Odometry(forward, turn), np.array(seen.proximity)
-    return Observation(seen.stamp_ns, odometry, image, proximity, seen.bumped, seen.kidnapped)
+    rest = seen.bumped, seen.battery, seen.kidnapped
+    return Observation(seen.stamp_ns, odometry, image, proximity, *rest)
 
 
 def check_image(observation: Observation, description: RobotDescription) -> None:

@@ -38,6 +38,7 @@ PATIENCE = 1.0
 """s that a first message of each topic is waited for, in each attempt to begin."""
 KIDNAP_TYPE = "irobot_create_msgs/msg/KidnapStatus"
 HAZARDS_TYPE = "irobot_create_msgs/msg/HazardDetectionVector"
+BATTERY_TYPE = "sensor_msgs/msg/BatteryState"
 BUMP, STALL = 1, 3
 """Types of HazardDetection that mean touch."""
 TWIST_TYPE, STAMPED_TYPE = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -110,6 +111,7 @@ class Ros2Base:
         self._ranges = [Topic(node, name, ros2_ranges.KINDS, clock) for name in options.ranges]
         self._rangers: list[Ranger] = []
         self._kidnap = Topic(node, "kidnap_status", (KIDNAP_TYPE,), clock)
+        self._battery = Topic(node, "battery_state", (BATTERY_TYPE,), clock)
         self._hazards = Topic(node, "hazard_detection", (HAZARDS_TYPE,), clock)
         topic = node.link.topic(options.command)
         self._twist, self._stamped = (node.publisher(topic, kind) for kind in (TWIST_TYPE, STAMPED_TYPE))
@@ -180,7 +182,12 @@ class Ros2Base:
         touches = () if hazards is None or self._hazards.silent else hazards.message.detections
         bumped = any(one.type in (BUMP, STALL) for one in touches)
         kidnapped = kidnap is not None and bool(kidnap.message.is_kidnapped)
-        return BaseReading(self._wheels.way, self._proximity(), bumped, kidnapped, stamp_ns)
+        battery = self._battery.newest()
+        charge = math.nan if battery is None else float(battery.message.percentage)
+        return BaseReading(
+            self._wheels.way, self._proximity(), bumped, charge if 0.0 <= charge <= 1.0 else None, kidnapped,
+            stamp_ns,
+        )  # fmt: skip
 
     def _take_odometry(self, end: float) -> int:
         """Add the newest odometry; returns its stamp."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.global_localization.view_agreement import ViewAgreement
-from mapweave.agent.localization.place_recognition import lookalikes, recognise_places
+from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.agent.mission import WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Command
@@ -84,7 +84,7 @@ class OwnMap:
         recalled = recognise_places(self.map, view, self._rng)
         if not recalled:
             return Candidates((), "", f"none of {len(self.map.nodes)} nodes is recognised")
-        alike = lookalikes(recalled, RIVAL, APART)
+        alike = aliased_places(recalled, RIVAL, APART)
         ambiguous = "" if alike is None else f"nodes {alike[0].id} and {alike[1].id} look the same"
         places = tuple(
             Candidate(

@@ -68,8 +68,8 @@ def options_of(arguments: argparse.Namespace) -> RecordingOptions:
 def run(arguments: argparse.Namespace) -> int:
     """Play the recording to its end."""
     from mapweave.agent.drivers.replay import Replay
-    from mapweave.agent.mission import Carried
     from mapweave.agent.recordings.recording import NoOdometry
+    from mapweave.hybridmap.mission_order import MissionKind
     from mapweave.processes.agent import AgentOptions, run_agent
 
     try:
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         data=arguments.data,
         epoch=arguments.epoch,
         fresh=True,  # a recording begins where it began, not where another has ended
-        mission=Carried(),
+        mission=MissionKind.CARRIED,
         server=network.server,
         total=len(robot),
         trajectories=True,

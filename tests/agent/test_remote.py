@@ -83,7 +83,7 @@ def test_an_observation_survives_exactly(
     image = None
     if shape is not None:
         image = np.frombuffer(random.randbytes(shape[0] * shape[1]), np.uint8).reshape(shape)
-    given_ = Observation(stamp, Odometry(*odometry), image, np.array(proximity), bumped, kidnapped)
+    given_ = Observation(stamp, Odometry(*odometry), image, np.array(proximity), bumped, kidnapped=kidnapped)
     assert same(decode_observation(encode_observation(given_)), given_)
 
 

@@ -44,6 +44,10 @@ CASES: list[tuple[str, str, str]] = [
     ("sim serve", "office --connect {closed}", SIM),
     ("server", "--listen {closed} --data {tmp}", SERVER),
     ("agent", "R0 --connect {closed}", "R0"),  # a name that cannot be: else it waits for its robot
+    ("status", "--connect nowhere", "endpoints look like"),
+    ("go", "R0 r0.1.1 --connect {closed}", "R0"),
+    ("explore", "R0 --connect {closed}", "R0"),
+    ("stop", "R0 --connect {closed}", "R0"),
     ("robots", "", "koala"),
     ("router", "--listen nowhere", "endpoints look like"),
     ("record", "R0 --out {tmp}/drive --connect {closed}", "R0"),
@@ -57,6 +61,7 @@ CASES: list[tuple[str, str, str]] = [
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said
     ("map show", "{own} --out {tmp}/own.png", VIZ),
+    ("map fetch", "{tmp}/none/map.mapweave --connect {closed}", "there is no folder"),
     ("map explain", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map explain", "r0.1.1 r1.1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map explain", "--map {merged}", SERVER),

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
-from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import AgentSettings
-from mapweave.agent.status_message import AgentStatus, decode_agent_status
 from mapweave.cli import main
+from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import Entry
@@ -30,6 +30,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import decode
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.mapweave.command_line import complaint
@@ -96,7 +97,7 @@ def test_agents_that_are_killed_begun_again_and_robbed_of_their_disk_lose_no_map
     def report() -> AgentStatus | None:
         children.check()
         replies = [r for r in bus.ask(KEYS.agent_status("r0"), b"", 2.0) if not r.error]
-        return decode_agent_status(replies[0].payload) if replies else None
+        return decode(replies[0].payload, AgentStatus) if replies else None
 
     def mapped(nodes: int) -> AgentStatus:
         """Wait until a map has so many nodes, all of them on the server's disk."""
@@ -274,7 +275,7 @@ def test_a_file_is_set_aside_before_a_damaged_journal_writes_over_it(tmp_path, r
 def test_a_robot_that_is_lifted_begins_a_new_map_and_keeps_the_old_one(tmp_path):
     said: list[str] = []
     walls, bus = PhotoWalls(), MemoryBus(MemoryHub())
-    options = AgentOptions("r0", tmp_path, epoch=1, mission=Carried(), patience=0.0)
+    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.0)
     agent = Agent(lambda: DESCRIPTION, bus, KEYS, AgentSettings(), options, print_line=said.append)
     before = Pose2(-1.0)
     for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):

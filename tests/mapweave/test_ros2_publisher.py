@@ -16,6 +16,7 @@ import pytest
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.mission import Carried
 from mapweave.commands.agent import open_robot, ros2_link
+from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes import ros2_publisher
@@ -269,7 +270,7 @@ axle = 0.25
     assert ros2_link(argparse.Namespace(robot="koala", ros2="tcp/a:1"), settings.robot).endpoint == "tcp/a:1"
     bus, stop = ZenohBus(BusSettings(endpoints=("tcp/127.0.0.1:9",))), threading.Event()
     robot, _ = open_robot(arguments, settings.robot, bus, "f", "r0")
-    options = AgentOptions("r0", tmp_path, mission=Carried(), patience=0.0, ros2=link)
+    options = AgentOptions("r0", tmp_path, mission=MissionKind.CARRIED, patience=0.0, ros2=link)
     run = (CheckedRobot(robot), bus, Keys("f"), settings.agent, options, stop)
     agent = threading.Thread(target=run_agent, args=run)
     agent.start()

@@ -219,6 +219,7 @@ class Create2(Emulator):
         self._data = b""
         self.mode = 0
         self.bumps = 0
+        self.charge = 2022
         self.wheels.set(0.0, 0.0)
 
     def lift(self) -> None:
@@ -261,6 +262,9 @@ class Create2(Emulator):
         left, right = (round(way / (3.141592653589793 * 72e-3) * 508.8) for way in self.wheels.way())
         return {
             7: bytes([self.bumps]),
+            # "Battery charge" and "Battery capacity": unsigned, 16 bit, mAh.
+            25: struct.pack(">H", self.charge),
+            26: struct.pack(">H", 2696),
             35: bytes([self.mode]),
             43: struct.pack(">H", left % 65536),
             44: struct.pack(">H", right % 65536),

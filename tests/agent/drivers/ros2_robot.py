@@ -31,6 +31,7 @@ KINDS = {
     "scan": "sensor_msgs/msg/LaserScan", "range": "sensor_msgs/msg/Range",
     "ir_intensity": "irobot_create_msgs/msg/IrIntensityVector",
     "hazard_detection": "irobot_create_msgs/msg/HazardDetectionVector",
+    "battery_state": "sensor_msgs/msg/BatteryState",
     "kidnap_status": "irobot_create_msgs/msg/KidnapStatus", "tf_static": "tf2_msgs/msg/TFMessage",
 }  # fmt: skip
 TOPICS = {
@@ -48,6 +49,7 @@ class Ros2Robot:
         walls: m, what each of the scanner's 90 rays measures.
         ranges: m, by the frame of each Range sensor.
         kidnapped: whether it is lifted.
+        battery: its charge, as a share.
         hazards: types of what it notices.
         axle: m.
         clock_ns: how far its clock is ahead of this computer's.
@@ -70,7 +72,7 @@ class Ros2Robot:
         self.walls = [math.inf] * 90
         self.ranges = {"front": 1.0}
         self.infrared: list[tuple[str, int]] = []
-        self.clock_ns = 0
+        self.clock_ns, self.battery = 0, math.nan
         self.silent = set(silent)
         self.lens = {"width": WIDTH, "height": HEIGHT, "focal": 60.0, **(lens or {})}
         self.pose = list(pose)
@@ -165,6 +167,7 @@ class Ros2Robot:
             self._publish("range", peer.range_reading(now, frame, 0.02, 2.0, distance))
         self._publish("ir_intensity", peer.ir_intensity(now, self.infrared))
         self._publish("hazard_detection", peer.hazards(now, self.hazards))
+        self._publish("battery_state", peer.battery_state(now, self.battery))
         self._publish("kidnap_status", peer.kidnap_status(now, self.kidnapped))
 
     def _publish(self, name: str, message: peer.Cdr) -> None:

@@ -192,6 +192,9 @@ def test_touch_and_being_lifted_are_reported(start: Start) -> None:
     until(lambda: last(robot, 1).kidnapped, 5.0)
     emulator.kidnapped = False
     until(lambda: not last(robot, 1).kidnapped, 5.0)
+    assert last(robot, 1).battery is None
+    emulator.battery = 0.625
+    until(lambda: last(robot, 1).battery == 0.625, 5.0)
 
 
 def test_another_clock_is_translated(start: Start) -> None:

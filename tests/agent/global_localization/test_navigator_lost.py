@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.global_localization.candidates import FleetMap, OwnMap
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
 from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
@@ -16,6 +15,7 @@ from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian

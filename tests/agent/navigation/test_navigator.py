@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.blocked_edges import BlockedEdges
 from mapweave.agent.navigation.navigator import Stage
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.settings import NavigatorSettings
+from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
