@@ -258,7 +258,8 @@ def _poses(opened: Bag, topic: str) -> StampedPoses:
         first = int(good.argmin())
         opened.damaged(f"{opened.path}: pose {first} of {topic} is not finite; what comes before is used")
         stamps, poses = stamps[:first], poses[:first]
-    kept = np.append(True, np.diff(stamps) > 0)[: len(stamps)]
+    # A stamp that lies ahead by damage hides what follows it; nothing goes back in time.
+    kept = np.append(True, stamps[1:] > np.maximum.accumulate(stamps)[:-1])[: len(stamps)]
     if kept.sum() < 2:
         why = f" ({opened.damage[-1]})" if opened.damage else ""
         raise DeviceError(f"{opened.path}: {topic} has {int(kept.sum())} poses; there must be two{why}")

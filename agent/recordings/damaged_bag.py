@@ -195,7 +195,7 @@ def _sqlite(path: Path) -> Iterator[Item]:
         file.close()
 
 
-MOST_BYTES = 1 << 30
+MOST_BYTES = 1 << 28
 """Of one record: a damaged length would otherwise ask for all memory there is."""
 
 

@@ -20,6 +20,8 @@ from mapweave.vision.lens import Distortion
 
 Stamps = NDArray[np.int64]
 
+SILENCE_S, SILENCE_GAPS = 2.0, 10.0
+"""A camera that gives no image for so long, s and median gaps, has stopped."""
 MOST_WIDTH = 800
 """px; wider images are reduced. SIFT takes time in proportion to the area."""
 
@@ -179,6 +181,7 @@ def assembled(
         def read(k: int) -> NDArray[np.uint8]:
             return whole(int(numbers[k]))
 
+        notes = (*notes, *_silence(stamps, odometry.stamps_ns))
     else:
         increments = odometry
     if len(increments) != len(stamps) or not np.isfinite(increments).all():
@@ -199,6 +202,16 @@ def assembled(
         notes,
         damage,
     )
+
+
+def _silence(stamps_ns: Stamps, odometry_ns: Stamps) -> list[str]:
+    """A line if the camera stops while the wheels go on."""
+    gaps = np.diff(stamps_ns, append=max(stamps_ns[-1], odometry_ns[-1]))
+    longest = int(gaps.argmax())
+    if gaps[longest] <= max(SILENCE_S * 1e9, SILENCE_GAPS * float(np.median(gaps))):
+        return []
+    begin = (stamps_ns[longest] - stamps_ns[0]) / 1e9
+    return [f"the camera is silent for {gaps[longest] / 1e9:.1f} s, {begin:.1f} s after its first image"]
 
 
 def without_odometry(

@@ -349,8 +349,9 @@ def test_odometry_that_is_cut_off_anywhere_is_used_up_to_there(original, folder,
         return
     replay = Replay(folder)
     observations = everything(replay)
-    assert len(observations) in (whole, whole + (share == 1.0)) and bool(replay.damage) == (whole < COUNT)
-    for k, observation in enumerate(observations):
+    # A file without the last line's end may be whole: then there is a row for each image.
+    assert len(observations) in (whole, COUNT) and bool(replay.damage) == (len(observations) < COUNT)
+    for k, observation in enumerate(observations[:whole]):
         assert (observation.odometry.forward, observation.odometry.turn) == (STEPS[k], TURNS[k])
 
 

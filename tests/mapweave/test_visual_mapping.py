@@ -118,6 +118,7 @@ def test_the_same_video_gives_the_same_map(video, made: Path, tmp_path: Path) ->
     assert again.read_bytes() == made.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path: Path) -> None:
     """The second half is mirrored; between the halves the camera turns by 60 degrees, by homographies."""
     path, _ = video
