@@ -36,6 +36,7 @@ from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
 
@@ -102,11 +103,28 @@ class Pipeline:
         self._navigator: Navigator | None = None
         self._resumption: Resumption | None = None
         self._direction = 1.0
+        self._lifted = self._put_elsewhere = False
 
     @property
     def map(self) -> HybridMap:
         """The robot's own map so far."""
         return self._mapper.map
+
+    @property
+    def map_from_robot(self) -> PoseGaussian | None:
+        """Where the robot is on its own map; None if it does not know."""
+        fix = self._navigator.fix if self._navigator is not None else None
+        match self._mission:
+            case Explore() | Carried() if self._located:
+                return self._mapper.map_from_robot
+            case GoTo() if fix is not None and fix.node in self.map.nodes:
+                return self.map.nodes[fix.node].map_from_robot @ fix.node_from_robot
+        return None
+
+    @property
+    def _located(self) -> bool:
+        """Whether the mapper knows where the robot is."""
+        return self._mapper.started and not (self._mapper.astray or self._mapper.doubtful)
 
     @property
     def mission(self) -> Mission:
@@ -115,12 +133,17 @@ class Pipeline:
 
     @property
     def lost(self) -> bool:
-        """Whether the robot shall map and has given up localizing on its own map.
+        """Whether the robot shall map and has given up localizing on its own map, or was lifted.
 
         It stands still then. The caller may begin a new map, in a new pipeline; another `set_mission`
         lets it try again.
         """
-        return self._resumption is not None and self._resumption.lost
+        return self._put_elsewhere or (self._resumption is not None and self._resumption.lost)
+
+    @property
+    def put_elsewhere(self) -> bool:
+        """Whether it is lost because its base has noticed that it was lifted."""
+        return self._put_elsewhere
 
     def set_mission(self, mission: Mission) -> None:
         """Begin another mission. Exploration that was interrupted goes on where it was.
@@ -129,7 +152,7 @@ class Pipeline:
         place of its own map.
         """
         self._mission = mission
-        self._resumption = None
+        self._resumption, self._put_elsewhere = None, False
         match mission:
             case Explore() if self._explorer is None:
                 self._explorer = self._new_explorer()
@@ -157,6 +180,8 @@ class Pipeline:
         observation = self.calibration.correct(observation)
         self._rangers.see(observation.proximity)
         match self._mission:
+            case _ if self._in_the_air(observation) or self._put_elsewhere:
+                pass
             case Idle() if self._mapper.started:
                 # Mapping that goes on later needs the motion of the wheels until then.
                 self._keep_up(observation)
@@ -178,6 +203,19 @@ class Pipeline:
     def _blind(self) -> str:
         """Why the rangers forbid an autonomous robot to drive; empty if it may."""
         return self._rangers.fault if isinstance(self._mission, Explore | GoTo) else ""
+
+    def _in_the_air(self, observation: Observation) -> bool:
+        """Whether the base says that it is lifted. Put down again, the robot is at an unknown place."""
+        if observation.kidnapped and not self._lifted:
+            self._mapper.lose()
+        elif self._lifted and not observation.kidnapped:
+            if isinstance(self._mission, GoTo):
+                self.set_mission(self._mission)
+            else:
+                self._put_elsewhere = bool(self.map.nodes) and not isinstance(self._mission, Idle)
+                self._restart()
+        self._lifted = observation.kidnapped
+        return self._lifted
 
     def _new_explorer(self) -> Explorer:
         settings, parts = self._settings, (self._map_id, self._description, self._mapper, self._floor)
@@ -274,6 +312,8 @@ class Pipeline:
                 progress = self._navigator.progress
         if self._blind:
             doing, detail = "standing still", self._blind
+        if self._lifted or self._put_elsewhere:
+            doing, detail = "lifted", "the robot begins a new map once it is on the floor"
         mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
         for more in (self._mapper.health if mapping else "", warning):
             detail = "; ".join(part for part in (detail, more) if part)
@@ -296,6 +336,6 @@ class Pipeline:
             astray=self._resumption is not None,
             given_up=given_up,
             progress=progress,
-            located=mapping and self._mapper.started and not self._mapper.astray,
+            located=mapping and self._located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -33,10 +34,12 @@ from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NUMBER, MapId, NodeId
+from mapweave.processes.ros2_publisher import Ros2Publisher
 from mapweave.processes.service_manager import ServiceManager
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
+from mapweave.wire.ros2.settings import Ros2Link
 from mapweave.wire.traffic_meter import TrafficMeter
 from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -69,6 +72,7 @@ class AgentOptions:
         trajectories: whether the pose at each observation goes to a file beside the map's.
         patience: how long to wait at the end until the server has everything, s.
         calibration: file with what `mapweave calibrate` has measured of this robot, if it exists.
+        ros2: where pose and map are published as ROS 2 topics; None if they are not.
     """
 
     name: str
@@ -85,6 +89,7 @@ class AgentOptions:
     trajectories: bool = False
     patience: float = 5.0
     calibration: Path | None = None
+    ros2: Ros2Link | None = None
 
 
 def measured(description: RobotDescription, calibration: Path | None) -> RobotDescription:
@@ -255,6 +260,7 @@ class Agent:
     def begin_new_map(self) -> None:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
         mission, old, calibration = self.pipeline.mission, self.map_id, self.pipeline.calibration
+        cause = "was lifted" if self.pipeline.put_elsewhere else f"cannot find itself on map {old}"
         self._leave()
         try:
             self.write_map()
@@ -263,10 +269,7 @@ class Agent:
             self._print(f"{self._options.name}: {error}")
         self._begin(calibration)
         self.pipeline.set_mission(mission)
-        self._print(
-            f"{self._options.name}: cannot find itself on map {old}; it begins map {self.map_id}, "
-            "and the old one stays"
-        )
+        self._print(f"{self._options.name}: {cause}; it begins map {self.map_id}, and the old one stays")
 
     def tick(self, observation: Observation) -> Step:
         """One tick; see Runner.tick. Begins a fresh map where that is needed."""
@@ -360,14 +363,20 @@ def run_agent(
     console = Console(stderr=True)
     show, manager = _progress(console, options), ServiceManager()
     describe = partial(_describe, robot, console.print, options.name)
+    publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
 
     def stepped(observation: Observation, step: Step) -> None:
         manager.alive()
         show(observation, step)
+        if publisher is not None:
+            publisher.step(observation, bool(step.changes), agent.pipeline, agent.merged_poses)
 
-    agent = Agent(describe, bus, keys, settings, options, stepped, console.print)
-    manager.ready()
-    with show:
+    with contextlib.ExitStack() as closing:
+        if publisher is not None:
+            closing.callback(publisher.close)
+        agent = Agent(describe, bus, keys, settings, options, stepped, console.print)
+        manager.ready()
+        closing.enter_context(show)
         try:
             agent.run(robot, stop)
         finally:
