@@ -6,10 +6,11 @@ import queue
 import threading
 from collections.abc import Callable
 
-from mapweave.agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
+from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
 from mapweave.agent.pipeline import Status
 from mapweave.agent.replication.queries import decode_answer, encode_query
-from mapweave.agent.status_message import AgentStatus, encode_agent_status
+from mapweave.agent.status_message import AgentStatus, DriveAnswer, encode_agent_status, encode_drive_answer
+from mapweave.agent.teleoperation import DriveRequest, Teleoperation
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -59,6 +60,8 @@ class FleetClient:
         server: str = "s0",
         unsent: Callable[[], int] = lambda: 0,
         placed: Callable[[], int] = lambda: 0,
+        teleoperation: Teleoperation | None = None,
+        limits: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """Announce the agent and listen for missions.
 
@@ -70,6 +73,8 @@ class FleetClient:
             server: the map server of `server_in_reach`.
             unsent: counts the changes that it has not acknowledged; called from any thread.
             placed: counts the nodes of the map with a merged pose; likewise.
+            teleoperation: takes the commands of a person who drives; it outlives this map.
+            limits: of the robot's speeds, m/s and rad/s, for that person.
         """
         self._bus = bus
         self._keys = keys
@@ -81,12 +86,14 @@ class FleetClient:
         self._stamp_ns = 0
         self._unsent, self._placed = unsent, placed
         self._timeout = answer_timeout
+        self._teleoperation, self._limits = teleoperation or Teleoperation(), limits
         self._missions: queue.SimpleQueue[Mission] = queue.SimpleQueue()
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
         self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._open_questions = 0
         self._closing = [
             bus.serve(keys.mission(map_id.agent), self._take_mission),
+            bus.serve(keys.drive(map_id.agent), self._take_drive),
             bus.serve(keys.agent_status(map_id.agent), self._tell_status),
             bus.watch(keys.server_alive(server), self._see_server),
             bus.announce(keys.agent_alive(map_id)),
@@ -100,6 +107,10 @@ class FleetClient:
         while not self._missions.empty():
             out.append(self._missions.get())
         return out
+
+    def driven(self) -> Driven | None:
+        """The command of a person who drives the robot now; None where nobody does."""
+        return self._teleoperation.driven()
 
     def server_in_reach(self) -> bool:
         """Whether the map server is known to be reachable in both directions."""
@@ -164,7 +175,13 @@ class FleetClient:
     def _take_mission(self, request: Request) -> None:
         mission = decode_mission(request.payload)
         self._missions.put(mission)
+        # A mission ends the wait for a person who has fallen silent.
+        self._teleoperation.release()
         request.reply(b"ok")
+
+    def _take_drive(self, request: Request) -> None:
+        answer_ns = self._teleoperation.take(DriveRequest.decode(request.payload))
+        request.reply(encode_drive_answer(DriveAnswer(self._now(), answer_ns, *self._limits)))
 
     def _ask_all(self) -> None:
         while (question := self._asked.get()) is not None:

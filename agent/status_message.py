@@ -47,39 +47,86 @@ class AgentStatus:
         return self.status.fix_node
 
 
+@dataclass(frozen=True)
+class DriveAnswer:
+    """Answer to a person's velocity command.
+
+    Attributes:
+        report: what the robot is doing.
+        answer_ns: time of the answer by the agent's clock; the next command repeats it.
+        max_forward: speed limit of the robot, m/s.
+        max_turn: rate limit, rad/s.
+    """
+
+    report: AgentStatus
+    answer_ns: int
+    max_forward: float
+    max_turn: float
+
+
 def encode_agent_status(report: AgentStatus) -> bytes:
     """What the robot is doing, for people and for tests."""
+    return encode_record(_record(report))
+
+
+def encode_drive_answer(answer: DriveAnswer) -> bytes:
+    """A status with three numbers more."""
+    more = {
+        "answer_ns": answer.answer_ns,
+        "max_forward": float(answer.max_forward),
+        "max_turn": float(answer.max_turn),
+    }
+    return encode_record(_record(answer.report) | more)
+
+
+def decode_drive_answer(payload: bytes) -> DriveAnswer:
+    """Read an answer.
+
+    Raises:
+        InvalidMessage: it is none.
+    """
+    values = decode_record(payload)
+    try:
+        return DriveAnswer(
+            decode_agent_status(payload),
+            _typed(values, "answer_ns", int),
+            _typed(values, "max_forward", float),
+            _typed(values, "max_turn", float),
+        )
+    except (KeyError, ValueError) as error:
+        raise InvalidMessage(f"drive answer: {error}") from None
+
+
+def _record(report: AgentStatus) -> dict[str, Scalar]:
     status = report.status
     pose, fix = status.map_from_robot, status.node_from_robot
-    return encode_record(
-        {
-            "stamp_ns": report.stamp_ns,
-            "epoch": report.epoch,
-            "unsent": report.unsent,
-            "traffic": report.traffic,
-            "linked": report.linked,
-            "placed": report.placed,
-            "astray": status.astray,
-            "doing": _one_line(status.doing),
-            "detail": _one_line(status.detail),
-            "nodes": status.nodes,
-            "tracked": status.tracked,
-            "finished": status.finished,
-            "x": float(pose.x),
-            "y": float(pose.y),
-            "heading": float(pose.heading),
-            "mission": status.mission,
-            "fix_node": "" if status.fix_node is None else str(status.fix_node),
-            "fix_x": float(fix.x),
-            "fix_y": float(fix.y),
-            "fix_heading": float(fix.heading),
-            "legs": status.legs,
-            "edges_driven": status.tally.edges,
-            "nodes_skipped": status.tally.skipped,
-            "relocalizations": status.tally.relocalizations,
-            "blocks": status.tally.blocks,
-        }
-    )
+    return {
+        "stamp_ns": report.stamp_ns,
+        "epoch": report.epoch,
+        "unsent": report.unsent,
+        "traffic": report.traffic,
+        "linked": report.linked,
+        "placed": report.placed,
+        "astray": status.astray,
+        "doing": _one_line(status.doing),
+        "detail": _one_line(status.detail),
+        "nodes": status.nodes,
+        "tracked": status.tracked,
+        "finished": status.finished,
+        "x": float(pose.x),
+        "y": float(pose.y),
+        "heading": float(pose.heading),
+        "mission": status.mission,
+        "fix_node": "" if status.fix_node is None else str(status.fix_node),
+        "fix_x": float(fix.x),
+        "fix_y": float(fix.y),
+        "fix_heading": float(fix.heading),
+        "legs": status.legs,
+        "edges_driven": status.tally.edges,
+        "nodes_skipped": status.tally.skipped,
+        "relocalizations": status.tally.relocalizations,
+        "blocks": status.tally.blocks,
+    }
 
 
 def _one_line(text: str) -> str:

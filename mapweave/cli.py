@@ -10,6 +10,7 @@ from typing import Any
 from mapweave.commands import (
     agent,
     demo,
+    drive,
     evaluate,
     info,
     map_file,
@@ -60,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, robots, map_file, record, replay, info, relocalize, evaluate,
+        demo, server, router, sim, agent, drive, robots, map_file, record, replay, info, relocalize, evaluate,
         settings,
     ):  # fmt: skip
         command.add_to(commands)

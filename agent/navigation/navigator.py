@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 from enum import StrEnum
+from itertools import pairwise
 
 import numpy as np
 
+from mapweave.agent.cautious_driving import lacks_rangers
 from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
@@ -25,7 +27,7 @@ from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteP
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.node import EdgeKind, Node, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.vision.lens import Lens
@@ -45,6 +47,9 @@ class Stage(StrEnum):
     ARRIVED = "parked at the goal"
 
 
+RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
+"""Edges between places that look alike, which no robot need have driven. A robot without proximity sensors
+avoids those that are longer than its radius."""
 TIGHT = 0.07
 """Something nearer than this counts as what is in the way, m."""
 ANSWER_PATIENCE = 100
@@ -107,6 +112,7 @@ class Navigator:
         self._failed_views = 0
         self._goal_hidden = False
         self._following = self._searching = self._parking_retried = False
+        self._touched = ""
         self._behaviour = self._go()
 
     @property
@@ -136,6 +142,14 @@ class Navigator:
             self.detail = self._localization.detail
         return command, self._motion.questions()
 
+    def touch(self, what: str) -> None:
+        """Something was touched: the present edge is blocked.
+
+        Args:
+            what: in words.
+        """
+        self._touched = what
+
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
 
     def _go(self) -> Behaviour:
@@ -144,7 +158,9 @@ class Navigator:
                 yield from self._find()
             assert self.fix is not None, "the search ends with a fix"
             route = yield from self._get_route(self.fix)
-            if route:
+            if (undriven := self._undriven(route)) is not None:
+                self._blocks.add(*undriven, self._motion.now)
+            elif route:
                 yield from self._follow(route, self.fix)
             else:
                 yield from self._wait_for_a_way()
@@ -186,6 +202,16 @@ class Navigator:
         self.legs = self.legs or len(content.legs)
         return content.legs
 
+    def _undriven(self, route: tuple[RouteLeg, ...]) -> tuple[NodeId, NodeId] | None:
+        """The first leg of a route that no robot has driven; None without one, or if there are rangers."""
+        if not lacks_rangers(self._description):
+            return None
+        for before, leg in pairwise(route):
+            way = math.hypot(leg.previous_from_node.mean.x, leg.previous_from_node.mean.y)
+            if leg.kind in RECOGNISED and way > self._description.radius:
+                return before.node.id, leg.node.id
+        return None
+
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away; without obstacles the robot's pose may be wrong."""
         self.stage = Stage.WAITING
@@ -199,7 +225,7 @@ class Navigator:
             self._description, self._lens, self._sift, route, fix, self._local_planner,
             self._settings, self._rng,
         )  # fmt: skip
-        self._following = True
+        self._following, self._touched = True, ""
         while True:
             leg = follower.leg
             command = follower.step(self._motion.observation)
@@ -207,6 +233,8 @@ class Navigator:
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._failed_views = 0
+            if self._touched:
+                follower.progress = RouteProgress.BLOCKED
             if follower.progress not in (RouteProgress.DRIVING, RouteProgress.PARKING):
                 break
             yield command
@@ -267,6 +295,8 @@ class Navigator:
 
     def _obstacle(self) -> str:
         """The obstacle ahead, in words; empty if nothing is near."""
+        if self._touched:
+            return f"something was touched: {self._touched}"
         ranges = self._motion.observation.proximity
         bearings = self._description.ranger_bearings
         if len(ranges) == len(bearings) and len(bearings):

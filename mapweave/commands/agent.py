@@ -39,6 +39,10 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--mission", choices=["idle", "explore", "carried"], default="explore", help="what to do at the start"
     )
+    parser.add_argument(
+        "--without-rangers", action="store_true",
+        help="a robot without proximity sensors may explore, slowly, by its camera and by touch",
+    )  # fmt: skip
     parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
     parser.add_argument(
         "--epoch", type=int, help="least number of a new map (default: the next one, as the server knows it)"
@@ -118,7 +122,10 @@ def run(arguments: argparse.Namespace) -> int:
             synchronization=synchronization,
             server=network.server,
         )
-        run_agent(CheckedRobot(robot), bus, keys, settings.agent, options, stop)
+        agent = settings.agent
+        if arguments.without_rangers:
+            agent = replace(agent, exploration=replace(agent.exploration, without_rangers=True))
+        run_agent(CheckedRobot(robot), bus, keys, agent, options, stop)
     finally:
         if robot is not None:
             robot.close()

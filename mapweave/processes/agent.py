@@ -17,6 +17,7 @@ from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission import Idle, Mission
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.ranger_monitor import announcement
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile
 from mapweave.agent.replication.epochs import newest_on_server, next_epoch
 from mapweave.agent.replication.journal import Journal
@@ -26,6 +27,7 @@ from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
+from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.node import NUMBER, MapId
 from mapweave.storage.map_file import MapFile, write_map_file
@@ -109,6 +111,7 @@ class Agent:
         self._bus = TrafficMeter(bus)
         self._keys = keys
         self._settings = replace(settings, seed=options.seed)
+        self._teleoperation = Teleoperation()
         self._options = options
         self._on_step = on_step
         self._print = print_line
@@ -116,6 +119,9 @@ class Agent:
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
             self._description = describe()
+            explores = settings.exploration.without_rangers
+            for line in announcement(self._description, options.name, explores):
+                print_line(f"{options.name}: {line}")
             maps = self.journal.maps()
             if options.resume is not None or (maps and not options.fresh):
                 self._resume(self._chosen(maps))
@@ -174,7 +180,8 @@ class Agent:
         self.merged_poses = MergedPoses(self._bus, self._keys, options.name, options.server)
         self._fleet = FleetClient(
             self._bus, self._keys, map_id, options.synchronization.answer_timeout, options.server,
-            self.replicator.unacknowledged, self._placed,
+            self.replicator.unacknowledged, self._placed, self._teleoperation,
+            (self._description.max_forward, self._description.max_turn),
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)
         self._trajectory = TrajectoryFile(path) if options.trajectories else None
