@@ -65,12 +65,12 @@ class CameraOccupancyGrid(OccupancyGrid):
 
     def drive(self, map_from_robot: Pose2) -> None:
         """Enter that the footprint is here: it is free, whatever was touched here before."""
-        centre = np.array([map_from_robot.x, map_from_robot.y])
+        row, column = self.cells(np.array([map_from_robot.x, map_from_robot.y])).tolist()
         offsets = self._disc(self._description.radius + 0.5 * self._settings.cell)
-        here = self.cells(centre + offsets)
+        # From the middle of the cell: on its border rounding would leave gaps.
+        here = self.cells(self.centre((row, column)) + offsets)
         rows, columns = here[:, 0], here[:, 1]
         self._odds[rows, columns], self._touched[rows, columns] = -MOST, False
-        row, column = self.cells(centre)
         self._driven[row, column] = True
 
     def see_node(self, node: Node) -> None:
@@ -183,11 +183,13 @@ class CameraOccupancyGrid(OccupancyGrid):
         return self._distance(self._occupied)
 
     def drivable(self, unknown: bool = False) -> NDArray[np.bool_]:
-        """Cells where all of the footprint is on floor known to be free, with clearance or driven before."""
+        """Cells where the robot was, or where all of the footprint is on free floor, with clearance."""
         if unknown:
             return super().drivable(unknown)
-        fits = self._distance(~self._free) >= self._description.radius + 0.4 * self._settings.cell
-        return np.asarray(fits & ((self.room() >= self._enough) | self._driven))
+        # The nearest point of a cell that is not free is up to half a diagonal nearer than its middle.
+        needed = self._description.radius + math.sqrt(0.5) * self._settings.cell
+        fits = self._distance(~self._free) >= needed
+        return np.asarray((fits & (self.room() >= self._enough)) | (self._driven & self._free))
 
     def open_border(self, start: Array, reach: float) -> float:
         """Share of the border of the floor that it can reach behind which nothing is known.
