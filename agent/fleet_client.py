@@ -1,51 +1,29 @@
-"""A robot's link to its fleet: changes and status out, missions in, questions asked without waiting."""
+"""A robot's link to its fleet: status out, missions in, questions asked without waiting."""
 
 from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable
+from dataclasses import replace
 
-from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
-from mapweave.agent.pipeline import Status
+from mapweave.agent.mission import Answer, Driven, Question
+from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.queries import decode_answer, encode_query
-from mapweave.agent.status_message import AgentStatus, DriveAnswer, encode_agent_status, encode_drive_answer
-from mapweave.agent.teleoperation import DriveRequest, Teleoperation
-from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.agent.teleoperation import Teleoperation
+from mapweave.hybridmap.agent_status import AgentStatus, Status, one_line
+from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.mission_order import MissionOrder
+from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import decode_record, encode_record
+from mapweave.wire.messages import decode, encode
 from mapweave.wire.traffic_meter import TrafficMeter
 
 NO_ANSWER = "no map server answered"
-
-
-def encode_mission(mission: Mission) -> bytes:
-    """An operator's command as a message."""
-    name = type(mission).__name__.lower()
-    node = str(mission.node) if isinstance(mission, GoTo) else ""
-    return encode_record({"mission": name, "node": node})
-
-
-def decode_mission(payload: bytes) -> Mission:
-    """Read an operator's command.
-
-    Raises:
-        InvalidMessage: it is not a command.
-    """
-    message = decode_record(payload)
-    name, node = str(message.get("mission", "")), str(message.get("node", ""))
-    plain: dict[str, Mission] = {"idle": Idle(), "explore": Explore(), "carried": Carried()}
-    if name in plain:
-        return plain[name]
-    if name == "goto":
-        try:
-            return GoTo(NodeId.parse(node))
-        except InvalidValue as error:
-            raise InvalidMessage(str(error)) from None
-    raise InvalidMessage(f"no mission {name!r}; known are idle, explore, carried and goto")
 
 
 class FleetClient:
@@ -56,6 +34,7 @@ class FleetClient:
         bus: Bus,
         keys: Keys,
         map_id: MapId,
+        missions: MissionControl,
         answer_timeout: float = 3.0,
         server: str = "s0",
         unsent: Callable[[], int] = lambda: 0,
@@ -69,6 +48,7 @@ class FleetClient:
             bus: the connection.
             keys: of the fleet.
             map_id: the map that the agent makes.
+            missions: takes orders.
             answer_timeout: how long a question may take, s.
             server: the map server of `server_in_reach`.
             unsent: counts the changes that it has not acknowledged; called from any thread.
@@ -84,10 +64,12 @@ class FleetClient:
         self._server_alive = False
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
         self._stamp_ns = 0
+        self._battery: float | None = None
+        self._trouble, self._trouble_at = "", 0.0
+        self._missions = missions
         self._unsent, self._placed = unsent, placed
         self._timeout = answer_timeout
         self._teleoperation, self._limits = teleoperation or Teleoperation(), limits
-        self._missions: queue.SimpleQueue[Mission] = queue.SimpleQueue()
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
         self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._open_questions = 0
@@ -101,13 +83,6 @@ class FleetClient:
         self._asker = threading.Thread(target=self._ask_all, name="questions", daemon=True)
         self._asker.start()
 
-    def missions(self) -> list[Mission]:
-        """Commands that came since the last call."""
-        out: list[Mission] = []
-        while not self._missions.empty():
-            out.append(self._missions.get())
-        return out
-
     def driven(self) -> Driven | None:
         """The command of a person who drives the robot now; None where nobody does."""
         return self._teleoperation.driven()
@@ -116,17 +91,21 @@ class FleetClient:
         """Whether the map server is known to be reachable in both directions."""
         return self._server_alive and self._bus.connected()
 
-    def report(self, status: Status, stamp_ns: int, publish: bool = True) -> None:
+    def report(
+        self, status: Status, stamp_ns: int, battery: float | None = None, publish: bool = True
+    ) -> None:
         """Publish the robot's status: on request and, best effort, to subscribers.
 
         Args:
             status: of the pipeline.
             stamp_ns: time of the observation that it describes.
+            battery: charge, as a share, if it is known.
             publish: send it now; else only answer questions with it.
         """
-        self._status, self._stamp_ns = status, stamp_ns
+        self._status = replace(status, doing=one_line(status.doing), detail=one_line(status.detail))
+        self._stamp_ns, self._battery = stamp_ns, battery
         if publish:
-            self._bus.publish(self._keys.agent_status(self._agent), encode_agent_status(self._now()))
+            self._bus.publish(self._keys.agent_status(self._agent), encode(self._now()))
 
     def ask(self, question: Question) -> None:
         """Send a question; its answer comes with a later `answers`."""
@@ -158,30 +137,34 @@ class FleetClient:
         return AgentStatus(
             self._status,
             self._stamp_ns,
+            self._agent,
             self._map.epoch,
             self._unsent(),
             traffic,
             self.server_in_reach(),
             self._placed(),
+            self._missions.report,
+            self._battery,
+            self._trouble,
+            time.monotonic() - self._trouble_at if self._trouble else 0.0,
         )
 
     def _tell_status(self, request: Request) -> None:
-        request.reply(encode_agent_status(self._now()))
+        request.reply(encode(self._now()))
 
     def _see_server(self, key: str, alive: bool) -> None:
         del key
         self._server_alive = alive
 
     def _take_mission(self, request: Request) -> None:
-        mission = decode_mission(request.payload)
-        self._missions.put(mission)
+        report = self._missions.take(decode(request.payload, MissionOrder))
         # A mission ends the wait for a person who has fallen silent.
         self._teleoperation.release()
-        request.reply(b"ok")
+        request.reply(encode(report))
 
     def _take_drive(self, request: Request) -> None:
-        answer_ns = self._teleoperation.take(DriveRequest.decode(request.payload))
-        request.reply(encode_drive_answer(DriveAnswer(self._now(), answer_ns, *self._limits)))
+        answer_ns = self._teleoperation.take(decode(request.payload, DriveRequest))
+        request.reply(encode(DriveAnswer(self._now(), answer_ns, *self._limits)))
 
     def _ask_all(self) -> None:
         while (question := self._asked.get()) is not None:
@@ -202,4 +185,5 @@ class FleetClient:
                 return Answer(question.number, decode_answer(question, reply.payload))
             except MapweaveError as refused:
                 error = str(refused)
+        self._trouble, self._trouble_at = one_line(error), time.monotonic()
         return Answer(question.number, None, error, retry_after)

@@ -13,6 +13,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.limits import NAME_OR_NOTHING, Angle, Share
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.ranges import Ranges
+from mapweave.vision.lens import NO_DISTORTION, Distortion
 
 MAX_RANGERS = 256
 FARTHEST = 1e4
@@ -20,8 +21,6 @@ FARTHEST = 1e4
 FASTEST = 1e3
 """No robot drives or turns faster, m/s and rad/s."""
 
-Coefficient = Annotated[float, Meta(ge=-1e4, le=1e4)]
-Distortion = tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
 Length = Annotated[float, Meta(ge=1e-3, le=100.0)]
 Reach = Annotated[float, Meta(ge=0.0, le=FARTHEST)]
 Speed = Annotated[float, Meta(ge=0.0, le=FASTEST)]
@@ -60,6 +59,7 @@ class Observation:
         proximity: (K,) m, free distance along each of the robot's rangers from the robot's edge; the
             ranger's maximum where nothing is in reach. Empty if the robot has none.
         bumped: whether the bumper is pressed.
+        battery: charge, as a share; None if the robot does not tell.
     """
 
     stamp_ns: int
@@ -67,6 +67,7 @@ class Observation:
     image: NDArray[np.uint8] | None = None
     proximity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     bumped: bool = False
+    battery: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,7 @@ class RobotDescription:
 
     Attributes:
         camera: ideal intrinsics and mount.
-        distortion: (k1, k2, p1, p2, k3) of the lens, OpenCV's order.
+        distortion: of the lens.
         radius: of the robot's footprint, m.
         axle: distance between the wheels L, m.
         wheel_noise: standard deviation of a wheel's way, as a share of the way: sigma of the paper.
@@ -106,7 +107,7 @@ class RobotDescription:
     """
 
     camera: Camera
-    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Distortion = NO_DISTORTION
     radius: Length = 0.16
     axle: Length = 0.24
     wheel_noise: Share = 0.02

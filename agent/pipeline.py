@@ -3,7 +3,7 @@ r"""One robot's whole pipeline: observation in, command and map changes out. Rea
     image, odometry, proximity -> mapper (tracks, EKF, nodes) -> changes
                                -> floor                        \
     lost on the own map ------> global localization -> mapper   |
-    mission ------------------> explorer | passenger | navigator -> guard -> command
+    mission ------------------> explorer | carried   | navigator -> guard -> command
     a person's command --------------------------------------------/
 
 It knows no network, no disk and no clock: live robots, recordings, simulation and tests run this very code.
@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 from mapweave.agent.camera_occupancy import CameraOccupancyGrid
 from mapweave.agent.cautious_driving import ALONG_EDGES, CautiousDriving, lacks_rangers, speed_for
-from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.exploration.camera_exploration import CameraExploration, with_readings
 from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
@@ -33,52 +32,12 @@ from mapweave.agent.ranger_monitor import RangerMonitor, not_exploring
 from mapweave.agent.servo.proximity import guard
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
+from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
-from mapweave.vision.lens import Lens
+from mapweave.hybridmap.node import MapId
+from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
-
-IDENTITY = Pose2()
-NOTHING_DRIVEN = DriveStatistics()
-
-
-@dataclass(frozen=True)
-class Status:
-    """What the robot is doing, for people.
-
-    Attributes:
-        doing: in words.
-        detail: why, or how far.
-        nodes: nodes of the own map.
-        tracked: features tracked in the image.
-        map_from_robot: estimated pose in its own map while mapping.
-        finished: whether the mission is complete.
-        mission: its name.
-        fix_node: the node by which the robot is localized while navigating.
-        node_from_robot: pose in that node's frame.
-        legs: nodes on the first route of the drive, beginning and goal included.
-        lost: whether it has given up localizing on its own map: a new map must be begun.
-        astray: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
-        located: whether `map_from_robot` comes from this observation.
-        tally: statistics of the drive so far.
-    """
-
-    doing: str
-    detail: str
-    nodes: int
-    tracked: int
-    map_from_robot: Pose2
-    finished: bool
-    mission: str = "idle"
-    fix_node: NodeId | None = None
-    node_from_robot: Pose2 = IDENTITY
-    legs: int = 0
-    lost: bool = False
-    astray: bool = False
-    located: bool = False
-    tally: DriveStatistics = NOTHING_DRIVEN
 
 
 @dataclass(frozen=True)
@@ -121,6 +80,9 @@ class Pipeline:
             next_number: the first that no node or edge of the map has ever had.
         """
         jit.load()  # a robot that drives must not wait for a compiler
+        self._fisheye = Lens(description.camera, description.distortion)
+        if self._fisheye.rectifies:
+            description = replace(description, distortion=NO_DISTORTION)
         self._map_id = map_id
         self._settings = settings or AgentSettings()
         self._description = description
@@ -189,6 +151,9 @@ class Pipeline:
             driven: a person's command, which comes before the mission's; None where nobody drives.
         """
         command, questions = Command(), list[Question]()
+        if self._fisheye.rectifies and observation.image is not None:
+            # From here on the camera is a pinhole.
+            observation = replace(observation, image=self._fisheye.rectified(observation.image))
         self._rangers.see(observation.proximity)
         self._take_over(driven)
         self._feel(observation)
@@ -355,7 +320,7 @@ class Pipeline:
             self._explorer = self._new_explorer()
 
     def _status(self, warning: str) -> Status:
-        doing, detail, finished = "idle", "no mission", False
+        doing, detail, finished, given_up, progress = "idle", "no mission", False, False, 0.0
         match self._mission:
             case Explore() | Carried() if self._mapper.astray:
                 doing = "lost" if self.lost else "looking for a place of its own map"
@@ -371,7 +336,8 @@ class Pipeline:
                 doing, detail = "mapping while carried", self._passenger.detail
             case GoTo() if self._navigator is not None:
                 doing, detail = str(self._navigator.stage), self._navigator.detail
-                finished = self._navigator.arrived
+                finished, given_up = self._navigator.arrived, self._navigator.given_up
+                progress = self._navigator.progress
         if self._blind:
             doing, detail = "standing still", self._blind
         if self._driven is not None:
@@ -397,6 +363,8 @@ class Pipeline:
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
             astray=self._resumption is not None,
+            given_up=given_up,
+            progress=progress,
             located=mapping and self._mapper.started and not self._mapper.astray,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation
 from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.replication.replicator import Replicator
@@ -25,6 +26,7 @@ class Runner:
         pipeline: Pipeline,
         fleet: FleetClient,
         replicator: Replicator,
+        missions: MissionControl,
         synchronization: Synchronization | None = None,
         on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
     ) -> None:
@@ -32,14 +34,16 @@ class Runner:
 
         Args:
             pipeline: the mind.
-            fleet: questions, missions, status.
+            fleet: questions and status.
             replicator: where changes go: to the own disk, then to the server.
+            missions: what the pipeline shall do.
             synchronization: what the loop waits for; nothing if not given.
             on_step: called after each tick, for progress.
         """
         self._pipeline = pipeline
         self._fleet = fleet
         self._replicator = replicator
+        self._missions = missions
         self._synchronization = synchronization or FreeRunning()
         self._on_step = on_step
         self._questions: tuple[Question, ...] = ()
@@ -48,7 +52,9 @@ class Runner:
 
     def tick(self, observation: Observation) -> Step:
         """Take one observation; changes and status go their way, questions wait for `exchange`."""
-        for mission in self._fleet.missions():
+        home = min(self._pipeline.map.nodes, default=None)
+        mission = self._missions.next(self._fleet.server_in_reach(), observation.stamp_ns * 1e-9, home)
+        if mission is not None:
             self._pipeline.set_mission(mission)
         answers, self._answers = (*self._answers, *self._fleet.answers()), ()
         step = self._pipeline.step(observation, answers, self._fleet.driven())
@@ -56,8 +62,9 @@ class Runner:
             self._replicator.submit(step.changes, observation.stamp_ns)
             self._synchronization.changes_submitted(self._replicator, self._fleet)
         self._questions = step.questions
-        now = self._ticks % REPORT_EVERY == 0 or bool(step.questions)
-        self._fleet.report(step.status, observation.stamp_ns, publish=now)
+        changed = self._missions.follow(step.status)
+        now = self._ticks % REPORT_EVERY == 0 or bool(step.questions) or changed
+        self._fleet.report(step.status, observation.stamp_ns, observation.battery, publish=now)
         self._ticks += 1
         self._on_step(observation, step)
         return step

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Annotated
 
 from msgspec import Meta
@@ -107,6 +108,7 @@ class NavigatorSettings:
         parking_patience: time without getting nearer to the goal's pose after which it is blocked, s.
         blocked_first: how long it avoids an edge that was blocked for the first time, s: people walk on.
         blocked_longest: each further time it avoids it twice as long, up to this, s: walls stay.
+        patience: a goal is given up when no further edge on the way was driven to for so long, s.
     """
 
     speed: Positive = 0.26
@@ -117,6 +119,7 @@ class NavigatorSettings:
     parking_patience: Positive = 30.0
     blocked_first: Positive = 15.0
     blocked_longest: Positive = 120.0
+    patience: Positive = 300.0
 
 
 @dataclass(frozen=True)
@@ -134,12 +137,23 @@ class OccupancyGridSettings:
     clearance: Annotated[float, Meta(ge=0.0)] = 0.1
 
 
+class WithoutServer(StrEnum):
+    """What a robot does while no map server is in reach."""
+
+    GO_ON = "go on"
+    STAND = "stand"
+    HOME = "home"
+    """It parks at the first node of its map."""
+
+
 @dataclass(frozen=True)
 class AgentSettings:
     """A robot's program.
 
     Attributes:
         seed: seed of all that the robot does by chance.
+        without_server: what it does while no map server is in reach: "go on" with its mission, "stand", or go
+            "home", to the first node of its map. Its mission goes on when the server is back.
         sift: features of an image.
         landmarks: which landmarks a node keeps.
         tracker: of image points.
@@ -151,6 +165,7 @@ class AgentSettings:
     """
 
     seed: Annotated[int, Meta(ge=0)] = 0
+    without_server: WithoutServer = WithoutServer.GO_ON
     sift: SiftSettings = field(default_factory=SiftSettings)
     landmarks: SelectionSettings = field(default_factory=SelectionSettings)
     tracker: TrackerSettings = field(default_factory=TrackerSettings)

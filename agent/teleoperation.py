@@ -5,64 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from mapweave.agent.mission import Driven
-from mapweave.agent.observation import FASTEST, Command
-from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.wire.log_messages import decode_record, encode_record
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.drive_request import DriveRequest
+from mapweave.hybridmap.errors import InvalidValue
 
 DEAD_MAN = 0.5
 """Without a command for so long the robot stands, s."""
 STALE = 1.0
 """A command that was given later than this after the answer which it follows comes too late, s: it stops."""
-
-
-@dataclass(frozen=True)
-class DriveRequest:
-    """A velocity command of a person.
-
-    Attributes:
-        session: random number of the program that the person drives with.
-        command: wanted.
-        answer_ns: `answer_ns` of the last answer that the program received; 0 for its first request.
-        release: the person gives the wheels back to the mission.
-    """
-
-    session: int
-    command: Command
-    answer_ns: int = 0
-    release: bool = False
-
-    def encode(self) -> bytes:
-        """As a flat record."""
-        return encode_record(
-            {
-                "session": self.session,
-                "forward": float(self.command.forward),
-                "turn": float(self.command.turn),
-                "answer_ns": self.answer_ns,
-                "release": self.release,
-            }
-        )
-
-    @staticmethod
-    def decode(payload: bytes) -> DriveRequest:
-        """Read a request.
-
-        Raises:
-            InvalidMessage: it is none.
-        """
-        values = decode_record(payload)
-        session, answer_ns, release = (values.get(name) for name in ("session", "answer_ns", "release"))
-        forward, turn = values.get("forward"), values.get("turn")
-        if type(session) is not int or type(answer_ns) is not int or type(release) is not bool:
-            raise InvalidMessage("drive: session and answer_ns must be whole numbers, release true or false")
-        if type(forward) is not float or type(turn) is not float:
-            raise InvalidMessage("drive: forward and turn must be numbers")
-        if not (abs(forward) <= FASTEST and abs(turn) <= FASTEST):
-            raise InvalidMessage(f"drive: forward and turn must be at most {FASTEST:g}")
-        return DriveRequest(session, Command(forward, turn), answer_ns, release)
 
 
 class Teleoperation:
@@ -98,7 +50,7 @@ class Teleoperation:
                 return now
             late = not 0 <= now - request.answer_ns <= STALE * 1e9
             self._session, self._at_ns = request.session, now
-            self._command = Command() if late else request.command
+            self._command = Command() if late else Command(request.forward, request.turn)
         return now
 
     def release(self) -> None:

@@ -41,7 +41,7 @@ class Standing(StrEnum):
     """Other pairs are more similar; the numbers come from a comparison made for the explanation."""
 
 
-DOUBLES = "doubles"
+ALIASED = "aliased"
 """Name among a link's evidence: of its inliers, landmarks that are found at other places too; absent if none
 is known (see mapweave.merge.outlier_rejection.distinctness)."""
 
@@ -51,7 +51,7 @@ MAX_MAPS_LISTED = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Witness:
+class LinkAgreement:
     """Another link between the same two pieces of map.
 
     Attributes:
@@ -108,10 +108,10 @@ class PairExplanation:
         probability: that the link is right, see mapweave.merge.outlier_rejection.link_probability; None
             without a pose, or where nothing joins the two.
         misfit: against the merged map; None if nothing joins the two.
-        witnesses: other links between the same two pieces of map.
+        other_links: other links between the same two pieces of map.
         claims: what the robots' own edges say about the two, whether the servo could drive them, and which of
             the two is superseded; one sentence each.
-        rulings: manual constraints on these two or their maps, in order.
+        constraints: manual constraints on these two or their maps, in order.
     """
 
     a: Node
@@ -125,9 +125,9 @@ class PairExplanation:
     evidence: Annotated[dict[Key, float], Meta(max_length=64)] = field(default_factory=dict)
     probability: Probability | None = None
     misfit: Misfit | None = None
-    witnesses: tuple[Witness, ...] = ()
+    other_links: tuple[LinkAgreement, ...] = ()
     claims: tuple[Words, ...] = ()
-    rulings: tuple[ManualConstraint, ...] = ()
+    constraints: tuple[ManualConstraint, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse what does not belong together.
@@ -177,7 +177,7 @@ class MapsExplanation:
         unverified: candidate pairs without a common pose.
         nearest: pairs that came nearest to a link, best first; of links that were refused, then of others. Of
             two maps that are one the links with the fewest landmarks behind them, weakest first.
-        rulings: manual constraints on the two maps, in order.
+        constraints: manual constraints on the two maps, in order.
     """
 
     first: MapId
@@ -189,7 +189,7 @@ class MapsExplanation:
     refused: Number
     unverified: Number
     nearest: tuple[NearMiss, ...] = ()
-    rulings: tuple[ManualConstraint, ...] = ()
+    constraints: tuple[ManualConstraint, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

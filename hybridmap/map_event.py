@@ -18,7 +18,7 @@ class MapEventKind(StrEnum):
     """Links between two maps were found, and refused: they put two robots in one place."""
     SET_APART = "set apart"
     """The merge fails with a map, and is made without it; or it is taken in again."""
-    RULED = "ruled"
+    CONSTRAINED = "constrained"
     """A person has decided."""
     FAILED = "failed"
 

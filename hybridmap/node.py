@@ -203,7 +203,7 @@ class Node:
         radius: of the robot's footprint, m: two robots are never nearer to each other than both of theirs. 0
             if unknown.
         ranges: what the proximity sensors saw from there at that time; empty if it has none.
-        wake: trajectory segment: where the robot was before and after, with its sensor readings.
+        segment: trajectory segment: where the robot was before and after, with its sensor readings.
     """
 
     id: NodeId
@@ -214,7 +214,7 @@ class Node:
     clock: str = ""
     radius: float = 0.0
     ranges: Ranges = field(default_factory=Ranges)
-    wake: TrajectorySegment = field(default_factory=TrajectorySegment)
+    segment: TrajectorySegment = field(default_factory=TrajectorySegment)
 
     def __post_init__(self) -> None:
         """Refuse a trajectory segment of other sensors.
@@ -222,9 +222,9 @@ class Node:
         Raises:
             InvalidValue: the segment has readings of more or fewer sensors, or beyond their reach.
         """
-        if not len(self.wake):
+        if not len(self.segment):
             return
-        distances = self.wake.distances
+        distances = self.segment.distances
         if distances.shape[1] != len(self.ranges):
             raise InvalidValue(
                 f"trajectory: {distances.shape[1]} sensors, where the node has {len(self.ranges)}"

@@ -46,7 +46,7 @@ class ActiveNodes:
             set_apart: the nodes of maps that are set apart.
         """
         self._places, self._node_of, self._merged = places, node_of, merged
-        self._left_out = frozenset((*merged.rulings.retired, *merged.set_apart))
+        self._left_out = frozenset((*merged.constraints.retired, *merged.set_apart))
         left_out = (
             node for map_id in self._left_out if map_id in merged.maps for node in merged.maps[map_id].nodes
         )

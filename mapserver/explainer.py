@@ -23,9 +23,9 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.constraint_history import said_of, with_constraints
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.route_explaining import explain_route
-from mapweave.mapserver.ruling_history import said_of, with_rulings
 from mapweave.mapserver.services import guarded
 from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
 from mapweave.merge.explanation.node_explanation import explain_nodes
@@ -41,24 +41,24 @@ log = logging.getLogger(__name__)
 AnyExplanation = TypeVar("AnyExplanation", PairExplanation, MapsExplanation, RouteExplanation)
 
 
-class RulingBook:
+class ConstraintRecord:
     """The server's record of manual constraints, on its disk. Entries are added, never removed."""
 
     def __init__(self, store: Store) -> None:
         """Read the record."""
         self._store = store
         made: list[ManualConstraint] = []
-        for body in store.rulings():
+        for body in store.constraints():
             try:
                 made.append(decode(body, ManualConstraint))
             except InvalidMessage as error:
                 log.error("a manual constraint cannot be read (%s); it is left out", error)
-        self._rulings = ManualConstraints(made)
+        self._constraints = ManualConstraints(made)
 
     @property
-    def rulings(self) -> ManualConstraints:
+    def constraints(self) -> ManualConstraints:
         """All of them, in order."""
-        return self._rulings
+        return self._constraints
 
     def maps(self) -> list[MapId]:
         """All maps of which the server has anything: they can be retired."""
@@ -71,8 +71,8 @@ class RulingBook:
             InvalidValue: there are too many.
             InvalidFile: the disk does not take it; then nothing has changed.
         """
-        self._store.add_ruling(encode(constraint))
-        self._rulings = ManualConstraints([*self._rulings.made, constraint])
+        self._store.add_constraint(encode(constraint))
+        self._constraints = ManualConstraints([*self._constraints.made, constraint])
 
 
 class Explainer:
@@ -85,12 +85,12 @@ class Explainer:
         name: str,
         answers: Callable[[], Answers],
         admission: AdmissionControl,
-        book: RulingBook,
-        rule: Callable[[ManualConstraints], None],
+        record: ConstraintRecord,
+        constrain: Callable[[ManualConstraints], None],
         settled: Callable[[], bool],
         consistency: ConsistencySettings,
         wary: Callable[[], Collection[tuple[NodeId, NodeId]]],
-        happenings: Callable[[], Iterable[MapEvent]],
+        events: Callable[[], Iterable[MapEvent]],
     ) -> None:
         """Begin to answer.
 
@@ -100,25 +100,25 @@ class Explainer:
             name: of the server in the fleet.
             answers: the newest ones. May wait for them.
             admission: admission control; explanations compare nodes, which takes long.
-            book: record of manual constraints.
-            rule: called with all constraints whenever there is a new one.
+            record: of manual constraints.
+            constrain: called with all constraints whenever there is a new one.
             settled: whether the newest answers know all that has come.
             consistency: as in the merge.
             wary: pairs of nodes between which robots of late did not get through.
-            happenings: what has become of the maps.
+            events: what has become of the maps.
         """
         self._answers = answers
         self._admission = admission
-        self._book = book
-        self._rule = rule
+        self._record = record
+        self._constrain = constrain
         self._settled = settled
         self._consistency = consistency
         self._wary = wary
-        self._happenings = happenings
+        self._events = events
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
-            bus.serve(keys.rule(name), guarded(self._apply_constraint)),
+            bus.serve(keys.constrain(name), guarded(self._apply_constraint)),
             bus.serve(keys.history(name), guarded(lambda _: encode(History(self.history())))),
         ]
 
@@ -158,14 +158,16 @@ class Explainer:
 
     def history(self) -> tuple[MapEvent, ...]:
         """The history of the maps and the manual constraints, in order."""
-        return with_rulings(self._happenings(), self._book.rulings)
+        return with_constraints(self._events(), self._record.constraints)
 
     def _apply_constraint(self, payload: bytes) -> bytes:
         constraint = decode(payload, ManualConstraint)
         with self._turn:
-            check_manual_constraint(self._answers().merged, self._book.rulings, constraint, self._book.maps())
-            self._book.add(constraint)
-            self._rule(self._book.rulings)
+            check_manual_constraint(
+                self._answers().merged, self._record.constraints, constraint, self._record.maps()
+            )
+            self._record.add(constraint)
+            self._constrain(self._record.constraints)
         event = said_of(constraint)
         log.warning("%s", event)
         return encode_record({"said": event})

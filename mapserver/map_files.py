@@ -46,7 +46,7 @@ def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
         tuple(whole.contents()),
         dict(merged.poses),
         tuple(RefusedPair(r.a, r.b, r.reason, _edge(merged, r)) for r in merged.refused),
-        merged.rulings.made,
+        merged.constraints.made,
         merged.superseded,
         merged.faded,
         tuple(history),
@@ -77,7 +77,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         InvalidFile: its measurements determine no poses.
     """
     s = settings or MergeSettings()
-    maps, constraints = maps_of(content), ManualConstraints(content.rulings)
+    maps, constraints = maps_of(content), ManualConstraints(content.constraints)
     links = tuple(_links(change.edge for change in content.changes if isinstance(change, EdgePut)))
     try:
         parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency)

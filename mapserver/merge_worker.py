@@ -128,9 +128,9 @@ class MergeWorker:
         self._schedule.catch_up()
         taken.wait()
 
-    def rule(self, constraints: ManualConstraints) -> None:
+    def constrain(self, constraints: ManualConstraints) -> None:
         """Apply exactly these manual constraints from now on. Returns at once."""
-        self._post(lambda: self._merger.rule(constraints))
+        self._post(lambda: self._merger.constrain(constraints))
 
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.map_event import MapEvent
@@ -66,6 +66,10 @@ class PackedMap:
                 return
             self._working = True
         self._executor.submit(self._work)
+
+    def packed(self) -> Future[bytes]:
+        """The file of the newest merge, some time later, from any thread."""
+        return self._executor.submit(self.pack)
 
     def close(self) -> None:
         """Answer what has come and stop."""

@@ -58,10 +58,6 @@ class Schedule(Protocol):
         """Have a job run every so many seconds, however busy the background is."""
         ...
 
-    def spawn(self, job: Job) -> None:
-        """Run a long job in parallel to all others."""
-        ...
-
     def executor(self, workers: int) -> Executor:
         """Where questions are answered; the caller shuts it down."""
         ...
@@ -132,10 +128,6 @@ class LiveSchedule:
         self._periodic.append(thread)
         if self._thread.is_alive():
             thread.start()
-
-    def spawn(self, job: Job) -> None:
-        """Have a job run on a thread of its own."""
-        threading.Thread(target=_run, args=(job,), name="beside", daemon=True).start()
 
     def executor(self, workers: int) -> Executor:
         """A pool of threads."""
@@ -248,10 +240,6 @@ class LockstepSchedule:
     def every(self, period: float, job: Job) -> None:
         """Run a job at a catch-up after so much simulated time has passed."""
         self._periodic.append(_Periodic(period, job, self.monotonic() + period))
-
-    def spawn(self, job: Job) -> None:
-        """As `post`."""
-        self.post(job)
 
     def executor(self, workers: int) -> Executor:
         """Answers in the thread that asks, after catching up."""

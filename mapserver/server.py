@@ -13,19 +13,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
+from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.blockages import Blockages
-from mapweave.mapserver.explainer import Explainer, RulingBook
+from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
+from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
+from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
+from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
 from mapweave.merge.settings import MergeSettings
@@ -51,6 +56,8 @@ class ServerSettings:
 
 STATUS_EVERY = 0.5
 """Time between two status messages, s."""
+RELAYS = 4
+"""Missions that wait for their robots' answers at once."""
 MERGE_SHARE = 0.4
 """Largest share of the time that is spent merging."""
 
@@ -92,8 +99,8 @@ class MapServer:
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
-        self._rulings = RulingBook(self._store)
-        self._worker.rule(self._rulings.rulings)
+        self._constraints = ConstraintRecord(self._store)
+        self._worker.constrain(self._constraints.constraints)
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
@@ -104,17 +111,24 @@ class MapServer:
         worker, clock = self._worker, self._schedule
         worker.start()
         self._ingest = Ingest(self._bus, self._keys, self._store, self._name, worker.take, replay=worker.read)
+        self._missions = MissionRelay(
+            self._bus, self._keys, self._store, lambda: worker.current().router, clock.time_ns
+        )
+        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
+        self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
-            lambda: self._history.happenings, clock.monotonic, clock.executor(1),
+            lambda: self._history.events, self._missions, self._roster,
+            clock.executor(RELAYS), clock.monotonic, clock.executor(1),
         )  # fmt: skip
         self._explainer = Explainer(
-            self._bus, self._keys, self._name, worker.current, self._admission, self._rulings, worker.rule,
-            lambda: worker.settled, self._settings.merge.consistency,
-            lambda: self._blockages.known(clock.monotonic()), lambda: self._history.happenings,
+            self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,
+            worker.constrain, lambda: worker.settled, self._settings.merge.consistency,
+            lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
         )  # fmt: skip
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._publish)
+        clock.every(RETRY_EVERY, self._missions.retry)
         clock.every(EVERY, self._places.save_if_worthwhile)
         return self
 
@@ -123,6 +137,7 @@ class MapServer:
     ) -> None:
         """Stop serving; everything that was acknowledged is on the disk already."""
         self._services.close()
+        self._roster.close()
         self._explainer.close()
         self._admission.close()
         self._ingest.close()
@@ -153,7 +168,7 @@ class MapServer:
             "loops": loops,
             "refused": sum(refusal.link is not None for refusal in merged.refused),
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
-            "rulings": len(merged.rulings.in_force),
+            "constraints": len(merged.constraints.in_force),
             "set_apart": len(merged.set_apart),
             "event": self._ingest.failure or self._worker.event,
             "settled": self._worker.settled,
@@ -186,6 +201,30 @@ class MapServer:
     def history(self) -> tuple[MapEvent, ...]:
         """The history of the maps and the manual constraints, in order."""
         return self._explainer.history()
+
+    def command(self, request: MissionRequest) -> MissionReport:
+        """Hand a mission on to its robot, from any thread; waits for the robot's answer.
+
+        Raises:
+            InvalidValue: there is no such robot, or no such goal.
+        """
+        return self._missions.command(request)
+
+    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+        """Give a robot a mission that is newer than the one that holds it; see `command`."""
+        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id))
+
+    def missions(self) -> Missions:
+        """The missions that are known, oldest first."""
+        return self._missions.missions()
+
+    def robots(self) -> FleetStatus:
+        """The robots, and where they are."""
+        return self._roster.robots(self._worker.current().merged)
+
+    def map_file(self) -> Future[bytes]:
+        """The merged map as a map file."""
+        return self._services.map_file()
 
     def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))

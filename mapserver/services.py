@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 
 from mapweave.hybridmap.errors import Busy, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.mission_order import MissionRequest
 from mapweave.hybridmap.query import KnownRequest, RouteAnswer, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
+from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.packed_map import PackedMap
+from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
@@ -37,6 +40,9 @@ class Services:
         blockages: Blockages,
         status: Callable[[], dict[str, Scalar]],
         history: Callable[[], Iterable[MapEvent]],
+        missions: MissionRelay,
+        roster: Roster,
+        relays: Executor,
         clock: Callable[[], float],
         executor: Executor,
     ) -> None:
@@ -51,6 +57,9 @@ class Services:
             blockages: takes note of where robots did not get through.
             status: of the server.
             history: of the maps, for who takes them along.
+            missions: hands missions on.
+            roster: of the robots.
+            relays: waits for robots' answers; it is shut down with this.
             clock: only grows, s.
             executor: packs the whole map; it is shut down with this.
         """
@@ -59,6 +68,9 @@ class Services:
         self._admission = admission
         self._blockages = blockages
         self._status = status
+        self._missions = missions
+        self._roster = roster
+        self._relays = relays
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor
         )
@@ -67,6 +79,9 @@ class Services:
             bus.serve(keys.route(name), guarded(self._route)),
             bus.serve(keys.known(name), guarded(self._known)),
             bus.serve(keys.server_map(name), self._map.ask),
+            bus.serve(keys.server_mission(name), self._command_later),
+            bus.serve(keys.missions(name), guarded(lambda _: encode(missions.missions()))),
+            bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(answers().merged)))),
             bus.serve(keys.server_status(name), guarded(self._tell_status)),
             bus.announce(keys.server_alive(name)),
         ]
@@ -75,7 +90,17 @@ class Services:
         """Stop answering."""
         for closing in self._closing:
             closing.close()
+        self._relays.shutdown()
         self._map.close()
+
+    def map_file(self) -> Future[bytes]:
+        """The merged map as a map file, from any thread."""
+        return self._map.packed()
+
+    def _command_later(self, request: Request) -> None:
+        # It waits for a robot, which nothing else of the server may do.
+        command = guarded(lambda payload: encode(self._missions.command(decode(payload, MissionRequest))))
+        self._relays.submit(command, request)
 
     def _relocalize_later(self, request: Request) -> None:
         done = self._admission.submit(lambda: self._relocalize(request.payload), hash(request.payload))

@@ -19,9 +19,16 @@ if TYPE_CHECKING:
     from mapweave.agent.observation import Odometry as Odometry
     from mapweave.agent.observation import RobotDescription as RobotDescription
     from mapweave.agent.recordings.camera_file import read_camera as read_camera
+    from mapweave.fleet import Fleet as Fleet
+    from mapweave.hybridmap.agent_status import AgentStatus as AgentStatus
+    from mapweave.hybridmap.agent_status import FleetStatus as FleetStatus
+    from mapweave.hybridmap.agent_status import RobotEntry as RobotEntry
     from mapweave.hybridmap.camera import Camera as Camera
     from mapweave.hybridmap.errors import MapweaveError as MapweaveError
     from mapweave.hybridmap.hybrid_map import HybridMap as HybridMap
+    from mapweave.hybridmap.mission_order import MissionKind as MissionKind
+    from mapweave.hybridmap.mission_order import MissionReport as MissionReport
+    from mapweave.hybridmap.mission_order import MissionState as MissionState
     from mapweave.hybridmap.node import Edge as Edge
     from mapweave.hybridmap.node import EdgeKind as EdgeKind
     from mapweave.hybridmap.node import Landmarks as Landmarks
@@ -49,9 +56,12 @@ else:
         "mapweave.agent.drivers.robot": ("Robot",),
         "mapweave.agent.observation": ("Command", "Observation", "Odometry", "RobotDescription"),
         "mapweave.agent.recordings.camera_file": ("read_camera",),
+        "mapweave.fleet": ("Fleet",),
+        "mapweave.hybridmap.agent_status": ("AgentStatus", "FleetStatus", "RobotEntry"),
         "mapweave.hybridmap.camera": ("Camera",),
         "mapweave.hybridmap.errors": ("MapweaveError",),
         "mapweave.hybridmap.hybrid_map": ("HybridMap",),
+        "mapweave.hybridmap.mission_order": ("MissionKind", "MissionReport", "MissionState"),
         "mapweave.hybridmap.node": ("Edge", "EdgeKind", "Landmarks", "MapId", "Node", "NodeId"),
         "mapweave.hybridmap.pose": ("Pose2", "PoseGaussian"),
         "mapweave.hybridmap.query": ("Certainty", "RelocalizeAnswer", "View"),

@@ -9,11 +9,13 @@ from typing import Any
 
 from mapweave.commands import (
     agent,
+    calibrate,
     demo,
     drive,
     evaluate,
     info,
     map_file,
+    missions,
     record,
     relocalize,
     replay,
@@ -22,6 +24,7 @@ from mapweave.commands import (
     server,
     settings,
     sim,
+    status,
 )
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
@@ -61,8 +64,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, drive, robots, map_file, record, replay, info, relocalize, evaluate,
-        settings,
+        demo, server, router, sim, agent, drive, status, missions, robots, map_file, record, replay, info,
+        calibrate, relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)
     return top

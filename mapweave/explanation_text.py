@@ -10,14 +10,14 @@ from datetime import UTC, datetime
 import numpy as np
 
 from mapweave.hybridmap.explanation import (
-    DOUBLES,
+    ALIASED,
     Hop,
+    LinkAgreement,
     MapsExplanation,
     NearMiss,
     PairExplanation,
     RouteExplanation,
     Standing,
-    Witness,
 )
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.pose import Array, PoseGaussian
@@ -65,19 +65,19 @@ def pair_words(explanation: PairExplanation) -> list[str]:
     if explanation.probability is not None:
         percent = _percent(explanation.probability)
         lines.append(f"  probability   {percent} that it is right, judged for itself by the rest of the map")
-    if explanation.witnesses:
-        count = sum(link.agrees for link in explanation.witnesses)
+    if explanation.other_links:
+        count = sum(link.agrees for link in explanation.other_links)
         lines.append(
-            f"  other links   {count} of {len(explanation.witnesses)} between the same pieces of map agree:"
+            f"  other links   {count} of {len(explanation.other_links)} between the same pieces of map agree:"
         )
-    for link in _selection(explanation.witnesses):
+    for link in _selection(explanation.other_links):
         word = "agrees" if link.agrees else "contradicts"
         kept = "stands" if link.kept else "refused"
         lines.append(f"    {link.a} - {link.b}: {word}, {_sigmas(link.distance2)}, {kept}")
-    if len(explanation.witnesses) > MOST_LINKS:
-        lines.append(f"    and {len(explanation.witnesses) - MOST_LINKS} more; --json lists all")
+    if len(explanation.other_links) > MOST_LINKS:
+        lines.append(f"    and {len(explanation.other_links) - MOST_LINKS} more; --json lists all")
     lines += [f"  {claim}" for claim in explanation.claims]
-    lines += [f"  {_constraint(constraint)}" for constraint in explanation.rulings]
+    lines += [f"  {_constraint(constraint)}" for constraint in explanation.constraints]
     return lines
 
 
@@ -89,7 +89,7 @@ def _evidence(evidence: Mapping[str, float]) -> list[str]:
     return [line.replace(tied, " ") for line in lines]
 
 
-def _selection(links: Sequence[Witness]) -> list[Witness]:
+def _selection(links: Sequence[LinkAgreement]) -> list[LinkAgreement]:
     """The links that are listed, nearest first: both agreeing and contradicting ones get lines."""
     ranked = sorted(links, key=lambda w: w.distance2)
     against = [w for w in ranked if not w.agrees]
@@ -108,7 +108,7 @@ def maps_words(explanation: MapsExplanation) -> list[str]:
     if explanation.nearest:
         lines.append("  weakest links:" if explanation.joined else "  nearest to a link:")
     lines += [f"    {_near(near_miss, explanation.reason)}" for near_miss in explanation.nearest]
-    lines += [f"  {_constraint(constraint)}" for constraint in explanation.rulings]
+    lines += [f"  {_constraint(constraint)}" for constraint in explanation.constraints]
     return lines
 
 
@@ -141,7 +141,7 @@ def _vector(vector: Array) -> str:
 
 
 def _aliased(explanation: PairExplanation) -> str:
-    count = int(explanation.evidence.get(DOUBLES, 0.0))
+    count = int(explanation.evidence.get(ALIASED, 0.0))
     return f", {count} of these are found at other places too" if count else ""
 
 

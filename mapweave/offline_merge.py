@@ -28,13 +28,13 @@ class Parts:
 
     Attributes:
         maps: the robots' own, by id.
-        rulings: manual constraints in any of the files.
+        constraints: manual constraints in any of the files.
         notes: what was left out, one sentence each.
         history: history of the maps in any of the files, in order.
     """
 
     maps: dict[MapId, HybridMap]
-    rulings: ManualConstraints
+    constraints: ManualConstraints
     notes: tuple[str, ...] = ()
     history: tuple[MapEvent, ...] = ()
 
@@ -65,7 +65,7 @@ def parts_of(files: Mapping[Path, MapFile]) -> Parts:
                 if _length(kept) < _length(hybrid_map):
                     notes.append(f"map {map_id} is taken from {path}, since that in {kept_path} is older")
             maps[map_id], origin[map_id] = hybrid_map, path
-        constraints += ManualConstraints(content.rulings)
+        constraints += ManualConstraints(content.constraints)
     events = {hybrid_map for content in files.values() for hybrid_map in content.history}
     history = sorted(events, key=lambda hybrid_map: (hybrid_map.stamp_ns, hybrid_map.kind, hybrid_map.words))
     return Parts(maps, constraints, tuple(notes), tuple(history))
@@ -108,7 +108,7 @@ def merge_parts(
         InvalidValue: a map cannot be merged; writing the others would lose it.
     """
     merger = Merger(settings=settings)
-    merger.rule(constraints)
+    merger.constrain(constraints)
     changes = [
         (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()
     ]
@@ -132,4 +132,4 @@ def merge_map_files(paths: Iterable[Path]) -> MapFile:
         InvalidValue: a map cannot be merged.
     """
     parts = parts_of({path: read_map_file(path) for path in paths})
-    return map_file_of(merge_parts(parts.maps, parts.rulings), parts.history)
+    return map_file_of(merge_parts(parts.maps, parts.constraints), parts.history)

@@ -12,7 +12,7 @@ from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.storage.map_file import MapFile
-from mapweave.vision.lens import Distortion, Lens
+from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
 from mapweave.vision.sift import Sift
 
 
@@ -33,14 +33,12 @@ def relocalizer_of(content: MapFile) -> Relocalizer:
     return Relocalizer(active, active.node, merged)
 
 
-def view_of(
-    image: NDArray[np.uint8], camera: Camera, distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
-) -> View:
+def view_of(image: NDArray[np.uint8], camera: Camera, distortion: Distortion = NO_DISTORTION) -> View:
     """The features of an image, for `Relocalizer.answer`.
 
     Args:
         image: (H, W) grey, as it comes from the camera.
         camera: that took it; its mount says where on the robot it is.
-        distortion: of its lens, OpenCV's five coefficients.
+        distortion: of its lens.
     """
     return Sift(Lens(camera, distortion)).extract(image).view(camera)

@@ -154,4 +154,4 @@ def _together(
     refused.sort(key=lambda refusal: refusal.pair)
     components = tuple(component for _, component in graphs)
     whole = MergedMap(dict(sorted(maps.items())), tuple(links), tuple(refused), components, poses, solved)
-    return replace(whole, rulings=constraints)
+    return replace(whole, constraints=constraints)

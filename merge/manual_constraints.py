@@ -24,14 +24,14 @@ class AppliedConstraints:
         links: without those that are excluded.
         refused: what was taken away, with reasons.
         whole: the maps as they came.
-        rulings: manual constraints, in force or not.
+        constraints: manual constraints, in force or not.
     """
 
     maps: Mapping[MapId, HybridMap]
     links: tuple[Link, ...]
     refused: tuple[RefusedLink, ...]
     whole: Mapping[MapId, HybridMap]
-    rulings: ManualConstraints
+    constraints: ManualConstraints
 
     def completed(self, merged: MergedMap) -> MergedMap:
         """The merge of the rest, with the original maps, so that a constraint can be withdrawn.
@@ -39,7 +39,7 @@ class AppliedConstraints:
         Args:
             merged: the merge of `maps`, `links` and `refused`.
         """
-        return replace(merged, maps=dict(sorted(self.whole.items())), rulings=self.rulings)
+        return replace(merged, maps=dict(sorted(self.whole.items())), constraints=self.constraints)
 
 
 def apply_constraints(

@@ -22,7 +22,7 @@ class ConsistencySettings:
         floor_heading: heading error of any loop that no covariance tells of, rad.
         least_links: independent links (no node in common) that join two pieces.
         dominance: how many times the landmarks of a contradicting set the kept set must have, and how many
-            times its witnesses if that set would be believed without it.
+            times its independent links if that set would be believed without it.
     """
 
     gate: Positive = 16.27
@@ -40,12 +40,12 @@ class ExclusionSettings:
         least_apart: centres of two robots are never nearer than this, m, unless both tell their radii: with
             a camera and two driven wheels few are narrower.
         doubt: chance at most that a true merge is refused, ever.
-        least_witnesses: independent moments that must make the merge half as likely each.
+        least_moments: independent moments that must make the merge half as likely each.
     """
 
     least_apart: Positive = 0.2
     doubt: Annotated[float, Meta(gt=0.0, lt=1.0)] = 1e-3
-    least_witnesses: Annotated[int, Meta(ge=1)] = 3
+    least_moments: Annotated[int, Meta(ge=1)] = 3
 
 
 @dataclass(frozen=True)

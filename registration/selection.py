@@ -37,7 +37,7 @@ class SelectionSettings:
     """How many landmarks a node keeps, and which.
 
     Attributes:
-        most_bytes: what a node may cost on the wire, all but its wake included, bytes; at least 660.
+        most_bytes: what a node may cost on the wire without its trajectory segment, bytes; at least 660.
     """
 
     most_bytes: int = 3000

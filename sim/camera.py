@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
-
-Distortion = tuple[float, float, float, float, float]
-"""(k1, k2, p1, p2, k3), OpenCV's order."""
+from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import NO_DISTORTION, Distortion, RadialTangential
 
 WEBCAM = Camera(width=320, height=240, fx=277.0, fy=277.0, cx=159.5, cy=119.5, mount_height=0.3)
 """60 degrees across, on a mast above the axle."""
@@ -83,7 +82,7 @@ class CameraSetup:
     """
 
     intrinsics: Camera = WEBCAM
-    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Distortion = NO_DISTORTION
     read_noise: float = 2.0
     shot_noise: float = 0.0
     exposure: Exposure = field(default_factory=Exposure)
@@ -98,23 +97,25 @@ class CameraSetup:
         check_range("camera: read_noise", self.read_noise, 0.0, 60.0)
         check_range("camera: shot_noise", self.shot_noise, 0.0, 60.0)
         check_range("camera: dropped", self.dropped, 0.0, 1.0)
-        for value in self.distortion:
-            check_range("camera: distortion", value, -10.0, 10.0)
         if max(self.intrinsics.width, self.intrinsics.height) > 2048:
             raise InvalidValue("camera: the simulator draws at most 2048 pixels across and down")
-        if not self._lens_is_single():
+        if isinstance(self.distortion, Equidistant):
+            return
+        for value in self.distortion:
+            check_range("camera: distortion", value, -10.0, 10.0)
+        if not self._lens_is_single(self.distortion):
             raise InvalidValue(
                 f"camera: with distortion {list(self.distortion)} the lens folds the image's corners over: "
                 "use smaller coefficients or a longer focal length"
             )
 
-    def _lens_is_single(self) -> bool:
+    def _lens_is_single(self, distortion: RadialTangential) -> bool:
         """Whether every pixel comes from one ray less than 80 degrees off the axis."""
         c = self.intrinsics
         columns, rows = np.linspace(0, c.width - 1, 33), np.linspace(0, c.height - 1, 25)
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
         matrix = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-        lens = np.array(self.distortion)
+        lens = np.array(distortion)
         rays = undistorted(pixels, matrix, lens)
         if not np.isfinite(rays).all() or np.hypot(*rays.T).max() > math.tan(math.radians(80)):
             return False
@@ -177,6 +178,8 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
         raise InvalidValue(f"{name} is {value:g}, must be between {low:g} and {high:g}")
 
 
+FISHEYE = Equidistant(fx=115.0, fy=115.4, cx=158.6, cy=120.9, k=(-0.02, 0.004, -0.003, 0.0005))
+
 CAMERAS: dict[str, CameraSetup] = {
     "webcam": CameraSetup(),
     "wide": CameraSetup(
@@ -201,6 +204,8 @@ CAMERAS: dict[str, CameraSetup] = {
         exposure=Exposure(band=0.2, lag=0.8, gain_error=0.1, vignetting=0.3, seconds=0.02),
         dropped=0.02,
     ),
+    "fisheye": CameraSetup(FISHEYE.ideal(320, 240, mount_height=0.3), distortion=FISHEYE),
 }
 """Cameras by name: `webcam` is ideal but for noise; `wide` sees 106 degrees across and bends what it sees;
+`fisheye` sees 160 degrees;
 `phone` is sharp and quick but blurs a little in turns; `cheap` is noisy, slow to adapt, and drops frames."""

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
-from mapweave.sim.camera import CameraSetup, Distortion, undistorted
+from mapweave.sim.camera import CameraSetup, undistorted
 from mapweave.sim.renderer import Renderer
 from mapweave.sim.scene import Scene
 from mapweave.sim.texture import Image
+from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import NO_DISTORTION, Distortion
 
 MARGIN_PX = 2
 """The ideal picture reaches so far beyond what the lens shows, for interpolation."""
@@ -23,6 +25,8 @@ SPARE_PX = (96, 192)
 """Rows and columns by which the field of noise is larger than a picture: each cuts another piece of it."""
 STEPS_PER_OCTAVE = 4
 """The strength of noise goes with the gain in steps of this share of a doubling."""
+FARTHEST_TANGENT = 3.0
+"""Tangent of the angle from the axis beyond which a fisheye's picture is black."""
 LEAST_BLUR_PX = 0.5
 """Less motion than this while the shutter is open cannot be seen."""
 MOST_LAYERS = 8
@@ -42,7 +46,7 @@ class Imager:
         """
         self.setup = setup
         camera = setup.intrinsics
-        self._lens = _lens(camera, setup.distortion) if any(setup.distortion) else None
+        self._lens = _lens(camera, setup.distortion) if setup.distortion != NO_DISTORTION else None
         self._ideal = Renderer(camera if self._lens is None else self._lens[0], background)
         self._drops = np.random.default_rng([*seed, 1])
         self._cuts = np.random.default_rng([*seed, 2])
@@ -54,7 +58,6 @@ class Imager:
         self._falloff = _falloff(camera, setup.exposure.vignetting) if setup.exposure.vignetting else None
         self._log_gain = 0.0
         self._mean: float | None = None
-        self._image_tick = 0
 
     @property
     def gain(self) -> float:
@@ -178,17 +181,27 @@ def _lens(camera: Camera, distortion: Distortion) -> tuple[Camera, NDArray[np.in
         the ideal ray that the lens shows there.
     """
     u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
-    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    rays = undistorted(np.stack([u, v], axis=-1).reshape(-1, 1, 2), matrix, np.array(distortion))
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
+    if isinstance(distortion, Equidistant):
+        rays = distortion.rays(pixels)
+        rays[~(np.hypot(*rays.T) < FARTHEST_TANGENT)] = np.nan
+    else:
+        matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+        rays = undistorted(pixels[:, None], matrix, np.array(distortion))
     ideal: Array = rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    left, top = np.floor(ideal.min(axis=0)).astype(int) - MARGIN_PX
-    right, low = np.ceil(ideal.max(axis=0)).astype(int) + MARGIN_PX
+    left, top = np.floor(np.nanmin(ideal, axis=0)).astype(int) - MARGIN_PX
+    right, low = np.ceil(np.nanmax(ideal, axis=0)).astype(int) + MARGIN_PX
     larger = Camera(
         width=int(right - left + 1), height=int(low - top + 1), fx=camera.fx, fy=camera.fy,
         cx=camera.cx - float(left), cy=camera.cy - float(top),
         mount_height=camera.mount_height, mount_forward=camera.mount_forward,
     )  # fmt: skip
-    places = (ideal - [left, top]).astype(np.float32).reshape(camera.height, camera.width, 2)
+    # What is too far out is outside the picture: black.
+    places = (
+        np.nan_to_num(ideal - [left, top], nan=-10.0)
+        .astype(np.float32)
+        .reshape(camera.height, camera.width, 2)
+    )
     whole, fraction = cv2.convertMaps(places[..., 0], places[..., 1], cv2.CV_16SC2)
     return larger, np.asarray(whole, np.int16), np.asarray(fraction, np.uint16)
 

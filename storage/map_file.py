@@ -75,7 +75,7 @@ class MapFile:
         changes: the map is their replay; a merged map's links are edges among them.
         poses: of a merged map's nodes: number of the component, pose in that component's frame.
         refused: of a merged map: pairs that were not linked. Edges of robots that are refused are only here.
-        rulings: manual constraints, in order.
+        constraints: manual constraints, in order.
         superseded: of a merged map: superseded nodes.
         faded: of a merged map: (N,) which of a node's N landmarks are faded.
         history: of a merged map: what has become of its maps by itself, in order.
@@ -86,7 +86,7 @@ class MapFile:
     changes: tuple[ChangeBody, ...]
     poses: Mapping[NodeId, tuple[Number, PoseGaussian]] = field(default_factory=dict)
     refused: tuple[RefusedPair, ...] = ()
-    rulings: tuple[ManualConstraint, ...] = ()
+    constraints: tuple[ManualConstraint, ...] = ()
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     history: tuple[MapEvent, ...] = ()

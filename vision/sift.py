@@ -86,6 +86,7 @@ class Sift:
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Find the features of a grey image (H, W)."""
+        image = self._lens.rectified(image)
         keypoints, descriptors = self.describe(image)
         if not keypoints:
             return Features(
@@ -93,7 +94,10 @@ class Sift:
             )
         raw = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
         responses = np.array([k.response for k in keypoints], dtype=np.float64)
-        return Features(raw, self._lens.undistort(raw), encode(descriptors), responses)
+        codes = encode(descriptors)
+        if self._lens.rectifies:
+            return Features(self._lens.distort(raw), raw, codes, responses)
+        return Features(raw, self._lens.undistort(raw), codes, responses)
 
     def describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]:
         """The same before they are coded: keypoints, strongest first, and (N, 128) SIFT."""

@@ -28,10 +28,10 @@ from mapweave.wire.landmark_codec import MAX_LANDMARKS_BYTES, pack_landmarks, un
 from mapweave.wire.packing import Limit, pack, unpack
 from mapweave.wire.pose_codec import MAX_MEASURED, pack_camera, pack_pose, unpack_camera, unpack_pose
 from mapweave.wire.range_codec import pack_ranges, unpack_ranges
-from mapweave.wire.trajectory_codec import MAX_WAKE_BYTES, pack_trajectory, unpack_trajectory
+from mapweave.wire.trajectory_codec import MAX_SEGMENT_BYTES, pack_trajectory, unpack_trajectory
 
 MAX_RADIUS_MM = 100_000
-MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + MAX_WAKE_BYTES + 2048
+MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + MAX_SEGMENT_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 BODY = Limit("change", MAX_BODY_BYTES)
 CHANGE = Limit("change", MAX_CHANGE_BYTES)
@@ -62,7 +62,7 @@ class _NodePut(_Element, tag=1):
     clock: Name | None = msgspec.field(name="z", default=None)
     radius_mm: Annotated[int, Meta(ge=0, le=MAX_RADIUS_MM)] = msgspec.field(name="r", default=0)
     ranges: bytes | None = msgspec.field(name="g", default=None)
-    wake: bytes | None = msgspec.field(name="u", default=None)
+    segment: bytes | None = msgspec.field(name="u", default=None)
 
 
 class _NodeRetired(_Element, tag=2):
@@ -199,7 +199,7 @@ def _node_message(node: Node) -> _NodePut:
         node.clock or None,
         round(node.radius * 1000.0),
         pack_ranges(node.ranges) if len(node.ranges) else None,
-        pack_trajectory(node.wake, node.ranges.reach) if len(node.wake) else None,
+        pack_trajectory(node.segment, node.ranges.reach) if len(node.segment) else None,
     )
 
 
@@ -215,7 +215,7 @@ def _read_node(message: _NodePut) -> Node:
         message.clock or "",
         message.radius_mm / 1000.0,
         ranges,
-        TrajectorySegment() if message.wake is None else unpack_trajectory(message.wake, ranges),
+        TrajectorySegment() if message.segment is None else unpack_trajectory(message.segment, ranges),
     )
 
 

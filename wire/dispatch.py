@@ -43,7 +43,7 @@ class Dispatcher:
         self.refused = 0
         self._limit = limit
         self._tasks: deque[Callable[[], None]] = deque()
-        self._wake = threading.Condition()
+        self._changed = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -103,28 +103,28 @@ class Dispatcher:
 
         A handler must not close its own bus; if it does so all the same, it is not waited for.
         """
-        with self._wake:
+        with self._changed:
             self._closed = True
             self._tasks.clear()
-            self._wake.notify()
+            self._changed.notify()
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
     def _put(self, task: Callable[[], None], *, bounded: bool) -> bool:
-        with self._wake:
+        with self._changed:
             if self._closed:
                 return True
             if bounded and len(self._tasks) >= self._limit:
                 return False
             self._tasks.append(task)
-            self._wake.notify()
+            self._changed.notify()
             return True
 
     def _run(self) -> None:
         while True:
-            with self._wake:
+            with self._changed:
                 while not self._tasks and not self._closed:
-                    self._wake.wait()
+                    self._changed.wait()
                 if self._closed:
                     return
                 task = self._tasks.popleft()

@@ -5,11 +5,14 @@
     mapweave/1/<fleet>/agent/<agent>/log/<epoch>      question: a range of the log
     mapweave/1/<fleet>/agent/<agent>/alive/<epoch>    liveliness
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
-    mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
+    mapweave/1/<fleet>/agent/<agent>/mission          question: a mission order
     mapweave/1/<fleet>/agent/<agent>/drive            question: a person's velocity command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
-    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, rule, history
+    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain and
+                                                      history
+    mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
+    mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot base; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of the driver of that base
@@ -97,7 +100,7 @@ class Keys:
         return f"{self.root}/agent/*/status"
 
     def mission(self, agent: str) -> str:
-        """Where an agent takes an operator's commands."""
+        """Where an agent takes orders."""
         return f"{self.root}/agent/{check_name(agent)}/mission"
 
     def drive(self, agent: str) -> str:
@@ -158,6 +161,38 @@ class Keys:
         """Pattern: any server."""
         return f"{self.root}/server/*/map"
 
+    def server_mission(self, server: str) -> str:
+        """Where a server takes missions, and hands them on."""
+        return self._of_server("mission", server)
+
+    def any_mission(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/mission"
+
+    def missions(self, server: str) -> str:
+        """The missions that a server knows of."""
+        return self._of_server("missions", server)
+
+    def any_missions(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/missions"
+
+    def robots(self, server: str) -> str:
+        """The robots as a server sees them."""
+        return self._of_server("robots", server)
+
+    def any_robots(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/robots"
+
+    def reserve(self, server: str) -> str:
+        """Reservations of edges by a server."""
+        return self._of_server("reserve", server)
+
+    def any_reserve(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/reserve"
+
     def explain(self, server: str) -> str:
         """Explanations by a server."""
         return self._of_server("explain", server)
@@ -166,13 +201,13 @@ class Keys:
         """Pattern: any server."""
         return f"{self.root}/server/*/explain"
 
-    def rule(self, server: str) -> str:
+    def constrain(self, server: str) -> str:
         """Manual constraints to a server."""
-        return self._of_server("rule", server)
+        return self._of_server("constrain", server)
 
-    def any_rule(self) -> str:
+    def any_constrain(self) -> str:
         """Pattern: every server of the fleet."""
-        return f"{self.root}/server/*/rule"
+        return f"{self.root}/server/*/constrain"
 
     def history(self, server: str) -> str:
         """The history of the maps, from a server."""
@@ -193,10 +228,6 @@ class Keys:
     def server_alive(self, server: str) -> str:
         """Under which a server is alive."""
         return self._of_server("alive", server)
-
-    def servers_alive(self) -> str:
-        """Pattern: every server."""
-        return f"{self.root}/server/*/alive"
 
     # Keys of a robot base.
 
@@ -256,14 +287,6 @@ class Keys:
         """Which server, to which agent."""
         server, agent = self._parse_names("server/*/poses/*", key)
         return server, agent
-
-    def parse_server_alive(self, key: str) -> str:
-        """Which server."""
-        return self._parse_names("server/*/alive", key)[0]
-
-    def parse_server_status(self, key: str) -> str:
-        """Which server."""
-        return self._parse_names("server/*/status", key)[0]
 
     def _of_map(self, what: str, map_id: MapId) -> str:
         return f"{self.root}/agent/{check_name(map_id.agent)}/{what}/{check_epoch(map_id.epoch)}"

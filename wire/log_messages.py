@@ -30,7 +30,6 @@ Scalar = bool | int | float | str
 Id = Annotated[int, Meta(ge=0)]
 """Drawn by chance, below 2^64."""
 Sequence = Annotated[int, Meta(ge=1, le=MAX_NUMBER)]
-Encoded = Annotated[bytes, Meta(max_length=MAX_CHANGE_BYTES)]
 
 
 @dataclass(frozen=True, slots=True)

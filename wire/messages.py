@@ -1,4 +1,4 @@
-"""Questions about the fleet's map, their answers, and what people rule, as bytes.
+"""Questions about the fleet's map, their answers, and manual constraints, as bytes.
 
 See mapweave.hybridmap.query and mapweave.hybridmap.explanation for what they mean. Their fields travel under
 their own names.
@@ -11,9 +11,12 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
+from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
+from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.query import (
     MAX_CANDIDATES,
@@ -40,13 +43,13 @@ class KeptHistory:
     """What a server keeps on its disk of what has happened.
 
     Attributes:
-        happenings: in order.
+        events: in order.
         parts: maps that were one when it was written, each in one set.
         apart: pairs of maps that are reported as kept apart.
         set_apart: maps that are reported as set apart.
     """
 
-    happenings: tuple[MapEvent, ...] = ()
+    events: tuple[MapEvent, ...] = ()
     parts: tuple[frozenset[MapId], ...] = ()
     apart: frozenset[tuple[MapId, MapId]] = frozenset()
     set_apart: frozenset[MapId] = frozenset()
@@ -64,8 +67,16 @@ LIMITS: dict[type, Limit] = {
     PairExplanation: Limit("explanation", 2 * MAX_BODY_BYTES + 4_000_000, 200_000),
     FleetExplanation: Limit("explanation", 8_000_000, 500_000),
     RouteExplanation: Limit("explanation of a route", 16_000_000, 200_000),
-    ManualConstraint: Limit("ruling", 4096),
+    ManualConstraint: Limit("manual constraint", 4096),
     History: Limit("history", 2**26, 1_000_000),
+    AgentStatus: Limit("agent status", 2**15),
+    DriveRequest: Limit("drive request", 256),
+    DriveAnswer: Limit("drive answer", 2**15 + 256),
+    FleetStatus: Limit("fleet status", 2**24, 200_000),
+    MissionOrder: Limit("mission", 2048),
+    MissionReport: Limit("mission report", 2**15),
+    MissionRequest: Limit("mission request", 2048),
+    Missions: Limit("missions", 2**22, 50_000),
     KeptHistory: Limit("history", 2**26, 2_000_000),
 }
 """Kinds of messages."""

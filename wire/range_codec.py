@@ -15,9 +15,8 @@ import numpy as np
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.pose import Array
-from mapweave.hybridmap.ranges import MOST, Ranges
+from mapweave.hybridmap.ranges import Ranges
 
-MAX_RANGE_BYTES = 2 + 3 * MOST
 BEARING_STEP = 1e-4
 MOST_STEPS = 31415
 """Bearings of half a turn to either side are the same; one step more would come back as the other."""

@@ -20,22 +20,22 @@ from mapweave.wire.range_codec import pack_bearings, pack_distances, unpack_bear
 
 AGE_STEP = 1e-2
 PLACE_STEP = 1e-3
-MAX_WAKE_BYTES = MOST * (8 + MOST_SENSORS)
+MAX_SEGMENT_BYTES = MOST * (8 + MOST_SENSORS)
 
 
-def pack_trajectory(wake: TrajectorySegment, reach: float) -> bytes:
+def pack_trajectory(segment: TrajectorySegment, reach: float) -> bytes:
     """Encode.
 
     Args:
-        wake: a segment with at least one moment.
+        segment: a segment with at least one moment.
         reach: of the node's proximity sensors, m.
     """
-    x, y, headings = wake.node_from_robot.T
+    x, y, headings = segment.node_from_robot.T
     return (
-        np.rint(wake.ages / AGE_STEP).astype("<i2").tobytes()
+        np.rint(segment.ages / AGE_STEP).astype("<i2").tobytes()
         + np.rint(np.concatenate([x, y]) / PLACE_STEP).astype("<i2").tobytes()
         + pack_bearings(headings)
-        + pack_distances(wake.distances.ravel(), reach)
+        + pack_distances(segment.distances.ravel(), reach)
     )
 
 

@@ -31,6 +31,8 @@ from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import Distortion, RadialTangential
 from mapweave.wire.codec import decode_body, encode_body
 from mapweave.wire.packing import Limit, pack, unpack
 from mapweave.wire.pose_codec import pack_camera, pack_pose, unpack_camera, unpack_pose
@@ -76,6 +78,10 @@ def _events(events: list[dict[str, Any]]) -> tuple[MapEvent, ...]:
     return tuple(_convert(event, _schema(MapEvent)) for event in read)
 
 
+def _distortion(plain: list[float] | dict[str, Any]) -> Distortion:
+    return _convert(plain, _schema(Equidistant if isinstance(plain, dict) else RadialTangential))  # type: ignore[no-any-return]
+
+
 FORMS: dict[Any, Form] = {
     PoseGaussian: Form(bytes, unpack_pose),
     Pose2: Form(tuple[Coordinate, Coordinate, Coordinate], lambda numbers: Pose2(*numbers)),
@@ -84,6 +90,7 @@ FORMS: dict[Any, Form] = {
     Node: Form(bytes, _node),
     Edge: Form(bytes, _edge),
     Ends: Form(tuple[list[Any], list[Any]], _ends),
+    Distortion: Form(list[float] | dict[str, Any], _distortion),
     tuple[MapEvent, ...]: Form(list[dict[str, Any]], _events),
 }
 PACKERS: Packers = {

@@ -121,11 +121,6 @@ class ZenohBus:
             self._closed.wait(0.01)
         return self.connected()
 
-    @property
-    def messages_lost(self) -> int:
-        """Messages that found the handlers' queue full."""
-        return self._owner.dispatcher.lost
-
     def close(self) -> None:
         """Take everything back and disconnect."""
         with self._owner.lock:

@@ -26,11 +26,13 @@ class BaseReading:
         way: distance of each wheel since the driver was made, m.
         proximity: (K,) m from the robot's edge; the reach where nothing is near.
         bumped: whether the bumper is pressed.
+        battery: charge, as a share; None if the base does not tell.
     """
 
     way: Wheels
     proximity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     bumped: bool = False
+    battery: float | None = None
 
 
 class Base(Protocol):

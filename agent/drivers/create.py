@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass
 
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
+from mapweave.agent.drivers.guarded_base import GuardedBase
 from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheel_guard import WheelGuard
@@ -15,13 +16,13 @@ from mapweave.agent.drivers.wheeled import WheeledRobot
 from mapweave.storage.settings_file import build
 
 START, SAFE, DRIVE_DIRECT, QUERY_LIST = 128, 131, 145, 149
-BUMPS, MODE, LEFT_COUNTS, RIGHT_COUNTS = 7, 35, 43, 44
-"""Sensor packets; their sizes are 1, 1, 2 and 2 bytes."""
+BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS = 7, 25, 26, 35, 43, 44
+"""Sensor packets; their sizes are 1, 2, 2, 1, 2 and 2 bytes. Charge and capacity are in mAh."""
 PASSIVE = 1
 """Mode without wheel control; a cliff, a wheel drop or the charger ends the Safe mode."""
 METRES_PER_COUNT = math.pi * 72e-3 / 508.8
 FASTEST_MM = 500
-QUERY = bytes([QUERY_LIST, 4, BUMPS, MODE, LEFT_COUNTS, RIGHT_COUNTS])
+QUERY = bytes([QUERY_LIST, 6, BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS])
 STOP = struct.pack(">Bhh", DRIVE_DIRECT, 0, 0)
 
 
@@ -36,37 +37,26 @@ class CreateOptions:
     port: str
 
 
-class CreateBase:
+class CreateBase(GuardedBase):
     """The base. It has no watchdog, so a `WheelGuard` stops its wheels."""
 
     geometry = Geometry(radius=0.175, axle=0.235, max_forward=0.3, max_turn=0.8)
 
     def __init__(self, port: str) -> None:
         """Create a base without opening the port."""
-        self._path = port
-        self._port: SerialPort | None = None
-        self._guard: WheelGuard | None = None
+        super().__init__(port)
         self._passive = False
         self._counters = [WheelCounter(METRES_PER_COUNT, 16, FASTEST_MM / 1e3) for _ in range(2)]
 
     def open(self) -> None:
         """Enter Safe mode, in which the robot stops at cliffs and when it is lifted."""
         self._port = SerialPort(self._path, 115200)
-        # An incomplete command of before takes up to four bytes; opcode 0 is ignored.
+        # An earlier incomplete command takes up to four bytes; opcode 0 is ignored.
         self._port.write(bytes(4) + bytes([START, SAFE]))
         # An incomplete command takes up to four bytes of the first stop; the second is complete.
         self._guard = WheelGuard(self._port.descriptor, STOP * 2)
         self.drive(Wheels())
         self.read()
-
-    def close(self) -> None:
-        """Stop the wheels by the guard, and close the port."""
-        if self._guard is not None:
-            self._guard.close()
-            self._guard = None
-        if self._port is not None:
-            self._port.close()
-            self._port = None
 
     def nearest(self, speeds: Wheels) -> Wheels:
         """Round to whole mm/s."""
@@ -84,15 +74,16 @@ class CreateBase:
         self._guard.moving(bool(left or right))
 
     def read(self) -> BaseReading:
-        """Read encoders, bumper and mode."""
+        """Read encoders, bumper, battery and mode."""
         assert self._port is not None
         self._port.clear()
         self._port.write(QUERY)
-        bumps, mode, left, right = struct.unpack(">BBHH", self._port.read(6))
+        bumps, charge, capacity, mode, left, right = struct.unpack(">BHHBHH", self._port.read(10))
         self._passive = mode == PASSIVE
         now = time.monotonic()
         way = Wheels(self._counters[0].update(left, now), self._counters[1].update(right, now))
-        return BaseReading(way, bumped=bool(bumps & 0b11))
+        battery = min(charge / capacity, 1.0) if capacity else None
+        return BaseReading(way, bumped=bool(bumps & 0b11), battery=battery)
 
 
 def _millimetres(speeds: Wheels) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
+from mapweave.agent.drivers.guarded_base import GuardedBase
 from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheel_guard import WheelGuard
@@ -106,14 +107,12 @@ class KoalaOptions:
     port: str
 
 
-class KoalaBase:
+class KoalaBase(GuardedBase):
     """The base of a Koala. It has no watchdog, so a `WheelGuard` stops its wheels."""
 
     def __init__(self, port: str) -> None:
         """Create a base without opening the port."""
-        self._path = port
-        self._port: SerialPort | None = None
-        self._guard: WheelGuard | None = None
+        super().__init__(port)
         self._generation = SILVER
         self._counters: tuple[WheelCounter, ...] = ()
 
@@ -152,15 +151,6 @@ class KoalaBase:
         stop = self._generation.end + self._drive_command(0, 0)
         self._guard = WheelGuard(self._port.descriptor, stop)
         self.drive(Wheels())
-
-    def close(self) -> None:
-        """Stop the wheels by the guard, and close the port."""
-        if self._guard is not None:
-            self._guard.close()
-            self._guard = None
-        if self._port is not None:
-            self._port.close()
-            self._port = None
 
     def nearest(self, speeds: Wheels) -> Wheels:
         """Round to whole units."""

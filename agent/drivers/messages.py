@@ -28,7 +28,7 @@ from mapweave.agent.observation import (
     RobotDescription,
 )
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.limits import MAX_NUMBER, Stamp
+from mapweave.hybridmap.limits import MAX_NUMBER, Share, Stamp
 from mapweave.storage.image_file import decode_grey, image_size
 from mapweave.wire import typed
 from mapweave.wire.packing import Limit, pack, unpack
@@ -88,6 +88,7 @@ class _Observation(msgspec.Struct):
     size: tuple[Side, Side] = msgspec.field(name="s", default=(1, 1))
     encoding: str = RAW
     image: bytes | None = msgspec.field(name="i", default=None)
+    battery: Share | None = None
 
 
 def encode_step(step: StepRequest) -> bytes:
@@ -117,6 +118,8 @@ def encode_observation(observation: Observation) -> bytes:
         "r": observation.proximity.tolist(),
         "b": observation.bumped,
     }
+    if observation.battery is not None:
+        fields["battery"] = observation.battery
     if observation.image is not None:
         image = np.ascontiguousarray(observation.image)
         if image.ndim != 2 or image.dtype != np.uint8:
@@ -139,7 +142,8 @@ def decode_observation(data: bytes) -> Observation:
             f"observation: odometry of {forward:g} m and {turn:g} rad in one step is out of range"
         )
     image = None if seen.image is None else _image(seen.encoding, seen.size, seen.image)
-    return Observation(seen.stamp_ns, Odometry(forward, turn), image, np.array(seen.proximity), seen.bumped)
+    proximity = np.array(seen.proximity)
+    return Observation(seen.stamp_ns, Odometry(forward, turn), image, proximity, seen.bumped, seen.battery)
 
 
 def check_image(observation: Observation, description: RobotDescription) -> None:

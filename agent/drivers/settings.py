@@ -12,6 +12,7 @@ from msgspec import Meta
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import SettingsError
+from mapweave.vision.lens import Distortion, LensModel, lens_of
 
 REMOTE = "remote"
 """The driver of a robot base behind Zenoh keys, for example a simulated one."""
@@ -26,13 +27,14 @@ class CameraSettings:
     Attributes:
         width: width of the image, px.
         height: height of the image, px.
-        fx: horizontal focal length, px.
+        fx: horizontal focal length of the real image, px.
         fy: vertical focal length, px.
         cx: column of the principal point, px.
         cy: row of the principal point, px.
         height_m: height of the optical centre above the floor, m.
         forward_m: how far the optical centre stands ahead of the axle, m.
-        distortion: (k1, k2, p1, p2, k3) of the lens, OpenCV's order.
+        lens: model of the lens: `radial-tangential`, or `equidistant` for a fisheye lens.
+        distortion: (k1, k2, p1, p2, k3), or (k1, k2, k3, k4) of an equidistant lens, OpenCV's order.
         source: number or path of a video device, a video file, or the URL of an RTSP or HTTP stream.
         delay: time from the middle of the exposure until the frame is here, s; subtracted from the stamps.
         lock_exposure: fix exposure and white balance after the first second.
@@ -46,17 +48,27 @@ class CameraSettings:
     cy: float
     height_m: float
     forward_m: float = 0.0
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    lens: LensModel = LensModel.RADIAL_TANGENTIAL
+    distortion: tuple[float, ...] = ()
     source: str = "0"
     delay: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
     lock_exposure: bool = False
 
     @property
-    def intrinsics(self) -> Camera:
-        """The ideal camera on the robot."""
-        return Camera(
+    def optics(self) -> tuple[Camera, Distortion]:
+        """The ideal camera on the robot, and the lens.
+
+        Raises:
+            InvalidValue: the coefficients are not those of such a lens, or it folds.
+        """
+        image = Camera(
             self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.height_m, self.forward_m
         )
+        return lens_of(image, self.lens, self.distortion)
+
+    def __post_init__(self) -> None:
+        """Refuse what no camera can be; see `optics`."""
+        _ = self.optics
 
 
 @dataclass(frozen=True)
@@ -122,8 +134,7 @@ class RobotSettings:
                 raise SettingsError(f"[robot.geometry] {name} is missing: the driver cannot know it")
         assert geometry.radius and geometry.axle and geometry.max_forward and geometry.max_turn
         given = RobotDescription(
-            self.camera.intrinsics,
-            self.camera.distortion,
+            *self.camera.optics,
             radius=geometry.radius,
             axle=geometry.axle,
             max_forward=geometry.max_forward,

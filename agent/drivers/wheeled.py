@@ -136,6 +136,7 @@ class WheeledRobot:
             None if frame is None else frame.image,
             reading.proximity if used else np.zeros(0),
             reading.bumped and fresh,
+            reading.battery,
         )
 
     def act(self, command: Command) -> Command:
@@ -225,5 +226,5 @@ class WheeledRobot:
         if self._opened and not self._failure:
             log.warning("%s; the robot stands until it answers again", failure)
         self._failure = failure
-        # A command of before must not be driven after the reconnection.
+        # An earlier command must not be driven after the reconnection.
         self._command = None

@@ -58,16 +58,6 @@ def pixel_gate(probability: float) -> float:
     return -2.0 * math.log1p(-probability)
 
 
-def chi_squares(innovations: Array, covariance: Array) -> Array:
-    """(N,) squared Mahalanobis distance of each innovation by itself.
-
-    Args:
-        innovations: (N, 2) measured minus expected.
-        covariance: (2N, 2N) S, joint, ordered as the innovations' rows.
-    """
-    return _quadratic(_blocks(covariance)[_diagonal(len(innovations))], innovations)
-
-
 def one_point_consensus(innovations: Array, covariance: Array, gate: float) -> Mask:
     """The largest set of innovations that one of them explains.
 

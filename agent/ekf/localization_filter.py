@@ -187,15 +187,6 @@ class LocalizationFilter:
         """Forget landmarks; ids that are not there are ignored."""
         self._keep(~np.isin(self.ids, ids))
 
-    def rebase(self, new_node_from_node: PoseGaussian) -> None:
-        """Hand over to another node's frame; landmarks that cannot be anchored there are let go.
-
-        Args:
-            new_node_from_node: pose of the old node in the new one, independent of the filter's state.
-        """
-        self._state, ahead = self._state.rebased(new_node_from_node, self._camera.mount_forward)
-        self._keep(ahead & self._anchorable(self._state.rays))
-
     @property
     def state(self) -> LocalizationState:
         """The whole state, a value: for figures and tests."""

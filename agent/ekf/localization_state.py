@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.ekf.inverse_depth import points_of_rays, project_anchored
+from mapweave.agent.ekf.inverse_depth import points_of_rays
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
@@ -130,42 +130,6 @@ class LocalizationState:
         return LocalizationState(
             self.pose_vector, self.rays[mask], self.first[mask], self.covariance[np.ix_(index, index)]
         )
-
-    def rebased(
-        self, new_from_node: PoseGaussian, mount_forward: float
-    ) -> tuple[LocalizationState, NDArray[np.bool_]]:
-        """The state in another node's frame, whose error is common to all of it.
-
-        Args:
-            new_from_node: pose of this node in the other, independent of the state.
-            mount_forward: of the optical centre ahead of the axle, m.
-
-        Returns:
-            The state, and (n,) which of its landmarks mean something there (are ahead of the other node).
-        """
-        n = len(self.rays)
-        node_from_new = new_from_node.inverse()
-        at = node_from_new.mean.vector
-        turn = turning(node_from_new.mean)
-        edge = turn @ node_from_new.covariance @ turn.T
-        projected = project_anchored(at, self.rays, mount_forward)
-        by_edge = np.empty((3 + 3 * n, 3))
-        away = turn[:2, :2].T @ (self.pose_vector[:2] - at[:2])
-        by_edge[:3] = -turn.T
-        by_edge[:2, 2] = away[1], -away[0]
-        by_edge[3:] = projected.by_pose.reshape(3 * n, 3)
-        p = self.covariance
-        moved = np.empty_like(p)
-        moved[:3, :3] = turn.T @ p[:3, :3] @ turn
-        moved[3:, :3] = (projected.by_ray @ (turn.T @ p[:3, 3:]).T.reshape(n, 3, 3)).reshape(3 * n, 3)
-        moved[:3, 3:] = moved[3:, :3].T
-        half = (projected.by_ray @ p[3:, 3:].reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-        moved[3:, 3:] = (projected.by_ray @ half.T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-        moved += by_edge @ edge @ by_edge.T
-        mean = new_from_node.mean @ Pose2.from_vector(self.pose_vector)
-        # What was linearised in the old frame and what will be in the new agree only at one estimate.
-        state = LocalizationState(mean.vector, projected.rays, projected.rays, 0.5 * (moved + moved.T))
-        return state, projected.scale > NEAREST_SCALE
 
 
 def turning(pose: Pose2) -> Array:

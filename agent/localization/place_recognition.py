@@ -11,19 +11,6 @@ from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.registration.recognition import Recognition, recognise
 
-
-def recognise_place(
-    hybrid_map: HybridMap,
-    view: View,
-    rng: np.random.Generator,
-) -> tuple[Node, Recognition] | None:
-    """The node of a robot's own map that a view shows best, and how it was recognised; or None.
-
-    See `recall_all`.
-    """
-    return next(iter(recognise_places(hybrid_map, view, rng)), None)
-
-
 TRIES = 5
 """Nodes that are verified, by descending votes."""
 VOTES = 6
@@ -67,7 +54,7 @@ def recognise_places(
     return sorted(recalled, key=lambda pair: -pair[1].inliers)
 
 
-def lookalikes(
+def aliased_places(
     recalled: list[tuple[Node, Recognition]], rival: float, apart: float
 ) -> tuple[Node, Node] | None:
     """The node that a view shows best, and another one, elsewhere, that it shows about as well; or None.

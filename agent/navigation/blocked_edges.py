@@ -35,7 +35,3 @@ class BlockedEdges:
     def at(self, now: float) -> tuple[Pair, ...]:
         """Pairs that count as blocked at a time, s."""
         return tuple(pair for pair, until in self._until.items() if now < until)
-
-    def next_change(self, now: float) -> float:
-        """Seconds until a block is forgotten; 0 without blocks."""
-        return min((until - now for until in self._until.values() if now < until), default=0.0)

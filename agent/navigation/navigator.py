@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 
 from mapweave.agent.cautious_driving import lacks_rangers
-from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.global_localization.candidates import Candidate, FleetMap, OwnMap
@@ -26,6 +25,7 @@ from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteProgress
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
+from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeKind, Node, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -45,6 +45,7 @@ class Stage(StrEnum):
     BLOCKED = "waiting at an obstacle"
     WAITING = "waiting for a route"
     ARRIVED = "parked at the goal"
+    GIVEN_UP = "gave up its goal"
 
 
 RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
@@ -56,6 +57,8 @@ ANSWER_PATIENCE = 100
 """Ticks that an answer may take before the question counts as lost."""
 PAUSE = 2.0
 """How long it waits before what is in its way, and before it asks again for a route, s."""
+REFUSED = 20.0
+"""A fleet that answers for so long that there is no way is believed, s: it may first have to merge."""
 TRUSTED = 1.0
 """After a block it still knows where it is if it has driven less than this blindly, m."""
 
@@ -69,6 +72,7 @@ class Navigator:
         fix: where the robot is, or None while lost.
         goal: the node to reach.
         legs: nodes on the first route that was given.
+        progress: share of the present route that is driven.
         tally: statistics of the drive so far.
         traverse: from one node to another, if the last step has ended one.
         refined: a node of the own map that was refined by the last step, if any.
@@ -90,6 +94,7 @@ class Navigator:
         self.fix: Fix | None = None
         self.goal = goal
         self.legs = 0
+        self.progress = 0.0
         self.tally = DriveStatistics()
         self.traverse: Traverse | None = None
         self.refined: Node | None = None
@@ -113,12 +118,22 @@ class Navigator:
         self._goal_hidden = False
         self._following = self._searching = self._parking_retried = False
         self._touched = ""
+        self._refused_since: float | None = None
+        self._driven: set[tuple[NodeId, NodeId]] = set()
+        self._progressed_at = 0.0
+        self._refusing = False
+        self._trouble = "it does not know where it is"
         self._behaviour = self._go()
 
     @property
     def arrived(self) -> bool:
         """Whether the robot is parked at the goal."""
         return self.stage == Stage.ARRIVED
+
+    @property
+    def given_up(self) -> bool:
+        """Whether the robot stands, since the goal cannot be reached; `detail` is the reason."""
+        return self.stage == Stage.GIVEN_UP
 
     def step(
         self, observation: Observation, answers: tuple[Answer, ...], standing: bool = False
@@ -134,6 +149,10 @@ class Navigator:
         self._local_planner.see(observation)
         if self.fix is not None and (standing or not self._following):
             self.fix.follow(observation, self._description)
+        if standing:
+            self._progressed_at += self._description.tick
+        elif not self.arrived and self._motion.now - self._progressed_at > self._settings.navigation.patience:
+            self._give_up(f"no nearer in {self._settings.navigation.patience:g} s: {self._trouble}")
         command = Command() if standing else next(self._behaviour)
         fix = None if self._searching else self.fix
         self.traverse = self._traverse_recorder.see(fix, observation)
@@ -153,7 +172,7 @@ class Navigator:
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
 
     def _go(self) -> Behaviour:
-        while not self.arrived:
+        while not (self.arrived or self.given_up):
             if self.fix is None:
                 yield from self._find()
             assert self.fix is not None, "the search ends with a fix"
@@ -161,14 +180,26 @@ class Navigator:
             if (undriven := self._undriven(route)) is not None:
                 self._blocks.add(*undriven, self._motion.now)
             elif route:
+                self._refused_since = None
                 yield from self._follow(route, self.fix)
             else:
                 yield from self._wait_for_a_way()
+        yield from self._stand()
+
+    def _stand(self) -> Behaviour:
         while True:
             yield Command()
 
+    def _give_up(self, reason: str) -> None:
+        """Stand, and say why."""
+        if not self.given_up:
+            self.stage, self.detail = Stage.GIVEN_UP, reason
+            self._searching = self._following = False
+            self._behaviour = self._stand()
+
     def _find(self) -> Behaviour:
         self.stage, self._searching, self._goal_hidden = Stage.LOST, True, False
+        self._trouble = "it does not know where it is"
         expected, self._expected = self._expected, None
         place = yield from self._localization.search(expected)
         self._start_from(place)
@@ -199,6 +230,9 @@ class Navigator:
             trouble = f"{answer.error or 'no answer'}; "
             content = onboard_route(self._own_map, fix.node, self.goal, blocked)
         self.detail = f"{trouble}{content.reason}"
+        if not content.legs:
+            self._trouble = self.detail
+        self._refusing = not (trouble or blocked)
         self.legs = self.legs or len(content.legs)
         return content.legs
 
@@ -213,10 +247,12 @@ class Navigator:
         return None
 
     def _wait_for_a_way(self) -> Behaviour:
-        """Without a route: obstacles may go away; without obstacles the robot's pose may be wrong."""
-        self.stage = Stage.WAITING
-        if not self._blocks.at(self._motion.now):
-            self.fix = None
+        """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""
+        self.stage, now = Stage.WAITING, self._motion.now
+        if not self._blocks.at(now) and self._refused_since is None:
+            self.fix, self._refused_since = None, now
+        elif self._refusing and self._refused_since is not None and now - self._refused_since > REFUSED:
+            self._give_up(self._trouble)
         yield from self._motion.stand(PAUSE)
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
@@ -228,8 +264,12 @@ class Navigator:
         self._following, self._touched = True, ""
         while True:
             leg = follower.leg
+            if follower.blocked not in self._driven:
+                self._driven.add(follower.blocked)
+                self._progressed_at = self._motion.now
             command = follower.step(self._motion.observation)
             self.fix, self.stage, self.detail = follower.fix, follower.progress, follower.detail
+            self.progress = follower.leg / len(route)
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._failed_views = 0
@@ -266,6 +306,7 @@ class Navigator:
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
         self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._obstacle() or NO_PROGRESS}"
+        self._trouble = self.detail
         yield from self._motion.stand(PAUSE)
         if self.fix is not None and not self.fix.in_sight and self.fix.blind > TRUSTED:
             self.fix, self._expected = None, self._on_own_map(self.fix)

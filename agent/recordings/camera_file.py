@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,13 +10,14 @@ from typing import Any
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
+from mapweave.vision.lens import Distortion, LensModel, lens_of
 
 
-def read_camera(path: Path) -> tuple[Camera, tuple[float, float, float, float, float]]:
+def read_camera(path: Path) -> tuple[Camera, Distortion]:
     """Read a `camera.toml`: px, and metres above the floor.
 
     Returns:
-        The camera and the five coefficients of its lens.
+        The ideal camera and the lens.
 
     Raises:
         DeviceError: the file is missing or wrong.
@@ -30,16 +30,14 @@ def read_camera(path: Path) -> tuple[Camera, tuple[float, float, float, float, f
             mount_height=number(values, "height_m"),
             mount_forward=number(values, "forward_m") if "forward_m" in values else 0.0,
         )  # fmt: skip
-        k1, k2, p1, p2, k3 = (float(k) for k in values.get("distortion", (0.0,) * 5))
-        if not all(math.isfinite(k) for k in (k1, k2, p1, p2, k3)):
-            raise DeviceError(f"{path}: the lens's coefficients must be finite")
+        model = LensModel(values.get("lens", LensModel.RADIAL_TANGENTIAL))
+        return lens_of(camera, model, values.get("distortion", ()))
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file; it must give the camera's intrinsics") from None
     except KeyError as missing:
         raise DeviceError(f"{path}: {missing.args[0]!r} is missing") from None
     except (OSError, ValueError, TypeError, OverflowError, InvalidValue) as error:
         raise DeviceError(f"{path}: {error}") from None
-    return camera, (k1, k2, p1, p2, k3)
 
 
 def number(values: Mapping[str, Any], name: str) -> float:

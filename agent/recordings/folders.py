@@ -13,13 +13,13 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_in, images_of, read_increments, read_times
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Distortion, Images, Recording, Stamps, assembled
+from mapweave.agent.recordings.recording import Images, Recording, Stamps, assembled, without_odometry
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.image_file import image_size, read_grey
+from mapweave.vision.lens import NO_DISTORTION, Distortion, LensModel, lens_of
 
-NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
 
@@ -61,14 +61,18 @@ def euroc(folder: Path, options: RecordingOptions) -> Recording:
         _yaml_list(cam, text, "distortion_coefficients", 4),
     )
     model = re.search(r"^distortion_model:\s*(\S+)", text, re.M)
-    if model is not None and model[1] != "radial-tangential":
-        raise DeviceError(
-            f"{cam / 'sensor.yaml'}: lens model {model[1]} is not supported; radial-tangential is"
-        )
+    name = str(LensModel.RADIAL_TANGENTIAL) if model is None else model[1]
+    if name not in list(LensModel):
+        known = " and ".join(LensModel)
+        raise DeviceError(f"{cam / 'sensor.yaml'}: lens model {name} is not supported; {known} are")
     if not paths:
         raise DeviceError(f"{cam / 'data.csv'}: no images")
     fx, fy, cx, cy = intrinsics
-    given = _camera(paths[0], (fx, fy, cx, cy)), (lens[0], lens[1], lens[2], lens[3], 0.0)
+    try:
+        coefficients = [*lens, 0.0] if name == LensModel.RADIAL_TANGENTIAL else lens
+        given = lens_of(_camera(paths[0], (fx, fy, cx, cy)), LensModel(name), coefficients)
+    except InvalidValue as error:
+        raise DeviceError(f"{cam / 'sensor.yaml'}: {error}") from None
     return _folder(folder, "EuRoC", paths, stamps, given, options)
 
 
@@ -118,8 +122,10 @@ def images_folder(folder: Path, options: RecordingOptions) -> Recording:
     if options.odometry is not None or _is_poses(path):
         poses = read_poses(options.odometry or path)
         return assembled(folder, "folder of images", camera, distortion, images, poses)
-    increments = read_increments(path, len(paths))
-    return assembled(folder, "folder of images", camera, distortion, images, increments)
+    increments, damage = read_increments(path, len(paths))
+    images = Images(stamps[: len(increments)], images.read)
+    lines = (f"{damage}; the images before it are used",) if damage else ()
+    return assembled(folder, "folder of images", camera, distortion, images, increments, damage=lines)
 
 
 def _is_poses(path: Path) -> bool:
@@ -142,9 +148,11 @@ def _folder(
     camera, distortion = options.camera_of(folder, given)
     beside = next((p for p in (folder / "odometry.csv", folder / "odometry.txt") if p.exists()), None)
     odometry = options.odometry or beside
+    images = _images(paths, stamps_ns)
     if odometry is None:
-        raise DeviceError(f"{folder}: {kind}, {len(paths)} images, but {NO_ODOMETRY}")
-    return assembled(folder, kind, camera, distortion, _images(paths, stamps_ns), read_poses(odometry))
+        message = f"{kind}, {len(paths)} images, but {NO_ODOMETRY}"
+        raise without_odometry(folder, kind, camera, distortion, images, message)
+    return assembled(folder, kind, camera, distortion, images, read_poses(odometry))
 
 
 def _images(paths: Sequence[Path], stamps_ns: Stamps, camera: Camera | None = None) -> Images:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mapweave.agent.recordings.camera_file import read_camera
-from mapweave.agent.recordings.recording import Distortion
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.vision.lens import Distortion
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,6 @@ class RecordingOptions:
 
 
 NO_ODOMETRY = (
-    "no odometry: give --odometry FILE (stamped poses), or make a map of some of the images alone with "
-    "`mapweave map from-photos`"
+    "no odometry: give --odometry FILE (stamped poses), or let `mapweave replay` map it by its images alone, "
+    "without a scale"
 )

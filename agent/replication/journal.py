@@ -6,16 +6,19 @@ import secrets
 import threading
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgeRetired, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.mission_order import MAX_KEPT, MissionReport, Missions
 from mapweave.hybridmap.node import MapId, NodeId, check_name
 from mapweave.storage.database import Database
 from mapweave.wire.codec import decode_body, element_of, encode_body, wrap_body
 from mapweave.wire.keys import check_epoch
+from mapweave.wire.messages import decode, encode
 
 APPLICATION_ID = 0x4D574A4C
 """'MWJL' in the file's header."""
@@ -104,6 +107,8 @@ class Journal:
                     raise InvalidFile(f"{path}: this journal has no owner")
                 elif agent not in (None, owner[0]):
                     raise InvalidFile(f"{path}: is the journal of agent {owner[0]}, not of {agent}")
+                # A journal of before has none.
+                rows.execute("CREATE TABLE IF NOT EXISTS mission (id TEXT PRIMARY KEY, body BLOB NOT NULL)")
             self.agent = str(owner[0]) if agent is None else agent
         except BaseException:
             self._database.close()
@@ -278,6 +283,31 @@ class Journal:
                     {"epoch": map_id.epoch, "limit": limit},
                 )
                 return dropped.rowcount
+
+    def missions(self) -> list[MissionReport]:
+        """Missions that were kept; one that cannot be read is left out."""
+        reports = []
+        for (body,) in self._read("SELECT body FROM mission"):
+            with suppress(InvalidMessage):
+                reports.append(decode(body, MissionReport))
+        return list(Missions.newest(reports).reports)
+
+    def keep_missions(self, reports: Sequence[MissionReport]) -> None:
+        """Write what has become of missions in one transaction; the oldest of many are dropped.
+
+        Raises:
+            InvalidFile: the disk does not take it.
+        """
+        with self._lock, self._database.transaction() as rows:
+            rows.executemany(
+                "INSERT OR REPLACE INTO mission VALUES (?, ?)",
+                ((report.order.id, encode(report)) for report in reports),
+            )
+            rows.execute(
+                "DELETE FROM mission WHERE rowid NOT IN "
+                "(SELECT rowid FROM mission ORDER BY rowid DESC LIMIT ?)",
+                (MAX_KEPT,),
+            )
 
     def close(self) -> None:
         """Close the file."""

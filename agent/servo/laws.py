@@ -25,9 +25,6 @@ BETA_SHIFT: Array = np.array([0.0, -1.0, -1.0, 1.0, 1.0]) * math.pi
 PHI_SHIFT: Array = np.array([-1.0, -2.0, 0.0, -2.0, 0.0]) * math.pi
 """(5,) rad, phi~_i = phi + PHI_SHIFT[i]."""
 
-DIRECTION: Array = np.array([1.0, -1.0, -1.0, -1.0, -1.0])
-"""(5,) sign of the forward speed at each law's equilibrium: cos(beta) = DIRECTION[i] cos(beta~_i)."""
-
 LAWS = len(BETA_SHIFT)
 
 
@@ -43,14 +40,6 @@ def lyapunov(rho: Any, phi: Any, beta: Any) -> Array:
     rho = np.asarray(rho, dtype=np.float64)[..., None]
     value: Array = 0.5 * (rho**2 + phi_tilde**2 + beta_tilde**2)
     return value
-
-
-def lyapunov_rate(rho: Any, phi: Any, beta: Any, lambda_: float) -> Array:
-    """(..., 5) V_i' = -rho^2 cos^2(beta) - lambda beta~_i^2 under law i: never positive."""
-    _, beta_tilde = charts(phi, beta)
-    rho, beta = (np.asarray(a, dtype=np.float64)[..., None] for a in (rho, beta))
-    rate: Array = -((rho * np.cos(beta)) ** 2) - lambda_ * beta_tilde**2
-    return rate
 
 
 def control(phi: Any, beta: Any, lambda_: float) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ MEASUREMENTS: dict[str, str] = {
     "kitti_two": "mapweave eval merge DATA/kitti03 --robots 2 --json",
     "kitti_three": "mapweave eval merge DATA/kitti03 --robots 3 --json",
     "rules_fleets": "python -m benchmarks.rules --fleets 30 --seed 721 --json",
+    "rules_twins": "python -m benchmarks.rules --twins 100 --seed 752 --json",
     "rules_graphs": "python -m benchmarks.rules --g2o DATA/posegraph/intel.g2o DATA/posegraph/manhattan.g2o "
     "--json",
     "rules_trials": "python -m benchmarks.rules --trials warehouse twin-corridor --runs 2 --seed 722 --json",

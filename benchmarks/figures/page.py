@@ -6,8 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.figures.questions import INTRODUCTION, QUESTIONS, RULES, Question, Rule
+from benchmarks.figures.questions import INTRODUCTION, QUESTIONS, Question
 from benchmarks.figures.results import Result
+from benchmarks.figures.rules import RULES, Rule
 from mapweave.hybridmap.errors import InvalidValue
 
 FIELD = re.compile(r"\{([^{}:]+)(?::([^{}]*))?\}")

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from benchmarks.navigate.office import ROBOT, Office
 from benchmarks.navigate.plots import Plot
-from mapweave.agent.mission import GoTo, Idle
-from mapweave.agent.pipeline import Status
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.pose import Array, wrap_angle
 
 PATIENCE = 240.0
@@ -77,11 +77,11 @@ def drive(office: Office, plot: Plot, on_time: Callable[[float, str], None]) -> 
         on_time: called with the simulated time of the drive and what the robot is doing.
     """
     desired = _picture_from(office, plot)
-    office.command(Idle())
+    office.command(MissionKind.STOP)
     office.control.kidnap(ROBOT, plot.world_from_robot)
     office.advance(0.1)
     before, begin = office.control.status().robots[ROBOT].collisions, office.ticks
-    office.command(GoTo(plot.goal))
+    office.command(MissionKind.GO, plot.goal)
     found_s, events = None, list[tuple[float, str]]()
     while True:
         status = office.advance(LOOK_EVERY).status
@@ -128,7 +128,7 @@ def _reason(status: Status, error_m: float, error_deg: float, collisions: int) -
 
 def _picture_from(office: Office, plot: Plot) -> NDArray[np.uint8]:
     """What the robot sees from where the goal's image was taken; it has no mission meanwhile."""
-    office.command(Idle())
+    office.command(MissionKind.STOP)
     office.control.kidnap(ROBOT, plot.world_from_goal)
     office.advance(0.1)
     return _picture(office)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mapweave.agent.fleet_client import encode_mission
-from mapweave.agent.mission import Explore, Mission
 from mapweave.agent.settings import AgentSettings
-from mapweave.agent.status_message import AgentStatus
+from mapweave.fleet import send_order
+from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidFile, NotConnected
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, Stage
@@ -71,12 +71,9 @@ class Office:
         """Close journal and store."""
         self._fleet.end()
 
-    def command(self, mission: Mission) -> None:
+    def command(self, kind: MissionKind, node: NodeId | None = None) -> None:
         """Tell the robot what to do; it begins with the next tick."""
-        key = self._fleet.keys.mission(ROBOT)
-        replies = self._fleet.bus.ask(key, encode_mission(mission), 10.0)
-        if not replies or replies[0].error:
-            raise NotConnected(f"the robot did not take its mission: {replies[0].error if replies else ''}")
+        send_order(self._fleet.bus, self._fleet.keys, MissionOrder.new(ROBOT, kind, "benchmark", node))
 
     def advance(self, seconds: float) -> AgentStatus:
         """Let simulated time pass; returns what the robot says then."""
@@ -101,7 +98,7 @@ class Office:
             seconds: simulated time at most.
             on_time: called with the simulated time and a word on progress.
         """
-        self.command(Explore())
+        self.command(MissionKind.EXPLORE)
         while self.ticks < seconds * TICKS_PER_SECOND:
             report = self.advance(LOOK_EVERY)
             on_time(self.ticks / TICKS_PER_SECOND, f"{report.status.nodes} nodes")

@@ -29,7 +29,7 @@ from mapweave.registration.matching import match
 
 AGENT = "d"
 """Of all distractors."""
-NOBODYS = -1
+NO_SITE = -1
 """Number of the building that donors and distractors are in."""
 CUT = (0.25, 0.75)
 """Where the cut between the two views may be, as shares of the width."""
@@ -84,7 +84,7 @@ class Distractors:
             np.concatenate([a.depth_sigmas, b.depth_sigmas]) * scales,
         )  # fmt: skip
         node = Node(NodeId(AGENT, 1, number), 0, left.node.map_from_robot, left.node.camera, landmarks)
-        return Place(node, left.world_from_node, NOBODYS, np.clip(sift, 0, 255).astype(np.uint8))
+        return Place(node, left.world_from_node, NO_SITE, np.clip(sift, 0, 255).astype(np.uint8))
 
     def node(self, number: int) -> Node:
         """A place's node."""
@@ -106,7 +106,7 @@ def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -
         wishes = [
             Wish(site.world.plan.random_free_pose(rng, CLEARANCE)) for _ in range(round(site.share * count))
         ]
-        made = [placed(p, NodeId("donor", 1, 1), NOBODYS, rng) for p in photographed(site, wishes, progress)]
+        made = [placed(p, NodeId("donor", 1, 1), NO_SITE, rng) for p in photographed(site, wishes, progress)]
         donors += [place for place in made if len(place.node.landmarks) >= LEAST_LANDMARKS]
     return Distractors(donors, differences(places, seed), seed)
 

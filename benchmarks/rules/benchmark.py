@@ -1,13 +1,15 @@
 """What fails without each rule that rejects links or answers.
 
     python -m benchmarks.rules --fleets N [--g2o FILE ...] [--seed N] [--json]
+    python -m benchmarks.rules --twins N [--seed N] [--json]
     python -m benchmarks.rules --trials SCENARIO ... [--runs N] [--seed N] [--json]
     python -m benchmarks.rules --places N [--seed N] [--json]
 
 Each rule is switched off by itself, and the same is measured as with all rules. Fleets are those of
 `benchmarks.merge`, 50, 80 and 90 % of their links false: how many are as good as least squares with the true
-links alone (`good`), joined by no true link (`joined_falsely`), and how many false links are believed. Graphs
-in files are split among four robots: chi-square over the batch optimum. Trials are those of
+links alone (`good`), joined by no true link (`joined_falsely`), and how many false links are believed. Twins
+are pairs of robots where another place may give as many links, which agree, as the right one. Graphs in files
+are split among four robots: chi-square over the batch optimum. Trials are those of
 `benchmarks.merge_sim`; what their robots mapped is merged once more without each rule. Places are those of
 `benchmarks.relocalize`: recall of near views, and the share of views of twin rooms and of unknown buildings
 that are answered with a place.
@@ -30,7 +32,7 @@ from rich.progress import Progress
 from benchmarks.merge_sim.benchmark import SCENARIOS, SEEDS_APART
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.score import figures, wrong_by_kind
-from benchmarks.rules.fleets import SHARES, fleets, public_graphs
+from benchmarks.rules.fleets import SHARES, fleets, public_graphs, twins
 from benchmarks.rules.switches import MERGE_RULES, PLACE_RULES, by_rule
 from benchmarks.rules.trials import total, trial
 from mapweave.formats.g2o import read_g2o
@@ -64,6 +66,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.rules", description=__doc__.splitlines()[0])
     parser.add_argument("--fleets", type=int, default=0, metavar="N", help="of each share of false links")
+    parser.add_argument("--twins", type=int, default=0, metavar="N", help="pairs of robots")
     parser.add_argument("--g2o", type=Path, nargs="*", default=[], metavar="FILE", help="planar pose graphs")
     parser.add_argument("--trials", nargs="+", default=[], choices=list(SCENARIOS), metavar="SCENARIO")
     parser.add_argument("--runs", type=int, default=1, help="of each scenario (default 1)")
@@ -71,8 +74,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if min(arguments.fleets, arguments.places, arguments.seed) < 0 or arguments.runs < 1:
-        parser.error("--fleets, --places and --seed must be at least 0, --runs at least 1")
+    if min(arguments.fleets, arguments.twins, arguments.places, arguments.seed) < 0 or arguments.runs < 1:
+        parser.error("--fleets, --twins, --places and --seed must be at least 0, --runs at least 1")
     console = Console(stderr=True)
     found: dict[str, Any] = {"seed": arguments.seed}
     try:
@@ -85,6 +88,8 @@ def main() -> None:
                     MERGE_RULES,
                     lambda: fleets(arguments.seed, arguments.fleets, lambda: progress.advance(task)),
                 )
+            if arguments.twins:
+                found["twins"] = by_rule(MERGE_RULES, lambda: twins(arguments.seed, arguments.twins))
             if graphs:
                 found["graphs"] = by_rule(MERGE_RULES, lambda: public_graphs(graphs, ROBOTS))
             if arguments.places:

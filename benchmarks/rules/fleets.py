@@ -16,6 +16,8 @@ from synthetic.pose_graph import batch_optimum, chi2_of, factors_of, split
 
 SHARES = (50, 80, 90)
 """Of false links, per cent."""
+TWINS = FleetSettings(robots=2, nodes=40, true_links=8, most_alike=8)
+"""Two robots with few links in a building in which another place may give as many."""
 GOOD = 1.1
 """An error over that of least squares with the true links alone that is as good."""
 
@@ -42,6 +44,18 @@ def fleets(seed: int, count: int, step: Callable[[], None]) -> dict[str, dict[st
             "error_ratio_median": round(statistics.median(ratios), 4),
         }
     return out
+
+
+def twins(seed: int, count: int) -> dict[str, int]:
+    """What comes of so many pairs of robots, half of their links false and up to eight of these alike."""
+    falsely = false = true = 0
+    for run in range(count):
+        fleet = draw_fleet(0.5, np.random.default_rng([seed, run]), TWINS)
+        merged = merge_maps(fleet.maps, fleet.links)
+        falsely += joined_falsely(merged, fleet)
+        right = sum(link.pair in fleet.true for link in merged.links)
+        true, false = true + right, false + len(merged.links) - right
+    return {"fleets": count, "joined_falsely": falsely, "false_links": false, "true_links": true}
 
 
 def public_graphs(graphs: dict[str, G2oGraph], robots: int) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from mapweave.mapserver.relocalization import view_registration
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
-from mapweave.mapserver.relocalization.perceptual_aliasing import PerceptualAliasing
 from mapweave.merge import merging
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency
@@ -26,7 +25,7 @@ Switch = tuple[object, str, object]
 """Where a function stands, its name, and what takes its place."""
 
 
-def _each_a_witness(links: Sequence[Link], *_: object) -> NDArray[np.bool_]:
+def _each_independent(links: Sequence[Link], *_: object) -> NDArray[np.bool_]:
     return np.eye(len(links), dtype=np.bool_)
 
 
@@ -39,7 +38,7 @@ def _nothing(*_: object, **__: object) -> list[Any]:
 
 
 MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
-    "independent support": ((pairwise_consistency, "neighbours", _each_a_witness),),
+    "independent support": ((pairwise_consistency, "neighbours", _each_independent),),
     "chance support": ((Sorted, "beyond_chance", _as_it_is),),
     "dominance": ((pairwise_consistency, "_rival", _nothing),),
     "refused links heard again": (
@@ -56,7 +55,6 @@ TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
 """Rules on links, for robots with images and bodies."""
 PLACE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "aliased regions": ((AliasedRegions, "counterpart", lambda *_: None),),
-    "nodes that look alike": ((PerceptualAliasing, "matches", _nothing),),
     "lonely recognition": ((view_registration, "is_lonely", lambda *_: False),),
 }
 """Rules on answers to lost robots."""

@@ -6,6 +6,11 @@
     GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
     GET /route        explanation of the route from a to b: ?a=r0.1.17&b=r1.1.5, JSON
+    GET /robots       what every robot is doing, JSON
+    GET /missions     the missions that are known, JSON
+    GET /map          the merged map, a map file
+    POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
+    POST /stop        stops every robot, JSON
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
 An error comes back as one JSON object with `error`. A busy server answers 503 with
@@ -15,6 +20,7 @@ Retry-After in whole seconds and `retry_after` exactly. The pages are in `static
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import logging
 import math
 from collections.abc import Awaitable, Callable, Mapping
@@ -32,10 +38,12 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.manual_constraint import EXAMPLE, read_ends
 from mapweave.hybridmap.map_event import History, MapEvent
+from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import json_values
@@ -55,9 +63,15 @@ MOST_AT_ONCE = 32
 """Questions that are served at once; the next one is refused."""
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
-METHODS = dict.fromkeys((*PAGES, "/status", "/history", "/explain", "/route"), "GET") | {
-    "/relocalize": "POST"
-}
+MISSION = "/robots/ROBOT/go?goal=GOAL"
+METHODS = dict.fromkeys(
+    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+) | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+BY = "http"
+"""Gives a mission, if the request does not say."""
+
+
+Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
 
 
 class Answering(Protocol):
@@ -74,6 +88,18 @@ class Answering(Protocol):
 
     def history(self) -> tuple[MapEvent, ...]:
         """The history of the maps."""
+
+    def robots(self) -> FleetStatus:
+        """The robots, and where they are."""
+
+    def missions(self) -> Missions:
+        """The missions that are known."""
+
+    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+        """Give a robot a mission; waits for its answer."""
+
+    def map_file(self) -> Future[bytes]:
+        """The merged map as a map file."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -98,6 +124,7 @@ class Web(HttpThread):
         server: Answering,
         patience: float = PATIENCE,
         limits: Limits | None = None,
+        commands: bool = False,
     ) -> None:
         """Open the port and serve on a thread of its own.
 
@@ -106,11 +133,12 @@ class Web(HttpThread):
             server: answers.
             patience: time limit for a body, and for an answer, s.
             limits: of connections.
+            commands: whether other machines may move robots, too.
 
         Raises:
             NotConnected: the port cannot be used, for example since it is taken.
         """
-        app = SameSite(Questions(server, patience).app, address[0])
+        app = SameSite(Questions(server, patience, commands).app, address[0])
         try:
             super().__init__(app, address, limits)
         except NotConnected as error:
@@ -167,28 +195,29 @@ class Questions:
         app: the application.
     """
 
-    def __init__(self, server: Answering, patience: float) -> None:
+    def __init__(self, server: Answering, patience: float, commands: bool) -> None:
         """Make the application."""
         self._server = server
+        self._commands = commands
         self._patience = patience
         self._open = 0
-        answering = {
+        answering: dict[str, Answer] = {
             "/status": self._status, "/history": self._history, "/explain": self._explain,
-            "/route": self._explain,
+            "/route": self._explain, "/robots": self._robots, "/missions": self._missions, "/map": self._map,
         }  # fmt: skip
         routes = [
             *(Route(path, _page(name)) for path, name in PAGES.items()),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
+            Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
+            Route("/stop", self._answering(self._stop), methods=["POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such})
         app.router.redirect_slashes = False
         self.app: ASGIApp = app
 
-    def _answering(
-        self, answer: Callable[[Request], Awaitable[Mapping[str, Any]]]
-    ) -> Callable[[Request], Awaitable[Response]]:
+    def _answering(self, answer: Answer) -> Callable[[Request], Awaitable[Response]]:
         """Answer a question, or refuse it with a reason."""
 
         async def endpoint(request: Request) -> Response:
@@ -196,7 +225,8 @@ class Questions:
                 return _busy(Busy(1.0))
             self._open += 1
             try:
-                return Reply(await answer(request))
+                content = await answer(request)
+                return content if isinstance(content, Response) else Reply(content)
             except HTTPException as error:
                 return refusal(error.status_code, error.detail)
             except Busy as busy:
@@ -223,6 +253,50 @@ class Questions:
 
     async def _history(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(History(self._server.history())))
+
+    async def _robots(self, _: Request) -> Mapping[str, Any]:
+        return await run_in_threadpool(lambda: json_values(self._server.robots()))
+
+    async def _missions(self, _: Request) -> Mapping[str, Any]:
+        return await run_in_threadpool(lambda: json_values(self._server.missions()))
+
+    async def _map(self, _: Request) -> Response:
+        data = await self._result(self._server.map_file)
+        headers = {"Content-Disposition": 'attachment; filename="merged.mapweave"'}
+        return Response(data, headers=headers, media_type="application/octet-stream")
+
+    async def _give(self, request: Request) -> Mapping[str, Any]:
+        self._check_commands(request)
+        robot, kind = request.path_params["robot"], request.path_params["kind"]
+        if kind not in (MissionKind.GO, MissionKind.EXPLORE, MissionKind.STOP):
+            raise HTTPException(HTTPStatus.NOT_FOUND, f"there is no mission {kind!r}: go, explore, stop")
+        query = request.query_params
+        goal, by, mission_id = query.get("goal", ""), query.get("by", BY), query.get("id", "")
+        report = await run_in_threadpool(
+            self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id
+        )
+        return json_values(report)
+
+    async def _stop(self, request: Request) -> Mapping[str, Any]:
+        self._check_commands(request)
+        by = request.query_params.get("by", BY)
+
+        def stop() -> Mapping[str, Any]:
+            names = [entry.robot for entry in self._server.robots().robots if entry.alive]
+            return json_values(
+                Missions(tuple(self._server.give(name, MissionKind.STOP, "", by) for name in names))
+            )
+
+        return await run_in_threadpool(stop)
+
+    def _check_commands(self, request: Request) -> None:
+        """There is no password: unless it is set otherwise, robots are moved from this machine alone."""
+        host = "" if request.client is None else request.client.host
+        if not self._commands and not is_loopback(host):
+            raise HTTPException(
+                HTTPStatus.FORBIDDEN,
+                "robots take missions from this machine alone: start the server with --http-commands",
+            )
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
         ends, path, query = None, request.url.path, dict(request.query_params)
@@ -270,6 +344,14 @@ def _length(request: Request) -> int:
     if int(text) == 0:
         raise InvalidValue("send a JPEG or PNG image as the body")
     return int(text)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is of this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _page(name: str) -> Callable[[Request], Awaitable[Response]]:

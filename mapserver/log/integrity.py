@@ -40,7 +40,7 @@ CREATE TABLE refused (
     agent TEXT NOT NULL, epoch INTEGER NOT NULL, sequence INTEGER NOT NULL, reason TEXT NOT NULL,
     message BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (agent, epoch, sequence)
 ) WITHOUT ROWID;
-CREATE TABLE ruling (
+CREATE TABLE manual_constraint (
     number INTEGER NOT NULL, body BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (number)
 ) WITHOUT ROWID;
 CREATE TABLE result (
@@ -94,7 +94,7 @@ def repair(connection: sqlite3.Connection) -> None:
     except BaseException:
         connection.execute("ROLLBACK")
         raise
-    for table in ("ruling", "refused", "node", "result", "damaged"):
+    for table in ("manual_constraint", "refused", "node", "result", "damaged"):
         if bad[table]:
             log.error("the store had %d damaged rows of table %s; they are left out", bad[table], table)
 

@@ -31,7 +31,7 @@ ADVICE = (
     "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: robots send "
     "again what they keep"
 )
-MAX_RULINGS = 10_000
+MAX_CONSTRAINTS = 10_000
 """Made by hand, one by one."""
 
 
@@ -218,11 +218,11 @@ class Store:
         nodes = self._read(count, (agent, agent, epoch))[0][0]
         return Traffic(nodes, node_puts, node_bytes, edge_puts, edge_bytes)
 
-    def rulings(self) -> list[bytes]:
+    def constraints(self) -> list[bytes]:
         """The manual constraints, in order."""
-        return [bytes(body) for (body,) in self._read("SELECT body FROM ruling ORDER BY number")]
+        return [bytes(body) for (body,) in self._read("SELECT body FROM manual_constraint ORDER BY number")]
 
-    def add_ruling(self, body: bytes) -> None:
+    def add_constraint(self, body: bytes) -> None:
         """Add a manual constraint.
 
         Raises:
@@ -230,10 +230,12 @@ class Store:
             InvalidFile: the disk does not take it.
         """
         with self._lock, self._database.transaction() as rows:
-            count, newest = rows.execute("SELECT count(*), coalesce(max(number), 0) FROM ruling").fetchone()
-            if count >= MAX_RULINGS:
-                raise InvalidValue(f"the record of manual constraints is full: {MAX_RULINGS}")
-            insert(rows, "ruling", (newest + 1, body))
+            count, newest = rows.execute(
+                "SELECT count(*), coalesce(max(number), 0) FROM manual_constraint"
+            ).fetchone()
+            if count >= MAX_CONSTRAINTS:
+                raise InvalidValue(f"the record of manual constraints is full: {MAX_CONSTRAINTS}")
+            insert(rows, "manual_constraint", (newest + 1, body))
 
     def put_result(self, name: str, value: bytes) -> None:
         """Store another result of the server.

@@ -34,14 +34,14 @@ class MergePipeline:
         maps: Mapping[MapId, HybridMap],
         verdicts: Verdicts,
         touched: set[MapId],
-        rulings: ManualConstraints,
+        constraints: ManualConstraints,
     ) -> MergedMap:
         """See `Islands.merge`.
 
         Raises:
             InvalidValue: a node's pose is out of the range of messages.
         """
-        merged = self._islands.merge(maps, verdicts, touched, rulings)
+        merged = self._islands.merge(maps, verdicts, touched, constraints)
         for graph in merged.graphs:
             # Written so that NaN fails.
             if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():

@@ -80,7 +80,7 @@ class Merger:
 
     @property
     def recollecting(self) -> bool:
-        """Whether there are findings of before that no merge has taken over yet."""
+        """Whether there are earlier verdicts that no merge has taken over yet."""
         return self._comparisons.recollecting
 
     def recollect(self, findings: VerificationCache) -> None:
@@ -145,11 +145,13 @@ class Merger:
         for pair, link in (links or {}).items():
             self._comparisons.judge(pair, link)
 
-    def rule(self, constraints: ManualConstraints) -> None:
+    def constrain(self, constraints: ManualConstraints) -> None:
         """Apply exactly these manual constraints from now on."""
-        ruled = {*constraints.in_force} ^ {*self._constraints.in_force}
+        changed = {*constraints.in_force} ^ {*self._constraints.in_force}
         # A retired map is harmless, and is no longer set apart.
-        self._isolation.release(constraint.retires for constraint in ruled if constraint.retires is not None)
+        self._isolation.release(
+            constraint.retires for constraint in changed if constraint.retires is not None
+        )
         if self._constraints.retired.keys() - constraints.retired.keys():
             self.alike.forget()
         self._constraints = constraints

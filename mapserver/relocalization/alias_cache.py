@@ -20,7 +20,7 @@ from mapweave.mapserver.relocalization.aliased_landmarks import (
 )
 from mapweave.mapserver.relocalization.candidates import Retrieval
 from mapweave.registration.matching import match
-from mapweave.registration.recognition import Recognition, RecognitionSettings
+from mapweave.registration.recognition import RecognitionSettings
 
 Between = Callable[[NodeId, NodeId], Pose2 | None]
 """Pose `a_from_b` of two nodes on the merged map; None if that does not join them."""
@@ -64,16 +64,12 @@ class AliasCache:
 
     def __init__(self, recognition: RecognitionSettings, candidates: int = 16) -> None:
         """Take when a place counts as recognised, and how many nodes are compared with one."""
-        self._doubles, self._recognition, self._candidates = (
+        self._aliased, self._recognition, self._candidates = (
             AliasedLandmarks(recognition),
             recognition,
             candidates,
         )
         self._entries: dict[NodeId, _Entry] = {}
-
-    def compare(self, a: Node, b: Node) -> Recognition | None:
-        """See Doubles.compare."""
-        return self._doubles.compare(a, b)
 
     def forget(self) -> None:
         """Drop all results: nodes that were hidden at the search are active again."""
@@ -149,7 +145,7 @@ class AliasCache:
                 if left < s.least_inliers:
                     same.append(candidate_id)
                     continue
-            likeness = self._doubles.compare(candidate, node)
+            likeness = self._aliased.compare(candidate, node)
             if likeness is not None:
                 aliases[candidate_id] = AliasedNode(
                     candidate, likeness.node_from_robot, likeness.pairs[:, 1], likeness.pairs[:, 0]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,10 +19,7 @@ from mapweave.hybridmap import jit
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
-from mapweave.hybridmap.query import View
-from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.registration.matching import MatchSettings, match
 from mapweave.registration.recognition import Recognition, RecognitionSettings, register
 
 REMEMBERED = 20_000
@@ -39,7 +35,7 @@ EXPLAINED_PX = 12.0
 """A match nearer than this to its prediction supports the pose."""
 
 NEAR_M, NEAR_HEADING = 0.5, 0.35
-"""Two nodes see the same place, and are no doubles, if the map has them about where they see each
+"""Two nodes see the same place, and are not aliased, if the map has them about where they see each
 other, m and rad."""
 
 
@@ -82,49 +78,6 @@ def between(merged: MergedMap, a: NodeId, b: NodeId) -> Pose2 | None:
     return merged.pose(a).inverse() @ merged.pose(b)
 
 
-def carried(
-    double: Node,
-    likeness: Recognition,
-    recognised: NodeMatch,
-    view: View,
-    matching: MatchSettings,
-    within_px: float,
-) -> NodeMatch:
-    """The recognition of an alias that follows from the recognition of its node.
-
-    Args:
-        double: the alias.
-        likeness: `double_from_node`, with landmarks of the double and of the node that agree.
-        recognised: that the node was recognised in the view.
-        view: the image's features.
-        matching: how features are matched.
-        within_px: a match nearer than this to its prediction supports the alias.
-
-    Returns:
-        A recognition of the alias, from the features that it would explain: those of landmarks that both
-        nodes have, and those that match its own. Its evidence has the share seen of what should be visible.
-    """
-    pose = likeness.node_from_robot @ recognised.recognition.node_from_robot
-    points = double.landmarks.points_in_robot(double.camera)
-    expected = view.camera.project(pose.mean.inverse().apply(points))
-    feature_of = dict(recognised.recognition.pairs.tolist())
-    pairs = {i: feature_of[j] for i, j in likeness.pairs.tolist() if j in feature_of}
-    taken = set(pairs.values())
-    for i, j in match(double.landmarks.codes, view.codes, matching).tolist():
-        off = expected[i] - view.pixels[j]
-        if i not in pairs and j not in taken and math.hypot(off[0], off[1]) < within_px:
-            pairs[i] = j
-    should = int(view.camera.contains(expected).sum())
-    recognition = replace(
-        likeness,
-        node_from_robot=pose,
-        pairs=np.array(sorted(pairs.items()), np.int64).reshape(-1, 2),
-        usable=recognised.recognition.usable,
-        evidence={**likeness.evidence, "seen": min(len(pairs) / max(should, 1), 1.0)},
-    )
-    return NodeMatch(double.id, recognition, alike=recognised.node)
-
-
 def same_place(a: Pose2, b: Pose2) -> bool:
     """Whether two poses are so near that vague estimates of one may be both."""
     return a.distance(b) < NEAR_M and abs(wrap_angle(a.heading - b.heading)) < NEAR_HEADING
@@ -151,9 +104,3 @@ def unexplained(
     points = node.landmarks.take(pairs[:, 0]).points_in_robot(node.camera)
     off = camera.project(node_from_robot.inverse().apply(points)) - pixels[pairs[:, 1]]
     return len(pairs) - int((np.hypot(off[:, 0], off[:, 1]) < within_px).sum())
-
-
-def elsewhere(ranked: Sequence[tuple[NodeId, float]], best: NodeId, faint: float) -> list[NodeId]:
-    """Candidates with at least this share of the best one's similarity, best first."""
-    least = faint * dict(ranked).get(best, 0.0)
-    return [node for node, score in ranked if node != best and score >= least]

@@ -37,13 +37,11 @@ class NodeMatch:
     Attributes:
         node: which.
         recognition: how.
-        alike: the recognised node of which this is an alias, if so.
         lonely: it rests on one thing, and nothing is seen of what should be visible around that.
     """
 
     node: NodeId
     recognition: Recognition
-    alike: NodeId | None = None
     lonely: bool = False
 
 
@@ -67,11 +65,6 @@ class PlaceHypothesis:
     def best(self) -> NodeMatch:
         """The recognition with most landmarks."""
         return self.sightings[0]
-
-    @property
-    def is_double(self) -> bool:
-        """Whether it is an alias of a recognised place."""
-        return any(match.alike is not None for match in self.sightings)
 
 
 def is_lonely(node: Node, view: View, recognition: Recognition) -> bool:

@@ -26,14 +26,14 @@ def answer_of(
         least_features: that a view needs.
     """
     reason = _reason(verdict, merged, least_features)
-    if verdict.outcome not in (Outcome.FOUND, Outcome.AMBIGUOUS):
+    if verdict.outcome not in (Outcome.FOUND, Outcome.AMBIGUOUS) and not verdict.confirmable:
         return RelocalizeAnswer(Certainty.UNKNOWN, (), reason)
     chances = probabilities(supported(verdict.places))
     candidates = tuple(
         _whereabouts(place, chance, merged, node_of)
         for place, chance in zip(verdict.places, chances, strict=True)
     )
-    certainty = Certainty.AMBIGUOUS
+    certainty = Certainty.UNKNOWN if verdict.confirmable else Certainty.AMBIGUOUS
     if verdict.outcome is Outcome.FOUND:
         # The distance from a photograph is unknown.
         certainty = Certainty.FOUND if candidates[0].distance_known else Certainty.PLACE
@@ -88,10 +88,9 @@ def _rivalry(rivals: Sequence[PlaceHypothesis], merged: MergedMap) -> str:
     names = " or ".join(str(place.best.node) for place in rivals)
     most, least = len(rivals[0].features), len(rivals[-1].features)
     words = f"it may be {names}: they explain {most} to {least} features"
-    if any(place.is_double for place in rivals):
-        words += ", and look the same on the map"
-    if any(place.nodes_around for place in rivals):
-        words += f", and so do {max(place.nodes_around for place in rivals)} nodes around them"
+    around = max(place.nodes_around for place in rivals)
+    if around:
+        words += f", and {around} nodes around them look the same"
     if any(between(merged, rivals[0].best.node, place.best.node) is None for place in rivals):
         words += ", and nothing joins their parts of the map yet"
     return words

@@ -13,9 +13,8 @@ from dataclasses import dataclass, field
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
-from mapweave.mapserver.relocalization.aliased_regions import AliasedRegionSettings
+from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions, AliasedRegionSettings
 from mapweave.mapserver.relocalization.candidates import Retrieval, retrieve
-from mapweave.mapserver.relocalization.perceptual_aliasing import PerceptualAliasing
 from mapweave.mapserver.relocalization.relocalize_answer import answer_of
 from mapweave.mapserver.relocalization.verdict import HypothesisSelector
 from mapweave.mapserver.relocalization.view_registration import Registration, ViewRegistration
@@ -43,7 +42,7 @@ class Relocalizer:
 
     Attributes:
         registration: compares views with nodes.
-        aliasing: which places look the same.
+        aliasing: which regions look the same.
         selection: decides between places.
     """
 
@@ -69,9 +68,7 @@ class Relocalizer:
         self._least_features = least = s.recognition.least_inliers
         self.alike = alike or AliasCache(s.recognition)
         self.registration = ViewRegistration(node_of, merged, s.recognition, s.faint)
-        self.aliasing = PerceptualAliasing(
-            index, node_of, merged, self.alike, s.recognition, s.regions, s.faint
-        )
+        self.aliasing = AliasedRegions(index, node_of, merged, self.alike, s.regions)
         self.selection = HypothesisSelector(merged, self.aliasing, least)
 
     def answer(self, view: View) -> RelocalizeAnswer:

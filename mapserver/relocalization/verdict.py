@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 import numpy as np
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import PoseGaussian
-from mapweave.mapserver.relocalization.perceptual_aliasing import PerceptualAliasing
+from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
 from mapweave.mapserver.relocalization.place_hypotheses import (
     ALONE,
     SLIGHT,
@@ -42,7 +42,7 @@ class Outcome(Enum):
     NO_CANDIDATE = auto()
     NOT_RECOGNISED = auto()
     ONE_WEAK_NODE = auto()
-    """A single node supports it, with few landmarks."""
+    """A single node supports it, with few landmarks, and nothing speaks against it."""
     ONE_THING = auto()
     """All landmarks that agree are on one thing, which may have been moved."""
 
@@ -56,24 +56,26 @@ class Verdict:
         registration: the grounds.
         places: that come into question, best supported first.
         rivals: more than one if ambiguous: places that explain the view about as well as the first.
+        confirmable: another view that gives the same place would make it certain: it lacks nothing but
+            landmarks.
     """
 
     outcome: Outcome
     registration: Registration
     places: Sequence[PlaceHypothesis] = ()
     rivals: Sequence[PlaceHypothesis] = ()
+    confirmable: bool = False
 
 
 class HypothesisSelector:
     """Groups recognitions into places, and decides between them. It belongs to one merged map."""
 
-    def __init__(self, merged: MergedMap, aliasing: PerceptualAliasing, least_features: int) -> None:
-        """Take where nodes are, and which places look alike.
-
+    def __init__(self, merged: MergedMap, aliasing: AliasedRegions, least_features: int) -> None:
+        """Take where nodes are, and which regions look alike.
 
         Args:
             merged: where nodes are.
-            aliasing: which other places look like a recognised one.
+            aliasing: which other regions look like that of a recognised place.
             least_features: a view with fewer has no candidates.
         """
         self._merged, self._aliasing = merged, aliasing
@@ -84,15 +86,15 @@ class HypothesisSelector:
         places = self.places(registration)
         rivals = self._rivals(places)
         outcome = self._refusal(registration, places, rivals)
-        if outcome is None:
-            ranked = [node for node, _ in registration.candidates.ranked]
-            counterpart = self._aliasing.counterpart(places[0], ranked)
-            if counterpart is None:
-                outcome = Outcome.FOUND
-            else:
-                outcome, rivals = Outcome.AMBIGUOUS, [places[0], counterpart]
-                places = [*places, counterpart]
-        return Verdict(outcome, registration, places, rivals)
+        weak = outcome is Outcome.ONE_WEAK_NODE and not places[0].best.lonely
+        if outcome is not None and not weak:
+            return Verdict(outcome, registration, places, rivals)
+        ranked = [node for node, _ in registration.candidates.ranked]
+        counterpart = self._counterpart(places[0], ranked)
+        if counterpart is None:
+            return Verdict(outcome or Outcome.FOUND, registration, places, rivals, weak)
+        places, rivals = [*places, counterpart], [places[0], counterpart]
+        return Verdict(outcome or Outcome.AMBIGUOUS, registration, places, rivals)
 
     def _refusal(
         self,
@@ -116,15 +118,12 @@ class HypothesisSelector:
         return next((outcome for outcome, holds in reasons if holds), None)
 
     def places(self, registration: Registration) -> list[PlaceHypothesis]:
-        """Group the recognised nodes, and the aliases of the best of them, into places.
+        """Group the recognised nodes into places.
 
         Nodes agree if their poses do, within what the map and the recognitions are certain of. The best
         supported place is the first.
         """
-        matches, candidates = list(registration.matches), registration.candidates
-        if matches:
-            matches += self._aliasing.matches(candidates.view, matches[0], candidates.ranked)
-        left = sorted(matches, key=lambda match: (-match.recognition.inliers, match.node))
+        left = sorted(registration.matches, key=lambda match: (-match.recognition.inliers, match.node))
         places = []
         while left:
             best, left = left[0], left[1:]
@@ -140,6 +139,17 @@ class HypothesisSelector:
             places.append(PlaceHypothesis(agreeing, combined, features))
             left = remaining
         return sorted(places, key=lambda place: (-len(place.features), place.best.node))
+
+    def _counterpart(self, place: PlaceHypothesis, ranked: Sequence[NodeId]) -> PlaceHypothesis | None:
+        """Another pose where the robot may be, by aliased surroundings of a place."""
+        best = place.best
+        region = self._aliasing.counterpart(best, ranked)
+        if region is None:
+            return None
+        twice = [pair for pair in best.recognition.pairs.tolist() if pair[1] in region.features]
+        recognition = replace(best.recognition, node_from_robot=region.node_from_robot, pairs=np.array(twice))
+        match = NodeMatch(region.node, recognition)
+        return PlaceHypothesis([match], region.node_from_robot, region.features, region.nodes)
 
     def _in_frame_of(self, node: NodeId, match: NodeMatch) -> PoseGaussian | None:
         """A match's estimate in another node's frame; None if the map does not join the two."""

@@ -37,8 +37,9 @@ def add_to(commands: Any) -> None:
     parser.add_argument("name", help="the robot's name in the fleet, for example r0")
     add_robot(parser)
     parser.add_argument(
-        "--mission", choices=["idle", "explore", "carried"], default="explore", help="what to do at the start"
-    )
+        "--mission", choices=["idle", "explore", "carried"],
+        help="what to do now (default: go on with the last mission; a robot without one explores)",
+    )  # fmt: skip
     parser.add_argument(
         "--without-rangers", action="store_true",
         help="a robot without proximity sensors may explore, slowly, by its camera and by touch",
@@ -78,9 +79,9 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.claim import Claim
     from mapweave.agent.drivers.recorded import RecordedRobot
-    from mapweave.agent.mission import Carried, Explore, Idle, Mission
     from mapweave.commands.map_ends import map_of
     from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.mission_order import MissionKind
     from mapweave.hybridmap.node import check_name
     from mapweave.processes.agent import AgentOptions, run_agent
     from mapweave.wire.keys import check_epoch
@@ -110,14 +111,15 @@ def run(arguments: argparse.Namespace) -> int:
             robot = RecordedRobot(robot, arguments.record, print_line=print_error)
         # A stop signal ends the wait for the robot.
         threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
-        missions: dict[str, Mission] = {"explore": Explore(), "carried": Carried(), "idle": Idle()}
+        kinds = {"explore": MissionKind.EXPLORE, "carried": MissionKind.CARRIED, "idle": MissionKind.STOP}
         options = AgentOptions(
             name=name,
             data=arguments.data,
             epoch=arguments.epoch,
             fresh=arguments.fresh,
             resume=resume,
-            mission=missions[arguments.mission],
+            mission=kinds.get(arguments.mission),
+            otherwise=MissionKind.EXPLORE,
             seed=arguments.seed,
             synchronization=synchronization,
             server=network.server,

@@ -9,6 +9,7 @@ from mapweave.commands import (
     map_explain,
     map_export,
     map_extract,
+    map_fetch,
     map_history,
     map_import,
     map_merge,
@@ -28,6 +29,6 @@ def add_to(commands: Any) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (
         map_show, map_explain, map_route, map_history, map_unmerge, map_retire,
-        map_merge, map_export, map_extract, map_import, map_photographs,
+        map_merge, map_fetch, map_export, map_extract, map_import, map_photographs,
     ):  # fmt: skip
         action.add_to(actions)

@@ -42,10 +42,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(json_values(events)))
         return 0
-    happenings = events.history
-    left_out = len(happenings) - arguments.most
+    listed = events.history
+    left_out = len(listed) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
-    lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:10}  {h.words}" for h in happenings[-arguments.most :]]
+    lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in listed[-arguments.most :]]
     print("\n".join(lines) if lines else "no joins, splits or manual constraints yet")
     return 0
 
@@ -54,7 +54,7 @@ def _history(arguments: argparse.Namespace) -> History:
     from mapweave.commands.map_ends import ask
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.map_event import History
-    from mapweave.mapserver.ruling_history import with_rulings
+    from mapweave.mapserver.constraint_history import with_constraints
     from mapweave.storage.map_file import read_map_file
     from mapweave.wire.keys import Keys
     from mapweave.wire.messages import decode
@@ -62,4 +62,4 @@ def _history(arguments: argparse.Namespace) -> History:
     if arguments.map is None:
         return decode(ask(arguments, Keys.any_history, b"")[0].payload, History)
     content = read_map_file(arguments.map)
-    return History(with_rulings(content.history, ManualConstraints(content.rulings)))
+    return History(with_constraints(content.history, ManualConstraints(content.constraints)))

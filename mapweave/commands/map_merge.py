@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_place(arguments.out)
     settings = settings_of(arguments).merge
     parts = parts_of({path: read_map_file(path) for path in arguments.files})
-    merged = merged_with_progress(parts.maps, parts.rulings, settings)
+    merged = merged_with_progress(parts.maps, parts.constraints, settings)
     write_map_file(arguments.out, map_file_of(merged, parts.history))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]

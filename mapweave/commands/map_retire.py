@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mapweave.commands.map_rule import add_ruling, rule
+from mapweave.commands.map_constraint import add_constraint_options, constrain
 
 
 def add_to(actions: Any) -> None:
@@ -20,7 +20,7 @@ def add_to(actions: Any) -> None:
         "older ones by themselves.",
     )
     parser.add_argument("which", metavar="MAP", help="the map, as r0.1: a robot and its epoch")
-    add_ruling(parser)
+    add_constraint_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -29,5 +29,5 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.commands.map_ends import map_of
 
     which = map_of(arguments.which)
-    rule(arguments, (which, which))
+    constrain(arguments, (which, which))
     return 0

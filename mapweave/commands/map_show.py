@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         "edges": kinds,
         "links": sum(e.kind is EdgeKind.MERGED for e in hybrid.edges.values()),
         "refused": sum(pair.edge is not None for pair in content.refused),
-        "rulings": len(ManualConstraints(content.rulings).in_force),
+        "constraints": len(ManualConstraints(content.constraints).in_force),
         "components": len(sizes),
         "landmarks_per_node_median": float(np.median(landmarks)) if landmarks else 0.0,
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mapweave.commands.map_rule import add_ruling, rule
+from mapweave.commands.map_constraint import add_constraint_options, constrain
 
 
 def add_to(actions: Any) -> None:
@@ -19,7 +19,7 @@ def add_to(actions: Any) -> None:
         "`mapweave map explain`.",
     )
     parser.add_argument("ends", nargs="+", metavar="NODE|MAP", help="the link: two nodes, or two maps")
-    add_ruling(parser)
+    add_constraint_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     first, second = (MapId(end[0], end[1]) for end in ends)
     if ends[0] == ends[1]:
         raise InvalidValue(f"{ends[0]} twice: give two different nodes or two different maps")
-    rule(arguments, ends)
+    constrain(arguments, ends)
     if first != second:
         for explanation in explained_maps(arguments, (first, second)).maps:
             print(explanation.reason)

@@ -34,6 +34,10 @@ def add_to(commands: Any) -> None:
         help="answer people over HTTP as well, on this machine alone unless HOST is given, "
         "for example 8080 or 0.0.0.0:8080 (default: off)",
     )  # fmt: skip
+    parser.add_argument(
+        "--http-commands", action="store_true",
+        help="with --http: other machines may move robots, too; there is no password",
+    )  # fmt: skip
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -72,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
             where = ", ".join(network.endpoints)
             print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
             if address is not None:
-                stack.enter_context(Web(address, server))
+                stack.enter_context(Web(address, server, commands=arguments.http_commands))
                 print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
             last_line = ""
             while not stop.wait(1.0):

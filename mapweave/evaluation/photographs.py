@@ -11,7 +11,7 @@ import csv
 import math
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.recordings.image_folder import images_of
+from mapweave.evaluation.asking_again import Trial
 from mapweave.evaluation.verdict import Verdict
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
@@ -30,7 +31,7 @@ from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.registration.evidence import cells
 from mapweave.registration.matching import match
 from mapweave.storage.image_file import read_grey
-from mapweave.vision.lens import Lens
+from mapweave.vision.lens import Distortion, Lens
 from mapweave.vision.sift import Sift
 
 
@@ -136,10 +137,10 @@ COMPARABLE = 0.6
 class AppearanceMap:
     """Places by their appearance alone."""
 
-    def __init__(self, camera: Camera, distortion: tuple[float, ...]):
+    def __init__(self, camera: Camera, distortion: Distortion):
         """Begin with none, for a camera and its lens."""
         self._camera = camera
-        self._sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
+        self._sift = Sift(Lens(camera, distortion))
         self._index = PlaceIndex()
         self._nodes: dict[int, Node] = {}
 
@@ -181,6 +182,20 @@ class AppearanceMap:
 
     def _view(self, path: Path) -> View:
         return self._sift.extract(read_grey(path, self._camera)).view(self._camera)
+
+
+def photograph_trials(verdicts: Sequence[Verdict]) -> list[Trial]:
+    """A robot that asks at a photograph and, where that is no answer, at the next one.
+
+    Photographs have no odometry. They are 1 to 3 m apart, so the next one is what lies within 2 m.
+    """
+    trials = []
+    for first, second in zip(verdicts, [*verdicts[1:], None], strict=True):
+        asked = [first] if second is None or int(second.query) != int(first.query) + 1 else [first, second]
+        answered = next((verdict for verdict in asked if verdict.certainty is Certainty.FOUND), None)
+        right = None if answered is None else answered.right
+        trials.append(Trial(first.expected, answered is not None, right))
+    return trials
 
 
 def _is_right(place: int, reference: Reference | None) -> bool:

@@ -69,7 +69,7 @@ class MapPart:
     @property
     def measurements(self) -> list[Measurement]:
         """Those whose optimum the poses are."""
-        left = apply_constraints(self.merged.maps, (), self.merged.rulings).maps
+        left = apply_constraints(self.merged.maps, (), self.merged.constraints).maps
         own = [m for fragment in fragments_of(left) for m in fragment.measurements]
         links = [Measurement(*link.pair, link.a_from_b, robust=True) for link in self.merged.links]
         return [m for m in (*own, *links) if m.a in self.numbers]

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
-from mapweave.agent.mission import Idle, Mission
+from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.ranger_monitor import announcement
@@ -29,7 +29,8 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.node import NUMBER, MapId
+from mapweave.hybridmap.mission_order import MissionKind
+from mapweave.hybridmap.node import NUMBER, MapId, NodeId
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -53,7 +54,8 @@ class AgentOptions:
         epoch: least number of the map if one is begun; None asks the server which one is next.
         fresh: begin a new map even if the journal holds one.
         resume: the map of the journal that goes on; None takes the newest.
-        mission: at the start.
+        mission: given at the start; None goes on with the mission that the journal holds.
+        otherwise: the mission without either.
         seed: of the random choices in exploration.
         synchronization: what the loop waits for between ticks.
         server: whose acknowledgement lets changes be forgotten.
@@ -67,7 +69,8 @@ class AgentOptions:
     epoch: int | None = None
     fresh: bool = False
     resume: MapId | None = None
-    mission: Mission = field(default_factory=Idle)
+    mission: MissionKind | None = None
+    otherwise: MissionKind = MissionKind.STOP
     seed: int = 0
     synchronization: Synchronization = field(default_factory=FreeRunning)
     server: str = "s0"
@@ -118,6 +121,12 @@ class Agent:
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
+            self.missions = MissionControl(
+                options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server
+            )
+            if options.mission is not None or self.missions.report is None:
+                self.missions.begin(options.mission or options.otherwise)
+            self.missions.unknown_goal = self._unknown_goal
             self._description = describe()
             explores = settings.exploration.without_rangers
             for line in announcement(self._description, options.name, explores):
@@ -172,20 +181,21 @@ class Agent:
             raise InvalidValue(f"the journal of {self._options.name} has no map {chosen}; it has {held}")
         return chosen
 
-    def _start(self, map_id: MapId, pipeline: Pipeline, mission: Mission | None = None) -> None:
+    def _start(self, map_id: MapId, pipeline: Pipeline) -> None:
         options = self._options
-        pipeline.set_mission(options.mission if mission is None else mission)
         self.pipeline = pipeline
         self.replicator = Replicator(self._bus, self._keys, self.journal, map_id, servers=(options.server,))
         self.merged_poses = MergedPoses(self._bus, self._keys, options.name, options.server)
         self._fleet = FleetClient(
-            self._bus, self._keys, map_id, options.synchronization.answer_timeout, options.server,
-            self.replicator.unacknowledged, self._placed, self._teleoperation,
+            self._bus, self._keys, map_id, self.missions, options.synchronization.answer_timeout,
+            options.server, self.replicator.unacknowledged, self._placed, self._teleoperation,
             (self._description.max_forward, self._description.max_turn),
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)
         self._trajectory = TrajectoryFile(path) if options.trajectories else None
-        self.runner = Runner(pipeline, self._fleet, self.replicator, options.synchronization, self._stepped)
+        self.runner = Runner(
+            pipeline, self._fleet, self.replicator, self.missions, options.synchronization, self._stepped
+        )
 
     def _stepped(self, observation: Observation, step: Step) -> None:
         if self._trajectory is not None and step.status.located:
@@ -248,6 +258,10 @@ class Agent:
         if path.exists() and not aside.exists():
             path.rename(aside)
             self._print(f"{self._options.name}: the map file written before is kept as {aside}")
+
+    def _unknown_goal(self, node: NodeId) -> str:
+        on_own_map = node.map == self.map_id and node not in self.pipeline.map.nodes
+        return f"there is no node {node}" if on_own_map else ""
 
     def _placed(self) -> int:
         return self.merged_poses.count(self.map_id)

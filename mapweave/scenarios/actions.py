@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NodeId, check_name
 from mapweave.sim import events
 from mapweave.sim.robots import camera_from_table
 from mapweave.storage.settings_file import build
 
 ALL_ROBOTS = "all"
+MISSION_KINDS = {"idle": MissionKind.STOP, "explore": MissionKind.EXPLORE, "carried": MissionKind.CARRIED}
+"""By their names in scenarios."""
 GOALS = ("foreign", "own", "photographed")
 
 
@@ -35,8 +38,8 @@ class SetMission:
 
     def __post_init__(self) -> None:
         """Refuse an unknown mission (InvalidValue)."""
-        if self.mission not in ("idle", "explore", "carried"):
-            raise InvalidValue(f"mission: no mission {self.mission!r}; known are idle, explore, carried")
+        if self.mission not in MISSION_KINDS:
+            raise InvalidValue(f"mission: no mission {self.mission!r}; known are {', '.join(MISSION_KINDS)}")
 
 
 @dataclass(frozen=True)

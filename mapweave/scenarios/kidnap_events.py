@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from mapweave.agent.mission import GoTo, Mission
-from mapweave.agent.status_message import AgentStatus
+from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import SERVER, Fleet, Stage
@@ -28,7 +28,7 @@ class KidnapEvents:
     """
 
     def __init__(
-        self, stage: Stage, fleet: Fleet, command: Callable[[str, Mission], None], note: Note
+        self, stage: Stage, fleet: Fleet, command: Callable[[str, MissionKind, NodeId], None], note: Note
     ) -> None:
         """Start with no robot lost.
 
@@ -122,7 +122,7 @@ class KidnapEvents:
             self._note(f"{lost.robot} is not sent: {reason}", True)
             return
         lost.goal, self.sent = node, lost
-        self._command(lost.robot, GoTo(node))
+        self._command(lost.robot, MissionKind.GO, node)
         self._note(f"{lost.robot} shall go to {node}", False)
 
     def _goal(self, lost: Lost, goal: str) -> NodeId:

@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapweave.agent.fleet_client import decode_mission
 from mapweave.agent.observation import Command
 from mapweave.agent.synchronization import Lockstep
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
 from mapweave.processes.agent import Agent, AgentOptions
+from mapweave.scenarios.actions import MISSION_KINDS
 from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
 from mapweave.settings import load_settings
 from mapweave.sim.ground_truth_client import SimControl
@@ -22,7 +22,6 @@ from mapweave.sim.ground_truth_service import GroundTruthService
 from mapweave.sim.keys import SimKeys
 from mapweave.sim.simulation import Simulation
 from mapweave.wire.bus import Request
-from mapweave.wire.log_messages import encode_record
 from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
 
 OVERTAKEN = 0.5
@@ -103,12 +102,11 @@ class LocalFleet:
         stage, simulation = self._stage, self._simulation
         assert simulation is not None
         bus = self._buses[robot] = MemoryBus(self._hub)
-        mission = decode_mission(encode_record({"mission": stage.scenario.missions[robot], "node": ""}))
         options = AgentOptions(
             name=robot,
             data=stage.agents,
             epoch=FIRST_EPOCH,
-            mission=mission,
+            mission=MISSION_KINDS[stage.scenario.missions[robot]],
             seed=stage.agent_seed(robot),
             synchronization=Lockstep(),
             server=SERVER,

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapweave.agent.status_message import AgentStatus, decode_agent_status
+from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidMessage, NotConnected
 from mapweave.hybridmap.node import MapId
 from mapweave.scenarios.recording import Trajectory
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
+from mapweave.wire.messages import decode
 
 PATIENCE = 120.0
 """How long the server may take to merge what it has, s."""
@@ -70,7 +71,7 @@ class Reports:
         """An agent's status at its last tick; None if it cannot be reached."""
         for reply in self._bus.ask(self._keys.agent_status(robot), b"", 5.0):
             if not reply.error:
-                report = decode_agent_status(reply.payload)
+                report = decode(reply.payload, AgentStatus)
                 self._note(robot, report)
                 return report
         return None
@@ -113,7 +114,7 @@ class Reports:
         self._closing.close()
 
     def _hear(self, sample: Sample) -> None:
-        self._note(self._keys.parse_agent_status(sample.key), decode_agent_status(sample.payload))
+        self._note(self._keys.parse_agent_status(sample.key), decode(sample.payload, AgentStatus))
 
     def _note(self, robot: str, report: AgentStatus) -> None:
         status = report.status

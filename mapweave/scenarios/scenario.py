@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -289,8 +289,3 @@ def _check_names(scenario: Scenario, where: str) -> None:
                 raise SettingsError(
                     f"{where}: event {number}: no robot {name!r}; there are {', '.join(sorted(names))}"
                 )
-
-
-def with_seed(scenario: Scenario, seed: int | None) -> Scenario:
-    """The scenario with another seed, if one is given."""
-    return scenario if seed is None else replace(scenario, seed=seed)

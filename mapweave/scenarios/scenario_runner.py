@@ -8,13 +8,14 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mapweave.agent.fleet_client import encode_mission
-from mapweave.agent.mission import Carried, Explore, Idle, Mission
-from mapweave.agent.status_message import AgentStatus
+from mapweave.fleet import send_order
+from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios import actions
+from mapweave.scenarios.actions import MISSION_KINDS
 from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, Fleet, Stage
 from mapweave.scenarios.kidnap_events import KidnapEvents
 from mapweave.scenarios.photographing import beside, photograph
@@ -35,7 +36,8 @@ ABDUCT_TRIES, ABDUCT_PAUSE = 8, 10.0
 RECOVERY_PATIENCE = 120.0
 """How long all may take to be well again after something came back, wall s."""
 
-MISSIONS: dict[str, Mission] = {"idle": Idle(), "explore": Explore(), "carried": Carried()}
+CONDUCTOR = "scenario"
+"""Gives the missions."""
 
 
 class ScenarioRunner:
@@ -55,7 +57,7 @@ class ScenarioRunner:
         self,
         stage: Stage,
         fleet: Fleet,
-        on_look: Callable[[ScenarioRunner], None] = lambda conductor: None,
+        on_look: Callable[[ScenarioRunner], None] = lambda runner: None,
         stride: float = STRIDE,
     ) -> None:
         """Take the means.
@@ -169,7 +171,7 @@ class ScenarioRunner:
             case actions.SetMission(mission, robot):
                 names = sorted(self._alive - self._cut) if robot == actions.ALL_ROBOTS else [robot]
                 for name in names:
-                    self._command(name, MISSIONS[mission])
+                    self._command(name, MISSION_KINDS[mission])
                 self.note(f"{', '.join(names)}: {mission}")
             case actions.Abduct(robot):
                 self._abduct(robot)
@@ -233,10 +235,10 @@ class ScenarioRunner:
             idle = [name for name, agent in self.agents.items() if agent.status.mission == "idle"]
             self.note(f"no robot can be kidnapped now, {', '.join(idle) or 'none'} explores on: {reason}")
             for name in idle:
-                self._command(name, Explore())
+                self._command(name, MissionKind.EXPLORE)
             self._advance(self.now + ABDUCT_PAUSE)
             for name in idle:
-                self._command(name, Idle())
+                self._command(name, MissionKind.STOP)
             self._advance(self.now + 1.0)
         self.note(f"no robot is kidnapped: {reason}", True)
 
@@ -274,11 +276,8 @@ class ScenarioRunner:
             return False
         return True
 
-    def _command(self, robot: str, mission: Mission) -> None:
-        replies = self._fleet.bus.ask(self._fleet.keys.mission(robot), encode_mission(mission), 10.0)
-        if not replies or replies[0].error:
-            why = replies[0].error if replies else "no answer"
-            raise NotConnected(f"agent {robot} did not take its mission: {why}")
+    def _command(self, robot: str, kind: MissionKind, node: NodeId | None = None) -> None:
+        send_order(self._fleet.bus, self._fleet.keys, MissionOrder.new(robot, kind, CONDUCTOR, node))
 
 
 def _in_words(event: ScenarioEvent) -> str:

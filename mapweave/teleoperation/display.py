@@ -8,7 +8,7 @@ import sys
 import textwrap
 
 from mapweave.agent.observation import Command
-from mapweave.agent.status_message import AgentStatus
+from mapweave.hybridmap.agent_status import AgentStatus
 
 
 def lines(name: str, report: AgentStatus, command: Command, silence: float, usage: str) -> list[str]:

@@ -11,11 +11,12 @@ import time
 from types import TracebackType
 
 from mapweave.agent.observation import Command
-from mapweave.agent.status_message import DriveAnswer, decode_drive_answer
-from mapweave.agent.teleoperation import DEAD_MAN, DriveRequest
+from mapweave.agent.teleoperation import DEAD_MAN
+from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import DeviceError, MapweaveError
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode, encode
 
 PERIOD = 0.1
 """Between two commands at the most, s."""
@@ -100,13 +101,13 @@ class Session:
     def _send(self, timeout: float, release: bool = False) -> None:
         answer_ns = 0 if self.answer is None else self.answer.answer_ns
         command = Command() if release else self.command
-        request = DriveRequest(self._number, command, answer_ns, release)
-        for reply in self._bus.ask(self._keys.drive(self._name), request.encode(), timeout):
+        request = DriveRequest(self._number, command.forward, command.turn, answer_ns, release)
+        for reply in self._bus.ask(self._keys.drive(self._name), encode(request), timeout):
             if reply.error:
                 self.refused = reply.error
                 return
             try:
-                self.answer, self.answered = decode_drive_answer(reply.payload), time.monotonic()
+                self.answer, self.answered = decode(reply.payload, DriveAnswer), time.monotonic()
             except MapweaveError as error:
                 self.refused = str(error)
 

@@ -110,7 +110,7 @@ def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> 
     held = [link for link in links if (link.a.map in part) != (link.b.map in part)]
     pairs = {link.pair for link in held}
     reasons = Counter(r.reason for r in after.refused if r.pair in pairs and r.edge is None)
-    retired = after.rulings.retired
+    retired = after.constraints.retired
     away = [next((end.map for end in pair if end.map in retired), None) for pair in pairs]
     removed = [
         pair

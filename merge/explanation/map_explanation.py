@@ -141,7 +141,7 @@ def _explained(
         len(refused),
         len(between.unverified),
         nearest,
-        merged.rulings.about(*pair),
+        merged.constraints.about(*pair),
     )
 
 
@@ -156,7 +156,7 @@ def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[
     # A map may be in several pieces, so a way over maps is only a hint.
     way = nx.shortest_path(graph, first, second) if first in graph and second in graph else [first, second]
     over = ", ".join(map(str, way[1:-1])) or "each other's pieces"
-    apart = any(set(r.ends) == {first, second} for r in merged.rulings.in_force)
+    apart = any(set(r.ends) == {first, second} for r in merged.constraints.in_force)
     more = ", by a manual constraint; to separate them undo the links of that way too" if apart else ""
     return f"{first} and {second} are one map by way of {over}; no link joins the two directly{more}"
 
@@ -176,7 +176,7 @@ def _why_apart(
 ) -> str:
     head = f"{first} and {second} are not one map"
     ends = ((first, second), (first, first), (second, second))
-    constraint = next((r for r in merged.rulings.in_force if r.ends in ends), None)
+    constraint = next((r for r in merged.constraints.in_force if r.ends in ends), None)
     if constraint is not None:
         return f"{head}: {reason_of(constraint)}"
     if refused:
@@ -213,8 +213,8 @@ def _weakest(merged: MergedMap, links: Sequence[Link]) -> tuple[NearMiss, ...]:
 
 def _near_miss(link: Link, words: str) -> NearMiss:
     inliers = int(link.evidence.get("inliers", link.weight))
-    if link.doubles:
-        words = f"{link.doubles} of these are found at other places too; {words}"
+    if link.aliased:
+        words = f"{link.aliased} of these are found at other places too; {words}"
     return NearMiss(*link.pair, int(link.evidence.get("matches", inliers)), inliers, words)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.explanation import Misfit, PairExplanation, Standing, Witness
+from mapweave.hybridmap.explanation import LinkAgreement, Misfit, PairExplanation, Standing
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
@@ -60,19 +60,21 @@ def explain_nodes(
     explanation = replace(
         _evidence(first, second, geometry, verification),
         claims=(*claims(merged, first.id, second.id, own), *consequences(merged, link, first.id, second.id)),
-        rulings=merged.rulings.about(first.id, second.id),
+        constraints=merged.constraints.about(first.id, second.id),
     )
-    retired = next((r for m, r in merged.rulings.retired.items() if m in (first.id.map, second.id.map)), None)
+    retired = next(
+        (r for m, r in merged.constraints.retired.items() if m in (first.id.map, second.id.map)), None
+    )
     if retired is not None:
         return replace(explanation, standing=Standing.UNDONE, reason=reason_of(retired))
-    witnesses: tuple[Witness, ...] = ()
+    other_links: tuple[LinkAgreement, ...] = ()
     verified = geometry is not None and (own is None or own.kind in CLAIMS)
     if geometry is None and explanation.a_from_b is not None:
         geometry = Link(first.id, second.id, explanation.a_from_b, explanation.shared, explanation.evidence)
     if geometry is not None and (own is None or own.kind in CLAIMS):
-        witnesses = _other_links(merged, geometry, consistency)
-    standing, reason = _verdict(merged, (first, second), link, own, refusal, witnesses, verification)
-    explanation = replace(explanation, standing=standing, reason=reason, witnesses=witnesses)
+        other_links = _other_links(merged, geometry, consistency)
+    standing, reason = _verdict(merged, (first, second), link, own, refusal, other_links, verification)
+    explanation = replace(explanation, standing=standing, reason=reason, other_links=other_links)
     if geometry is None:
         return explanation
     misfit, link_probability_ = _judged(merged, geometry, kept=link is not None or own is not None)
@@ -85,15 +87,15 @@ def _verdict(
     link: Link | None,
     own: Edge | None,
     refusal: RefusedLink | None,
-    witnesses: tuple[Witness, ...],
+    other_links: tuple[LinkAgreement, ...],
     verification: RecognitionSettings | None,
 ) -> tuple[Standing, str]:
     """What has become of two nodes, and why, in words."""
     first, second = ends
     if link is not None:
-        count = sum(w.agrees and w.kept for w in witnesses)
+        count = sum(w.agrees and w.kept for w in other_links)
         return Standing.LINKED, f"{_landmarks(link)}, {_other_links_in_words(count)}"
-    constraint = merged.rulings.against(first.id, second.id)
+    constraint = merged.constraints.against(first.id, second.id)
     if constraint is not None and refusal is not None and refusal.link is not None:
         return Standing.UNDONE, reason_of(constraint)
     if own is not None:
@@ -168,10 +170,10 @@ def _refusal(merged: MergedMap, a: NodeId, b: NodeId, joined: bool) -> RefusedLi
 
 
 def _landmarks(link: Link) -> str:
-    if not link.doubles:
+    if not link.aliased:
         return f"{link.weight} landmarks agree on one pose"
-    inliers = link.weight + link.doubles
-    return f"{inliers} landmarks agree on one pose, {link.doubles} of them found at other places too"
+    inliers = link.weight + link.aliased
+    return f"{inliers} landmarks agree on one pose, {link.aliased} of them found at other places too"
 
 
 def _other_links_in_words(count: int) -> str:
@@ -191,7 +193,7 @@ def _judged(merged: MergedMap, link: Link, kept: bool) -> tuple[Misfit | None, f
 
 def _other_links(
     merged: MergedMap, link: Link, consistency: ConsistencySettings | None
-) -> tuple[Witness, ...]:
+) -> tuple[LinkAgreement, ...]:
     """All other links that were found between the two pieces of map, as the merge compares them."""
     s = consistency or ConsistencySettings()
     maps = {map_id: merged.maps[map_id] for map_id in {link.a.map, link.b.map}}
@@ -211,7 +213,7 @@ def _other_links(
     distances2 = loop_distances2(group, pieces[names[0]], pieces[names[1]], s)
     own = next(k for k, candidate in enumerate(group) if candidate.key == link.key)
     return tuple(
-        Witness(
+        LinkAgreement(
             *candidate.pair,
             float(distances2[own, k]),
             bool(distances2[own, k] < s.gate),
@@ -223,4 +225,4 @@ def _other_links(
 
 
 def _without_undone(merged: MergedMap, maps: dict[MapId, HybridMap]) -> dict[MapId, HybridMap]:
-    return dict(apply_constraints(maps, (), merged.rulings).maps)
+    return dict(apply_constraints(maps, (), merged.constraints).maps)

@@ -89,7 +89,7 @@ class Encounter:
         by_window, total = self.added(clear, odds, weights, s)
         # What was enough at any time is enough: later meetings do not make it possible.
         windows = np.cumsum(by_window > math.log(2.0))
-        return bool(((windows >= s.least_witnesses) & (total >= -math.log(s.doubt))).any())
+        return bool(((windows >= s.least_moments) & (total >= -math.log(s.doubt))).any())
 
     def added(self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings) -> tuple[Array, Array]:
         """(W,) logarithms of the odds against the merge that each window adds to those before, and (W,) sums.

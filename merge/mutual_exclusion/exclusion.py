@@ -26,7 +26,7 @@ from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.encounter import Encounter
 from mapweave.merge.mutual_exclusion.mutual_visibility import errors_in_common, none_wrong, odds_against
 from mapweave.merge.mutual_exclusion.quadrature import SAMPLES, quadrature_points
-from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, Stay, stay
+from mapweave.merge.mutual_exclusion.trajectories import RobotTrajectory, Stay, stay
 from mapweave.merge.mutual_exclusion.visibility_intervals import visibility_intervals
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ExclusionSettings
@@ -37,7 +37,10 @@ to all moments."""
 
 
 def clash_of(
-    graph: PoseGraph, first: BodyTrajectory, second: BodyTrajectory, settings: ExclusionSettings | None = None
+    graph: PoseGraph,
+    first: RobotTrajectory,
+    second: RobotTrajectory,
+    settings: ExclusionSettings | None = None,
 ) -> Collision | None:
     """Whether two robots' trajectories contradict each other.
 
@@ -104,7 +107,7 @@ STEP = 0.5
 
 
 def _met(
-    graph: PoseGraph, first: BodyTrajectory, second: BodyTrajectory, s: ExclusionSettings
+    graph: PoseGraph, first: RobotTrajectory, second: RobotTrajectory, s: ExclusionSettings
 ) -> _Met | None:
     """None if they are not known to have met."""
     start, end = max(first.times[0], second.times[0]), min(first.times[-1], second.times[-1])
@@ -136,7 +139,7 @@ def _met(
 
 def _clash(
     graph: PoseGraph,
-    trajectories: tuple[BodyTrajectory, BodyTrajectory],
+    trajectories: tuple[RobotTrajectory, RobotTrajectory],
     meeting: Encounter,
     odds: Array | None,
     evidence: float,
@@ -165,8 +168,8 @@ def _clash(
 
 def _pose_sigmas(
     graph: PoseGraph,
-    first: BodyTrajectory,
-    second: BodyTrajectory,
+    first: RobotTrajectory,
+    second: RobotTrajectory,
     i: NDArray[np.int64],
     j: NDArray[np.int64],
 ) -> Array:

@@ -12,7 +12,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, TrajectoryCache
+from mapweave.merge.mutual_exclusion.trajectories import RobotTrajectory, TrajectoryCache
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
 from mapweave.merge.pose_graph.links import Link
@@ -47,7 +47,7 @@ class Refutation:
         self._exclusion = exclusion
         cache = trajectories or TrajectoryCache()
         by_fragment = ((f.name, cache.trajectories(f, maps[f.name.map])) for f in fragments)
-        self._trajectories: dict[NodeId, tuple[BodyTrajectory, ...]] = {
+        self._trajectories: dict[NodeId, tuple[RobotTrajectory, ...]] = {
             name: some for name, some in by_fragment if some
         }
 
@@ -118,7 +118,7 @@ class Refutation:
                 yield key, max(clashes, key=lambda clash: clash.evidence)
 
 
-def _near(graph: PoseGraph, trajectories: Sequence[BodyTrajectory]) -> Iterator[tuple[int, int]]:
+def _near(graph: PoseGraph, trajectories: Sequence[RobotTrajectory]) -> Iterator[tuple[int, int]]:
     """Pairs of trajectories of different robots that overlap in time, by one clock, and come near each other.
 
     Of a thousand robots in a large building few ever meet, and a full test is slow.

@@ -21,7 +21,7 @@ DRIFT = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class BodyTrajectory:
+class RobotTrajectory:
     """N moments of a robot, by one clock: the images of its nodes, and their trajectory segments.
 
     Attributes:
@@ -62,7 +62,7 @@ class BodyTrajectory:
         return out
 
 
-def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
+def trajectories_of(nodes: Collection[Node]) -> tuple[RobotTrajectory, ...]:
     """The trajectories of one robot's nodes, one a clock; nodes of unknown clocks are left out."""
     by_clock: dict[str, list[Node]] = {}
     for node in nodes:
@@ -76,7 +76,7 @@ def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
         teller = np.concatenate(
             [np.arange(len(nodes_of_clock)), np.repeat(range(len(nodes_of_clock)), _lengths(nodes_of_clock))]
         )
-        segments = [node.wake for node in nodes_of_clock if len(node.wake)]
+        segments = [node.segment for node in nodes_of_clock if len(node.segment)]
         ages = np.concatenate([np.zeros(len(nodes_of_clock)), *(segment.ages for segment in segments)])
         offsets = np.concatenate(
             [np.zeros((len(nodes_of_clock), 3)), *(segment.node_from_robot for segment in segments)]
@@ -84,10 +84,10 @@ def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
         times = _seconds(nodes_of_clock)[teller] + ages
         order = np.argsort(times, kind="stable")
         scans = RangeScans.of(
-            [node.ranges for node in nodes_of_clock], [node.wake for node in nodes_of_clock]
+            [node.ranges for node in nodes_of_clock], [node.segment for node in nodes_of_clock]
         ).take(order)
         ids = tuple(nodes_of_clock[k].id for k in teller[order])
-        trajectories.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, scans))
+        trajectories.append(RobotTrajectory(clock, ids, offsets[order], times[order], radius, scans))
     return tuple(trajectories)
 
 
@@ -96,9 +96,9 @@ class TrajectoryCache:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._entries: dict[NodeId, tuple[Fragment, tuple[BodyTrajectory, ...]]] = {}
+        self._entries: dict[NodeId, tuple[Fragment, tuple[RobotTrajectory, ...]]] = {}
 
-    def trajectories(self, fragment: Fragment, hybrid_map: HybridMap) -> tuple[BodyTrajectory, ...]:
+    def trajectories(self, fragment: Fragment, hybrid_map: HybridMap) -> tuple[RobotTrajectory, ...]:
         """See `trajectories_of`; `hybrid_map` holds the fragment's nodes."""
         entry = self._entries.get(fragment.name)
         if entry is None or entry[0] is not fragment:
@@ -112,7 +112,7 @@ def _seconds(nodes: Sequence[Node]) -> Array:
 
 
 def _lengths(nodes: Sequence[Node]) -> list[int]:
-    return [len(node.wake) for node in nodes]
+    return [len(node.segment) for node in nodes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ CLOCK_ERROR = 0.05
 """Standard deviation between two robots with the same clock, s."""
 
 
-def stay(trajectory: BodyTrajectory, places: Array, times: Array) -> Stay:
+def stay(trajectory: RobotTrajectory, places: Array, times: Array) -> Stay:
     """Where a robot was, on the straight lines between its moments, which it drives at a pace of its own.
 
     Args:

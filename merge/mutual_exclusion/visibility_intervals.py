@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array
-from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, Stay
+from mapweave.merge.mutual_exclusion.trajectories import RobotTrajectory, Stay
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 
@@ -64,7 +64,7 @@ class VisibilityInterval:
 
 
 def visibility_intervals(
-    graph: PoseGraph, observer: BodyTrajectory, other: BodyTrajectory, stay: Stay, times: Array
+    graph: PoseGraph, observer: RobotTrajectory, other: RobotTrajectory, stay: Stay, times: Array
 ) -> VisibilityInterval:
     """All observations of one robot with the other robot's expected place in reach.
 

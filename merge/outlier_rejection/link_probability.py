@@ -66,7 +66,7 @@ def prior_odds(merged: MergedMap) -> float:
     Links excluded by manual constraints do not count. Half a link is added to either side (Jeffreys' prior).
     """
     refused = sum(
-        r.link is not None and r.edge is None and merged.rulings.against(*r.pair) is None
+        r.link is not None and r.edge is None and merged.constraints.against(*r.pair) is None
         for r in merged.refused
     )
     return (len(merged.links) + 0.5) / (refused + 0.5)

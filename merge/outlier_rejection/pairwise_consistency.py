@@ -40,8 +40,8 @@ EXACT = 40
 """Up to as many links the best clique is searched exhaustively, beyond greedily."""
 LEAST_EVIDENCE = 4.6
 """Natural logarithm of the odds from which a link that is too little alone, or was contradicted, is
-believed where others join its two ends: how many witnesses are true for one that is false, times Bayes'
-factor (see mapweave.merge.outlier_rejection.link_probability), which must speak for it."""
+believed where others join its two ends: how many independent links are true for one that is false, times
+Bayes' factor (see mapweave.merge.outlier_rejection.link_probability), which must speak for it."""
 
 
 HUNDREDTHS = 100.0

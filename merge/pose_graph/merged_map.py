@@ -120,7 +120,7 @@ class MergedMap:
         components: nodes that belong together, largest first.
         poses: of all nodes.
         graphs: the solved graph of each component, for covariances between nodes.
-        rulings: manual constraints; the refused pairs say which of them took effect.
+        constraints: manual constraints; the refused pairs say which of them took effect.
         superseded: nodes that newer ones of the same place replace, see
             mapweave.merge.map_maintenance.node_superseding. They still constrain poses; answers use the other
             nodes.
@@ -136,7 +136,7 @@ class MergedMap:
     components: tuple[frozenset[NodeId], ...]
     poses: Mapping[NodeId, Placement]
     graphs: tuple[PoseGraph, ...] = ()
-    rulings: ManualConstraints = field(default_factory=ManualConstraints)
+    constraints: ManualConstraints = field(default_factory=ManualConstraints)
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     set_apart: Mapping[MapId, str] = field(default_factory=dict)
@@ -243,7 +243,7 @@ class MergedMap:
         words = [f"{count} {word}{'' if count == 1 else 's'}" for count, word in counts]
         more = (
             (len(self.superseded), "superseded"),
-            (len(self.rulings.retired), "retired"),
+            (len(self.constraints.retired), "retired"),
             (len(self.set_apart), "set apart"),
         )
         words += [f"{refused} refused", *(f"{count} {word}" for count, word in more if count)]

@@ -1,5 +1,4 @@
-"""The choice of pairs as it changes: the same as `mapweave.merge.pose_graph.candidates.choose_pairs`, node
-by node.
+"""Which pairs of nodes are verified: those that are among the best of either of their nodes.
 
 The table of all overlaps is never traversed. Only what a change affects is updated: the nodes whose overlaps
 it contains, and the few edges around a new or removed edge.
@@ -18,7 +17,12 @@ class PairTable:
     """Overlaps by node, the edges that make neighbours, and the pairs that are chosen."""
 
     def __init__(self, most_per_map: int = MOST_PER_MAP, least_hops: int = LEAST_HOPS) -> None:
-        """Start empty; the arguments are those of `choose_pairs`."""
+        """Start empty.
+
+        Args:
+            most_per_map: best pairs of one node with the nodes of any one map.
+            least_hops: nodes of one map that are fewer edges apart are neighbours, not loops.
+        """
         self._most_per_map, self._least_hops = most_per_map, least_hops
         self._overlaps: dict[NodeId, dict[NodeId, float]] = {}
         self._ways: dict[NodeId, Counter[NodeId]] = {}

@@ -47,12 +47,12 @@ class Verdicts:
 
     def ties(self, constraints: ManualConstraints) -> Iterable[MapPair]:
         """Maps between which there are links, without those that manual constraints exclude."""
-        ruled = bool(constraints.in_force)
+        constrained = bool(constraints.in_force)
         for maps, verdicts in self._between.items():
             if maps[0] == maps[1]:
                 continue
             links = (v for v in verdicts.values() if isinstance(v, Link))
-            if any(not ruled or constraints.against(*link.pair) is None for link in links):
+            if any(not constrained or constraints.against(*link.pair) is None for link in links):
                 yield maps
 
     def among(self, maps: frozenset[MapId]) -> list[Verdict]:

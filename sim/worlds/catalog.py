@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -90,8 +90,3 @@ def world_from_table(table: Mapping[str, Any], seed: int, folder: Path) -> World
     if not isinstance(kind, str):
         raise InvalidValue(f"world: kind must be a name, not {kind!r}")
     return make_world(kind, seed, **rest)
-
-
-def parameter_names(kind: str) -> tuple[str, ...]:
-    """Names of a kind's parameters."""
-    return tuple(field.name for field in fields(KINDS[kind].parameters))

@@ -12,24 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.agent.drive_statistics import DriveStatistics
-from mapweave.agent.fleet_client import NO_ANSWER, FleetClient, decode_mission, encode_mission
-from mapweave.agent.mission import (
-    Answer,
-    Carried,
-    Explore,
-    GoTo,
-    Idle,
-    Mission,
-    Question,
-    WhatIsKnown,
-    WhereAmI,
-    WhichWay,
-)
-from mapweave.agent.pipeline import Status
-from mapweave.agent.status_message import MAX_WORDS, AgentStatus, decode_agent_status, encode_agent_status
+from mapweave.agent.fleet_client import NO_ANSWER, FleetClient
+from mapweave.agent.mission import Answer, Question, WhatIsKnown, WhereAmI, WhichWay
+from mapweave.agent.mission_control import MissionControl
+from mapweave.hybridmap.agent_status import MAX_STATUS_WORDS, AgentStatus, Status
 from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
@@ -61,7 +51,19 @@ VIEW = View(
 
 names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,31}", fullmatch=True)
 node_ids = st.builds(NodeId, names, st.integers(0, 2**53), st.integers(0, 2**40))
-missions = st.one_of(st.just(Idle()), st.just(Explore()), st.just(Carried()), st.builds(GoTo, node_ids))
+stamps = st.integers(0, 2**63 - 1)
+orders = st.one_of(
+    st.builds(
+        MissionOrder,
+        names,
+        names,
+        st.sampled_from(sorted(set(MissionKind) - {MissionKind.GO})),
+        stamps,
+        names,
+    ),
+    st.builds(MissionOrder, names, names, st.just(MissionKind.GO), stamps, names, node_ids),
+)
+reports = st.builds(MissionReport, orders, st.sampled_from(sorted(MissionState)), st.floats(0.0, 1.0))
 finite = st.floats(-1e6, 1e6)
 words = st.text(st.characters(categories=["L", "N", "P", "Zs"]).filter(str.isprintable), max_size=200)
 counts = st.integers(0, 10**4)
@@ -74,16 +76,18 @@ statuses = st.builds(
 )  # fmt: skip
 
 
-@given(missions)
-def test_missions_come_back_as_they_were(mission: Mission) -> None:
-    assert decode_mission(encode_mission(mission)) == mission
+@given(orders, reports)
+def test_missions_come_back_as_they_were(order: MissionOrder, report: MissionReport) -> None:
+    assert decode(encode(order), MissionOrder) == order
+    assert decode(encode(report), MissionReport) == report
 
 
-@given(statuses, st.integers(0, 2**53))
-def test_statuses_come_back_as_they_were(status: Status, stamp_ns: int) -> None:
-    report = decode_agent_status(encode_agent_status(AgentStatus(status, stamp_ns)))
-    assert report == AgentStatus(status, stamp_ns)
-    assert report.fix_node == status.fix_node
+@given(statuses, stamps, st.none() | reports)
+def test_statuses_come_back_as_they_were(
+    status: Status, stamp_ns: int, mission: MissionReport | None
+) -> None:
+    sent = AgentStatus(status, stamp_ns, "r0", mission=mission)
+    assert decode(encode(sent), AgentStatus) == sent
 
 
 odd_texts = ["goto", "r0.1.2", "r0.².1", "r0.1.٣", "r0.-1.2", "r0.1." + "9" * 400, "nan", "inf", "..", ""]
@@ -95,52 +99,31 @@ scalars = st.one_of(
 
 @given(st.binary(max_size=200))
 def test_garbage_is_no_mission_and_no_status(data: bytes) -> None:
-    for read in (decode_mission, decode_agent_status):
+    for kind in (MissionOrder, MissionReport, AgentStatus):
         with pytest.raises(InvalidMessage):
-            read(data)
+            decode(data, kind)
 
 
-@given(st.sampled_from(["goto", "idle", "GOTO", "fly", ""]) | scalars, scalars)
-def test_a_mission_is_read_or_refused(name: object, node: object) -> None:
-    data = msgpack.packb({"v": 1, "s": {"mission": name, "node": node}})
+@given(st.sampled_from([MissionOrder, AgentStatus]), orders, statuses, st.data())
+def test_a_message_with_a_strange_field_is_read_or_refused(
+    kind: type, order: MissionOrder, status: Status, data: st.DataObject
+) -> None:
+    fields = msgpack.unpackb(encode(order if kind is MissionOrder else AgentStatus(status, 5)))
+    within = data.draw(st.sampled_from([fields, fields.get("status", fields)]))
+    within[data.draw(st.sampled_from(sorted(within)))] = data.draw(scalars)
     try:
-        mission = decode_mission(data)
+        value = decode(msgpack.packb(fields), kind)
     except InvalidMessage:
         return
-    assert decode_mission(encode_mission(mission)) == mission
+    assert decode(encode(value), kind) == value
 
 
-@given(statuses, st.data())
-def test_a_status_with_a_strange_field_is_read_or_refused(status: Status, data: st.DataObject) -> None:
-    fields = msgpack.unpackb(encode_agent_status(AgentStatus(status, 5)))
-    name = data.draw(st.sampled_from(sorted(fields["s"])))
-    fields["s"][name] = data.draw(scalars)
-    try:
-        report = decode_agent_status(msgpack.packb(fields))
-    except InvalidMessage:
-        return
-    numbers = [*report.status.map_from_robot.vector, *report.status.node_from_robot.vector]
-    assert np.isfinite(numbers).all()
-    assert decode_agent_status(encode_agent_status(report)) == report
-
-
-@given(statuses, st.data())
-def test_a_status_without_a_field_is_refused(status: Status, data: st.DataObject) -> None:
-    fields = msgpack.unpackb(encode_agent_status(AgentStatus(status, 5)))
-    name = data.draw(st.sampled_from(sorted(fields["s"])))
-    del fields["s"][name]
+@pytest.mark.parametrize("name", ["doing", "detail", "nodes", "tracked", "map_from_robot", "finished"])
+def test_a_status_without_a_field_is_refused(name: str) -> None:
+    fields = msgpack.unpackb(encode(AgentStatus(Status("turning", "", 0, 0, Pose2(), False), 5)))
+    del fields["status"][name]
     with pytest.raises(InvalidMessage, match=name):
-        decode_agent_status(msgpack.packb(fields))
-
-
-@given(st.text(), st.integers(1, 400))
-def test_any_status_can_be_encoded(text: str, times: int) -> None:
-    """A status quotes servers and drivers: line breaks and long texts must not end the robot's loop."""
-    status = Status("looking", text * times, 0, 0, Pose2(), False)
-    message = decode_agent_status(encode_agent_status(AgentStatus(status, 0))).status.detail
-    assert message.isprintable()
-    assert len(message) == min(len(text) * times, MAX_WORDS)
-    assert all(c == d for c, d in zip(text * times, message, strict=False) if c.isprintable())
+        decode(msgpack.packb(fields), AgentStatus)
 
 
 # The link
@@ -162,59 +145,75 @@ def other(hub: MemoryHub) -> Iterator[MemoryBus]:
 @pytest.fixture
 def link(hub: MemoryHub) -> Iterator[FleetClient]:
     bus = MemoryBus(hub)
-    link = FleetClient(bus, KEYS, MAP, answer_timeout=0.5)
+    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"), answer_timeout=0.5)
     yield link
     link.close()
     bus.close()
 
 
-def test_operators_commands_arrive_in_order_and_once(link: FleetClient, other: MemoryBus) -> None:
-    assert link.missions() == []
-    given: list[Mission] = [Explore(), GoTo(THERE), Idle()]
-    for mission in given:
-        (reply,) = other.ask(KEYS.mission("r0"), encode_mission(mission), 2.0)
-        assert (reply.payload, reply.error) == (b"ok", "")
-    assert link.missions() == given
-    assert link.missions() == []
+def test_an_order_is_acknowledged_and_reported(link: FleetClient, other: MemoryBus) -> None:
+    order = MissionOrder("a1", "r0", MissionKind.GO, 7, "anna", THERE)
+    for _ in range(2):
+        (reply,) = other.ask(KEYS.mission("r0"), encode(order), 2.0)
+        assert decode(reply.payload, MissionReport) == MissionReport(order, MissionState.RUNNING)
+    (reply,) = other.ask(KEYS.agent_status("r0"), b"", 2.0)
+    assert decode(reply.payload, AgentStatus).mission == MissionReport(order, MissionState.RUNNING)
 
 
 @pytest.mark.parametrize(
-    ("payload", "said"),
+    ("change", "said"),
     [
-        (b"garbage", "record"),
-        (msgpack.packb({"v": 1, "s": {"mission": "fly"}}), "no mission 'fly'; known are idle, explore"),
-        (msgpack.packb({"v": 1, "s": {"mission": "goto", "node": "kitchen"}}), "is no node id"),
-        (msgpack.packb({"v": 1, "s": {"mission": "goto", "node": "r0.².1"}}), "is no node id"),
+        ({"kind": "fly"}, "Invalid enum value 'fly'"),
+        ({"kind": "go"}, "give node"),
+        ({"node": ["r0", 1, 2]}, "takes no node"),
+        ({"stamp_ns": -1}, "stamp_ns"),
+        ({"id": "No Name"}, "id"),
+        ({"robot": "r1"}, "a mission of r1 came to r0"),
     ],
 )
-def test_invalid_commands_are_refused_without_effect(
-    link: FleetClient, other: MemoryBus, payload: bytes, said: str
+def test_invalid_orders_are_refused_without_effect(
+    link: FleetClient, other: MemoryBus, change: dict[str, object], said: str
 ) -> None:
-    (reply,) = other.ask(KEYS.mission("r0"), payload, 2.0)
+    fields = msgpack.unpackb(encode(MissionOrder("a1", "r0", MissionKind.STOP, 7, "anna")))
+    (reply,) = other.ask(KEYS.mission("r0"), msgpack.packb(fields | change), 2.0)
     assert said in reply.error
-    assert link.missions() == []
-    (reply,) = other.ask(KEYS.mission("r0"), encode_mission(Explore()), 2.0)
-    assert not reply.error, "and the next command is taken"
+    (reply,) = other.ask(KEYS.agent_status("r0"), b"", 2.0)
+    assert decode(reply.payload, AgentStatus).mission is None
 
 
 def test_the_fleet_receives_the_robots_status(link: FleetClient, other: MemoryBus) -> None:
     received: list[AgentStatus] = []
     other.subscribe(
-        KEYS.agent_statuses(), lambda sample: received.append(decode_agent_status(sample.payload))
+        KEYS.agent_statuses(), lambda sample: received.append(decode(sample.payload, AgentStatus))
     )
     status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False, "goto", THERE, Pose2(0.1, 0, 0), 4)
     link.report(status, 123)
-    eventually(lambda: received == [AgentStatus(status, 123, MAP.epoch)])
+    eventually(lambda: received == [AgentStatus(status, 123, "r0", MAP.epoch)])
+
+
+@given(st.text(), st.integers(1, 400))
+def test_any_status_can_be_sent(text: str, times: int) -> None:
+    """A status quotes servers and drivers: line breaks and long texts must not end the robot's loop."""
+    bus = MemoryBus(MemoryHub())
+    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"))
+    link.report(Status("looking", text * times, 0, 0, Pose2(), False), 0)
+    (reply,) = bus.ask(KEYS.agent_status("r0"), b"", 2.0)
+    message = decode(reply.payload, AgentStatus).status.detail
+    link.close()
+    bus.close()
+    assert message.isprintable()
+    assert len(message) == min(len(text) * times, MAX_STATUS_WORDS)
+    assert all(c == d for c, d in zip(text * times, message, strict=False) if c.isprintable())
 
 
 def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     """Also when nothing was published: what waits for the server, what has gone over the network."""
     bus, waiting = TrafficMeter(MemoryBus(hub)), [3]
-    link = FleetClient(bus, KEYS, MAP, unsent=lambda: waiting[0])
+    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"), unsent=lambda: waiting[0])
 
     def asked() -> AgentStatus:
         (reply,) = other.ask(KEYS.agent_status("r0"), b"", 1.0)
-        return decode_agent_status(reply.payload)
+        return decode(reply.payload, AgentStatus)
 
     first = asked()
     assert first.status.doing == "starting"
@@ -240,11 +239,11 @@ def test_the_agent_is_alive_until_it_goes(hub: MemoryHub, other: MemoryBus) -> N
     seen: list[tuple[str, bool]] = []
     other.watch(KEYS.agents_alive(), lambda key, alive: seen.append((key, alive)))
     bus = MemoryBus(hub)
-    link = FleetClient(bus, KEYS, MAP)
+    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"))
     eventually(lambda: seen == [(KEYS.agent_alive(MAP), True)])
     link.close()
     eventually(lambda: seen[-1] == (KEYS.agent_alive(MAP), False))
-    assert other.ask(KEYS.mission("r0"), encode_mission(Idle()), 0.2) == []
+    assert other.ask(KEYS.mission("r0"), b"", 0.2) == []
     bus.close()
 
 
@@ -368,7 +367,7 @@ def test_a_question_that_cannot_be_sent_is_answered_and_the_next_one_is_asked(
 
 def test_closing_twice_is_no_error(hub: MemoryHub) -> None:
     bus = MemoryBus(hub)
-    link = FleetClient(bus, KEYS, MAP)
+    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"))
     link.close()
     link.close()
     bus.close()

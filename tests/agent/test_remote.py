@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -30,6 +31,7 @@ from mapweave.agent.observation import Command, Observation, Odometry, RobotDesc
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
 from mapweave.processes import simulator
+from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.bus import Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -40,6 +42,8 @@ DESCRIPTION = RobotDescription(
     ranger_bearings=(-0.5, 0.0, 0.5),
     ranger_reach=3.0,
 )
+LENS = Equidistant(115.0, 115.5, 158.7, 120.9, (-0.02, 0.004, -0.003, 0.0005))
+FISHEYE = replace(DESCRIPTION, camera=LENS.ideal(320, 240, 0.3), distortion=LENS)
 KEYS = Keys("test")
 
 
@@ -89,7 +93,8 @@ def test_a_step_survives_exactly(sequence: int, forward: float, turn: float) -> 
 
 
 def test_a_description_survives_exactly() -> None:
-    assert decode_description(encode_description(DESCRIPTION)) == DESCRIPTION
+    for description in (DESCRIPTION, FISHEYE):
+        assert decode_description(encode_description(description)) == description
 
 
 def test_a_sliced_image_is_sent_correctly() -> None:
@@ -162,6 +167,7 @@ def test_a_wrong_step_is_refused(fields: dict[str, object]) -> None:
 MESSAGES: list[tuple[bytes, Callable[[bytes], object]]] = [
     (encode_observation(an_observation(np.zeros((4, 4), np.uint8))), decode_observation),
     (encode_description(DESCRIPTION), decode_description),
+    (encode_description(FISHEYE), decode_description),
     (encode_step(StepRequest(7, Command(0.1, 0.2))), decode_step),
 ]
 

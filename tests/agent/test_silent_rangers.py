@@ -70,10 +70,13 @@ def test_it_stops_and_reports_while_they_are_silent_and_then_goes_on(walls, miss
 
 
 def test_a_long_silence_does_not_count_against_what_the_robot_was_doing(walls):
-    """The same commands as without the silence: behaviours have waited, not given up."""
+    """The same commands as without the silence: behaviours have waited, not given up.
+
+    40 s are longer than the patience of each of them.
+    """
     pipelines = [Drive(walls, on(Explore())) for _ in range(2)]
     commands = []
-    for drive, silence in zip(pipelines, (0, 900), strict=True):
+    for drive, silence in zip(pipelines, (0, 400), strict=True):
         first = drive.run(40)
         drive.run(silence, NONE)
         commands.append([step.command for step in first + drive.run(60)])

@@ -16,14 +16,13 @@ from benchmarks.navigate.drives import PATIENCE, Outcome, _reason, drive
 from benchmarks.navigate.floor import Floor
 from benchmarks.navigate.office import Mapped
 from benchmarks.navigate.plots import LEAST_EDGES, Plot, draw_plot
-from mapweave.agent.drive_statistics import DriveStatistics
-from mapweave.agent.mission import GoTo
-from mapweave.agent.pipeline import Status
-from mapweave.agent.status_message import AgentStatus
 from mapweave.evaluation.map_score import crossed
+from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.floorplan import FloorPlan, Rectangle
@@ -135,8 +134,8 @@ def test_figures_count_failures_as_such(mapped: Mapped) -> None:
     assert figures["collisions"] == 2 and figures["path_over_shortest"] == pytest.approx(1.3)
     assert (figures["edges_driven"], figures["nodes_skipped"]) == (9, 2)
     assert (figures["relocalizations"], figures["blocks"]) == (5, 3)
-    nobody = summary(outcomes[2:])
-    assert nobody["success"] == 0.0 and nobody["goal_error_m_median"] is None
+    failed = summary(outcomes[2:])
+    assert failed["success"] == 0.0 and failed["goal_error_m_median"] is None
 
 
 def test_a_drive_fails_for_each_reason(mapped: Mapped) -> None:
@@ -158,8 +157,8 @@ class FakeOffice:
         self.poses = [Pose2()] * 41
         self.collisions = 3
 
-    def command(self, mission: object) -> None:
-        self.going, self.begin = isinstance(mission, GoTo), self.ticks
+    def command(self, kind: MissionKind, node: NodeId | None = None) -> None:
+        self.going, self.begin = kind is MissionKind.GO, self.ticks
 
     def kidnap(self, robot: str, pose: Pose2) -> None:
         self.poses[-1] = pose

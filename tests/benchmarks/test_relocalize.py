@@ -128,10 +128,10 @@ def test_pictures_are_taken_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     wishes = [Wish(Pose2(2.0, 2.0, heading)) for heading in (0.0, 1.0)]
     first = taken("arena", lambda: Photographer(world, (1,)), wishes)
 
-    def nobody() -> Photographer:
+    def never() -> Photographer:
         raise AssertionError("they are there")
 
-    second = taken("arena", nobody, wishes)
+    second = taken("arena", never, wishes)
     for a, b in zip(first, second, strict=True):
         assert len(a) > 10 and a.camera == b.camera and a.world_from_robot == b.world_from_robot
         assert np.array_equal(a.sift, b.sift) and np.array_equal(a.pixels, b.pixels)
@@ -187,20 +187,20 @@ def test_answers_are_judged_by_the_truth() -> None:
     sift = np.zeros((0, 128), np.uint8)
     picture = Picture(here, CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
 
-    def told(pose: Pose2, site: int, kind: str = "near") -> dict[str, float]:
+    def scored(pose: Pose2, site: int, kind: str = "near") -> dict[str, float]:
         estimated = PoseGaussian.from_sigmas(pose, 0.1, 0.05)
         answer = RelocalizeAnswer(
             Certainty.FOUND, (Whereabouts(node.id, estimated, None, -1, 20, 0.9),), "because"
         )
         return figures([judged(Query(kind, picture, site), answer, truth)])
 
-    right = told(Pose2(0.3, 0.1, 0.1), 0)
+    right = scored(Pose2(0.3, 0.1, 0.1), 0)
     assert right["recall_at_1"] == 1 and right["error_m_median"] == pytest.approx(0.1, abs=1e-3)
     assert right["nees"] == pytest.approx(1.0, abs=0.01)
-    assert told(Pose2(0.5, 0.1, 0.1), 0)["recall_at_1"] == 0
-    assert told(Pose2(0.2, 0.1, 0.3), 0)["wrong_place"] == 1
-    assert told(Pose2(0.2, 0.1, 0.1), 1)["recall_at_1"] == 0
-    assert told(Pose2(0.2, 0.1, 0.1), 0, "twins")["false_accept"] == 1
+    assert scored(Pose2(0.5, 0.1, 0.1), 0)["recall_at_1"] == 0
+    assert scored(Pose2(0.2, 0.1, 0.3), 0)["wrong_place"] == 1
+    assert scored(Pose2(0.2, 0.1, 0.1), 1)["recall_at_1"] == 0
+    assert scored(Pose2(0.2, 0.1, 0.1), 0, "twins")["false_accept"] == 1
 
 
 def test_the_fit_finds_the_weights_that_made_the_data() -> None:

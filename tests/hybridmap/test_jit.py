@@ -48,11 +48,11 @@ assert "numba" not in sys.modules or sys.argv[1] == "without", "imported too ear
 jit.load()
 kernel = some_kernels.lengths
 rows = np.array([[3.0, 4.0], [0.0, 2.0]])
-told = {"lengths": kernel(rows, some_kernels.Scale(2.0, np.array([1.0, 0.0])), 1).tolist()}
-told["table"] = some_kernels.table(np.array([1.0, 2.0, 3.0]), rows).tolist()
+report = {"lengths": kernel(rows, some_kernels.Scale(2.0, np.array([1.0, 0.0])), 1).tolist()}
+report["table"] = some_kernels.table(np.array([1.0, 2.0, 3.0]), rows).tolist()
 stats = getattr(kernel.machine, "stats", None)
-told["hits"] = sum(stats.cache_hits.values()) if stats else -1
-print(json.dumps(told))
+report["hits"] = sum(stats.cache_hits.values()) if stats else -1
+print(json.dumps(report))
 """
 
 

@@ -17,7 +17,7 @@ from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.wire.codec import decode_body, encode_body
 from synthetic.world import CAMERA, random_vectors
 
-EVIDENCE = ("inliers", "doubles", "matches", "share", "there", "back", "sigma_xy", "log_evidence")
+EVIDENCE = ("inliers", "aliased", "matches", "share", "there", "back", "sigma_xy", "log_evidence")
 
 
 def pose(rng: np.random.Generator) -> PoseGaussian:
@@ -75,7 +75,7 @@ def ranges(rng: np.random.Generator) -> Ranges:
     return Ranges(rng.uniform(-3.1, 3.1, n), rng.uniform(0, reach, n), reach)
 
 
-def wake(rng: np.random.Generator, seen: Ranges) -> TrajectorySegment:
+def segment(rng: np.random.Generator, seen: Ranges) -> TrajectorySegment:
     """Where the robot was before and after: anywhere."""
     n = int(rng.integers(1, 20))
     where = rng.uniform(-1, 1, (n, 3)) * [*([float(rng.choice([0.5, 20.0]))] * 2), 3.1]
@@ -92,7 +92,7 @@ def node(rng: np.random.Generator, node_id: NodeId) -> Node:
     return Node(
         node_id, stamp, pose(rng), of, landmarks(rng, of), str(rng.choice(["", "utc"])),
         float(rng.choice([0.0, 0.2, 100.0])), seen,
-        wake(rng, seen) if len(seen) and rng.random() < 0.6 else TrajectorySegment(),
+        segment(rng, seen) if len(seen) and rng.random() < 0.6 else TrajectorySegment(),
     )  # fmt: skip
 
 
@@ -119,7 +119,7 @@ def content(rng: np.random.Generator, map_id: MapId, others: list[NodeId]) -> li
     counts = {change.node.id: len(change.node.landmarks) for change in changes if isinstance(change, NodePut)}
     ends = [*own, NodeId(*map_id, 1000)]
     if rng.random() < 0.4:
-        ends += [*others, NodeId("nobody", 0, 1)]
+        ends += [*others, NodeId("unknown", 0, 1)]
     if len(own) > 1 and rng.random() < 0.7:
         # Most robots' nodes hang together.
         pairs = pairwise(own)

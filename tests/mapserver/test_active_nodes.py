@@ -55,7 +55,7 @@ def test_nothing_is_answered_from_a_retired_map_until_it_is_taken_back(two: Two)
         ([RETIRED], False),
         ([RETIRED, replace(RETIRED, apart=False)], True),
     ):
-        two.merger.rule(ManualConstraints(constraints))
+        two.merger.constrain(ManualConstraints(constraints))
         answers = two.answers()
         assert answers.relocalizer.answer(two.view(HERE)).certainty is Certainty.FOUND
         there = answers.relocalizer.answer(two.view(THERE))
@@ -68,7 +68,7 @@ def test_nothing_is_answered_from_a_retired_map_until_it_is_taken_back(two: Two)
             assert "1 retired" in answers.merged.summary()
 
 
-def told(merger: Merger, views: Sequence[View]) -> list[Certainty]:
+def certainties(merger: Merger, views: Sequence[View]) -> list[Certainty]:
     """Answers once it is known what all nodes look like, as on a server that has nothing else to do."""
     relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
     while relocalizer.prepare(50):
@@ -90,26 +90,26 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     for map_id in maps[:2]:
         for change in logs[map_id]:
             merger.on_change(change)
-    before = told(merger, views)
+    before = certainties(merger, views)
     for change in logs[maps[2]]:
         merger.on_change(change)
-    with_it = told(merger, views)
+    with_it = certainties(merger, views)
     assert merger.merged().joined(maps[0], maps[2])
-    merger.rule(ManualConstraints([retired]))
-    assert told(merger, views) == before and before.count(Certainty.FOUND) >= 8
+    merger.constrain(ManualConstraints([retired]))
+    assert certainties(merger, views) == before and before.count(Certainty.FOUND) >= 8
     # A node that comes meanwhile looks like some of the retired map's, and that is known once it is taken
     # back.
     late = take_map(world, MapId("d", 1), [Pose2(2.3, 2.0, 0.6)], rng)[0]
     merger.on_change(Change(MapId("d", 1), 1, 0, NodePut(late[0])))
-    told(merger, views)
-    merger.rule(ManualConstraints([retired, replace(retired, apart=False)]))
-    assert told(merger, views) == with_it
+    certainties(merger, views)
+    merger.constrain(ManualConstraints([retired, replace(retired, apart=False)]))
+    assert certainties(merger, views) == with_it
     alike = merger.alike.of(late[0], merger.places, merger.node, lambda a, b: None)
     assert any(item.other.id.map == maps[2] for item in alike)
 
 
 def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
-    two.merger.rule(ManualConstraints([RETIRED]))
+    two.merger.constrain(ManualConstraints([RETIRED]))
     merged = two.merger.merged()
     rng = np.random.default_rng(3)
     nodes, _ = take_map(two.worlds[THERE], THERE, [Pose2(2.0, 2.0, 0.1)], rng)
@@ -117,12 +117,12 @@ def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
     two.merger.on_change(Change(THERE, 99, 0, NodePut(late)))
     places = ActiveNodes(two.merger.places, two.merger.node, merged)
     assert all(node.map == HERE for node, _ in places.query(two.view(THERE), 5))
-    two.merger.rule(ManualConstraints())
+    two.merger.constrain(ManualConstraints())
     assert any(node == late.id for node, _ in two.merger.places.query(two.view(THERE), 5))
 
 
 def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
-    two.merger.rule(ManualConstraints())
+    two.merger.constrain(ManualConstraints())
     merged = two.merger.merged()
     node_id = NodeId("a", 1, 3)
     node = merged.maps[HERE].nodes[node_id]

@@ -1,4 +1,4 @@
-"""A server that says why, heeds what people rule, and does so after it was started again."""
+"""A server that explains merges, applies manual constraints, and does so after it was started again."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ExplainRequest, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
-from mapweave.mapserver.explainer import Explainer, RulingBook
+from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_files import map_file_of, maps_of, merged_of
@@ -98,9 +98,9 @@ class Asker:
         (explanation,) = decode(self.ask(KEYS.explain("s0"), request).payload, FleetExplanation).maps
         return explanation
 
-    def rule(self, ends: Ends, apart: bool = True) -> Reply:
+    def constrain(self, ends: Ends, apart: bool = True) -> Reply:
         return self.ask(
-            KEYS.rule("s0"), encode(ManualConstraint(ends, apart, "anna", 10**18, "two kitchens"))
+            KEYS.constrain("s0"), encode(ManualConstraint(ends, apart, "anna", 10**18, "two kitchens"))
         )
 
     def status(self) -> dict[str, object]:
@@ -131,7 +131,7 @@ def same(first: MergedMap, second: MergedMap) -> None:
     assert [(r.pair, r.reason, r.edge) for r in first.refused] == [
         (r.pair, r.reason, r.edge) for r in second.refused
     ]
-    assert first.components == second.components and first.rulings.made == second.rulings.made
+    assert first.components == second.components and first.constraints.made == second.constraints.made
     for node, place in first.poses.items():
         other = second.poses[node]
         assert place.component == other.component
@@ -150,7 +150,7 @@ def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
         reply = asker.ask(KEYS.explain("s0"), encode(ExplainRequest(pair)))
         result = decode(reply.payload, PairExplanation)
         assert result.standing is Standing.LINKED and (result.a.id, result.b.id) == pair
-        assert len(result.shared) == result.evidence["inliers"] and result.witnesses
+        assert len(result.shared) == result.evidence["inliers"] and result.other_links
         assert asker.maps().joined
         everything = decode(
             asker.ask(KEYS.explain("s0"), encode(ExplainRequest())).payload, FleetExplanation
@@ -187,20 +187,20 @@ def test_undone_links_stay_undone_after_a_restart(path: Path, caplog: pytest.Log
     with serving(path) as asker:
         assert str(asker.status()["event"]).startswith("a.1 and b.1 are one map now, by ")
         assert asker.maps().joined
-        reply = asker.rule((A, B))
+        reply = asker.constrain((A, B))
         assert "two kitchens" in str(decode_record(reply.payload)["said"])
         assert not asker.maps().joined and "undone with all links" in asker.maps().reason
         event = str(asker.status()["event"])
         assert event.startswith("a.1 and b.1 are no longer one map: ") and "anna" in event
         assert event in caplog.messages
-        assert asker.status()["rulings"] == 1
+        assert asker.status()["constraints"] == 1
     with serving(path) as asker:
         result = asker.maps()
-        assert not result.joined and [r.because for r in result.rulings] == ["two kitchens"]
-        assert "apart already" in asker.rule((A, B)).error
-        assert not asker.rule((A, B), apart=False).error
-        assert asker.maps().joined and len(asker.maps().rulings) == 2
-        assert "no manual constraint keeps" in asker.rule((A, B), apart=False).error
+        assert not result.joined and [r.because for r in result.constraints] == ["two kitchens"]
+        assert "apart already" in asker.constrain((A, B)).error
+        assert not asker.constrain((A, B), apart=False).error
+        assert asker.maps().joined and len(asker.maps().constraints) == 2
+        assert "no manual constraint keeps" in asker.constrain((A, B), apart=False).error
     with serving(path) as asker:
         assert asker.maps().joined
 
@@ -209,16 +209,16 @@ def test_one_link_of_many_can_be_undone(path: Path) -> None:
     with serving(path) as asker:
         before = links(asker.merged())
         pair = min(before)
-        assert not asker.rule(pair).error
+        assert not asker.constrain(pair).error
         assert links(asker.merged()) == before - {pair}
         neighbours = (NodeId("a", 1, 1), NodeId("a", 1, 3))
         if neighbours not in before:
-            assert "joined by their robot's way" in asker.rule(neighbours).error
+            assert "joined by their robot's way" in asker.constrain(neighbours).error
 
 
 def test_merged_without_a_server_is_the_same(path: Path) -> None:
     with serving(path) as asker:
-        asker.rule(min(links(asker.merged())))
+        asker.constrain(min(links(asker.merged())))
         served = asker.merged()
     offline = Merger()
     for map_id, changes in logs().items():
@@ -226,13 +226,13 @@ def test_merged_without_a_server_is_the_same(path: Path) -> None:
         content = unpack_map_file(pack_map_file(MapFile("agent", str(map_id), tuple(changes))))
         for change in content.changes:
             offline.apply(map_id, change)
-    offline.rule(merged_of(served).rulings)
+    offline.constrain(merged_of(served).constraints)
     same(offline.merged(), merged_of(served))
 
 
 def test_a_file_holds_the_whole_merged_map(path: Path) -> None:
     with serving(path) as asker:
-        asker.rule((A, B))
+        asker.constrain((A, B))
         content = asker.merged()
     merged = merged_of(content)
     again = unpack_map_file(pack_map_file(map_file_of(merged)))
@@ -274,7 +274,7 @@ def test_an_incomplete_merge_is_reported(stored: bytes, path: Path) -> None:
     store, admission, settled = Store(path), AdmissionControl(AdmissionSettings(workers=1)), False
     answers = SimpleNamespace(merged=merged, router=Router(merged))
     explainer = Explainer(
-        bus, KEYS, "s0", lambda: answers, admission, RulingBook(store),
+        bus, KEYS, "s0", lambda: answers, admission, ConstraintRecord(store),
             lambda constraints: None, lambda: settled,
         ConsistencySettings(), tuple, tuple,
     )  # fmt: skip
@@ -301,15 +301,15 @@ def test_other_links_use_the_gate_of_the_merge(path: Path) -> None:
     bus, asking = MemoryBus(hub), MemoryBus(hub)
     with MapServer(bus, KEYS, path, "s0", strict, LockstepSchedule()):
         reply = Asker(asking).ask(KEYS.explain("s0"), encode(ExplainRequest(pair)))
-        assert not any(witness.agrees for witness in decode(reply.payload, PairExplanation).witnesses)
+        assert not any(link.agrees for link in decode(reply.payload, PairExplanation).other_links)
     asking.close()
     bus.close()
 
 
 def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = Store(path)
-    store.add_ruling(b"rubbish")
-    RulingBook(store).add(ManualConstraint((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
-    assert [constraint.who for constraint in RulingBook(store).rulings.made] == ["anna"]
+    store.add_constraint(b"rubbish")
+    ConstraintRecord(store).add(ManualConstraint((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
+    assert [constraint.who for constraint in ConstraintRecord(store).constraints.made] == ["anna"]
     assert "a manual constraint cannot be read" in caplog.text
     store.close()

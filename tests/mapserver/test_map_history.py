@@ -15,10 +15,10 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_history import EXCLUSION_WORDS, MOST_AT_ONCE, MapHistory
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.ruling_history import with_rulings
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.pose_graph.links import refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -46,13 +46,13 @@ def merger() -> Merger:
 
 @pytest.fixture(scope="module")
 def one(merger: Merger) -> MergedMap:
-    merger.rule(ManualConstraints())
+    merger.constrain(ManualConstraints())
     return merger.merged()
 
 
 @pytest.fixture(scope="module")
 def two(merger: Merger) -> MergedMap:
-    merger.rule(APART)
+    merger.constrain(APART)
     return merger.merged()
 
 
@@ -63,8 +63,8 @@ def store(tmp_path: Path) -> Iterator[Store]:
     store.close()
 
 
-def told(history: MapHistory) -> list[tuple[MapEventKind, str]]:
-    return [(event.kind, event.words.split(":")[0].split(", by")[0]) for event in history.happenings]
+def events(history: MapHistory) -> list[tuple[MapEventKind, str]]:
+    return [(event.kind, event.words.split(":")[0].split(", by")[0]) for event in history.events]
 
 
 JOINED = (MapEventKind.JOINED, "a.1 and b.1 are one map now")
@@ -76,9 +76,9 @@ def test_each_event_is_listed_once_with_its_time(one: MergedMap, two: MergedMap)
     history = MapHistory(clock=lambda: next(times))
     for merged in (MergedMap.empty(), one, one, two, two, one):
         history.follow(merged)
-    assert told(history) == [JOINED, PARTED, JOINED]
-    assert "two kitchens" in history.happenings[1].words and history.newest.startswith("a.1 and b.1")
-    stamps = [happening.stamp_ns for happening in history.happenings]
+    assert events(history) == [JOINED, PARTED, JOINED]
+    assert "two kitchens" in history.events[1].words and history.newest.startswith("a.1 and b.1")
+    stamps = [event.stamp_ns for event in history.events]
     assert stamps == sorted(stamps) and stamps[0] >= 10**18
 
 
@@ -88,19 +88,19 @@ def test_a_restarted_server_publishes_only_news(store: Store, one: MergedMap, tw
     # It merges before it has read its store if manual constraints come first.
     again.follow(MergedMap.empty())
     again.follow(one)
-    assert told(again) == [JOINED]
+    assert events(again) == [JOINED]
     third = MapHistory(store)
     third.follow(two)
-    assert told(third) == [JOINED, PARTED]
+    assert events(third) == [JOINED, PARTED]
     assert "refused (undone with all links between a.1 and b.1 by anna" in third.newest
-    assert MapHistory(store).happenings == third.happenings
+    assert MapHistory(store).events == third.events
 
 
 def test_it_is_bounded(store: Store, one: MergedMap, two: MergedMap) -> None:
     history = MapHistory(store, most=5)
     for k in range(12):
         history.follow(two if k % 2 else one)
-    assert told(history) == [PARTED, JOINED, PARTED, JOINED, PARTED] == told(MapHistory(store))
+    assert events(history) == [PARTED, JOINED, PARTED, JOINED, PARTED] == events(MapHistory(store))
 
 
 def test_many_events_at_once_are_summarised(one: MergedMap) -> None:
@@ -108,7 +108,7 @@ def test_many_events_at_once_are_summarised(one: MergedMap) -> None:
     nodes = frozenset(next(iter(one.maps[A].nodes))._replace(agent=name.agent) for name in many)
     history = MapHistory()
     history.follow(replace(one, maps=many, links=(), components=(nodes,)))
-    assert len(history.happenings) == MOST_AT_ONCE + 1
+    assert len(history.events) == MOST_AT_ONCE + 1
     assert history.newest == f"and {199 - MOST_AT_ONCE} more at once"
 
 
@@ -123,16 +123,16 @@ def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
     history = MapHistory(store)
     history.follow(held)
     history.follow(replace(two, refused=tuple(refuse(link, seen.reason) for link in links)))
-    ((kind, _),) = told(history)
+    ((kind, _),) = events(history)
     assert kind is MapEventKind.KEPT_APART
     assert history.newest == (f"a.1 and b.1 are kept apart: {len(links)} links refused ({clash.reason})")
     again = MapHistory(store)
     again.follow(held)
-    assert again.happenings == history.happenings, "told already"
+    assert again.events == history.events, "recorded already"
     again.follow(one)
     again.follow(held)
     # The split by it has the reason itself.
-    assert [kind for kind, _ in told(again)] == [
+    assert [kind for kind, _ in events(again)] == [
         MapEventKind.KEPT_APART,
         MapEventKind.JOINED,
         MapEventKind.PARTED,
@@ -154,7 +154,7 @@ def test_each_refused_pair_is_listed_once(one: MergedMap, monkeypatch: pytest.Mo
     history = MapHistory()
     for _ in range(3):
         history.follow(merged)
-    assert [kind for kind, _ in told(history)] == [MapEventKind.KEPT_APART] * 3
+    assert [kind for kind, _ in events(history)] == [MapEventKind.KEPT_APART] * 3
 
 
 def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> None:
@@ -167,18 +167,18 @@ def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> N
     for node in list(one.maps[B].nodes):
         other.apply(B, NodeRetired(node))
     history.follow(other.merged())
-    assert told(history) == [JOINED]
+    assert events(history) == [JOINED]
 
 
 def test_a_damaged_record_is_replaced_and_reported(store: Store, one: MergedMap) -> None:
     store.put_result("history", b"rubbish")
     history = MapHistory(store)
-    (failed,) = history.happenings
+    (failed,) = history.events
     assert failed.kind is MapEventKind.FAILED and "damaged" in failed.words and history.newest == ""
     history.failed(failed.words)
-    assert history.happenings == (failed,), "told once"
+    assert history.events == (failed,), "recorded once"
     history.follow(one)
-    assert MapHistory(store).happenings == history.happenings
+    assert MapHistory(store).events == history.events
 
 
 def test_a_disk_that_does_not_take_it_ends_nothing(
@@ -193,24 +193,24 @@ def test_a_disk_that_does_not_take_it_ends_nothing(
 
     store.put_result = full  # type: ignore[method-assign]
     history.follow(two)
-    assert told(history) == [JOINED, PARTED] and "is not kept: the disk is full" in caplog.text
+    assert events(history) == [JOINED, PARTED] and "is not kept: the disk is full" in caplog.text
     store.close()
     store = Store(tmp_path / "s0.sqlite")
-    assert told(MapHistory(store)) == [JOINED], "the record of before is whole"
+    assert events(MapHistory(store)) == [JOINED], "the record of before is whole"
     store.close()
 
 
 def test_constraints_are_listed_in_the_history() -> None:
-    happenings = [MapEvent(10**18 + k, MapEventKind.JOINED, "x") for k in (-1, 1)]
-    kinds = [event.kind for event in with_rulings(happenings, APART)]
-    assert kinds == [MapEventKind.JOINED, MapEventKind.RULED, MapEventKind.JOINED]
-    assert "two kitchens" in with_rulings((), APART)[0].words
+    events = [MapEvent(10**18 + k, MapEventKind.JOINED, "x") for k in (-1, 1)]
+    kinds = [event.kind for event in with_constraints(events, APART)]
+    assert kinds == [MapEventKind.JOINED, MapEventKind.CONSTRAINED, MapEventKind.JOINED]
+    assert "two kitchens" in with_constraints((), APART)[0].words
 
 
 def test_it_comes_through_bytes() -> None:
-    happenings = (MapEvent(5, MapEventKind.PARTED, "a and b"), MapEvent(6, MapEventKind.FAILED, "no"))
-    assert decode(encode(History(happenings)), History).history == happenings
-    kept = KeptHistory(happenings, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
+    events = (MapEvent(5, MapEventKind.PARTED, "a and b"), MapEvent(6, MapEventKind.FAILED, "no"))
+    assert decode(encode(History(events)), History).history == events
+    kept = KeptHistory(events, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
     assert decode(encode(kept), KeptHistory) == kept
     with pytest.raises(InvalidValue, match="printable"):
         encode(History((MapEvent(5, MapEventKind.PARTED, "two\nlines"),)))
@@ -218,7 +218,7 @@ def test_it_comes_through_bytes() -> None:
         {"stamp_ns": 1, "kind": "danced", "words": "x"},
         {"stamp_ns": 6, "kind": "failed", "words": "no"},
     ]
-    assert decode(pack({"history": newer}), History).history == happenings[1:]
+    assert decode(pack({"history": newer}), History).history == events[1:]
     wrong: list[object] = [
         [{"stamp_ns": 1, "kind": "joined"}],
         [{**newer[1], "kind": 2}],

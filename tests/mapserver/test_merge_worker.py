@@ -37,7 +37,7 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
     assert worker.settled
     worker.start()
     constraints = ManualConstraints([ManualConstraint((MapId("a", 1), MapId("b", 1)), True, "anna", 0)])
-    worker.rule(constraints)
+    worker.constrain(constraints)
     assert entered.wait(20)
     assert not worker.settled
     go.set()
@@ -45,7 +45,7 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
     while not worker.settled:
         assert time.monotonic() < end
         time.sleep(0.001)
-    assert worker.answers.merged.rulings is constraints
+    assert worker.answers.merged.constraints is constraints
     worker.close()
 
 
@@ -112,7 +112,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(Merger, "merged", held)
     worker = MergeWorker(LiveSchedule(), 1.0)
     worker.start()
-    worker.rule(ManualConstraints())
+    worker.constrain(ManualConstraints())
     assert entered.wait(20)
     assert worker.answers.relocalizer.answer(view).certainty is Certainty.UNKNOWN
     for change in changes:
@@ -176,4 +176,18 @@ def test_a_database_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
     worker.start()
     worker.read(iter(changes))
     assert len(places) == 4
+    worker.close()
+
+
+def test_the_last_waiting_write_of_a_node_counts() -> None:
+    _, _, (first, *_) = mapped_room(("a",))
+    assert isinstance(first.body, NodePut)
+    worker = MergeWorker(LiveSchedule(), 1.0)
+    nodes = [replace(first.body.node, stamp_ns=k) for k in range(50)]
+    for k, one in enumerate(nodes):
+        worker.take(Change(first.map, k + 1, 0, NodePut(one)))
+    worker.start()
+    assert worker.settle(30) and worker.settled
+    assert worker.answers.merged.maps[first.map].nodes[first.body.node.id] is nodes[-1]
+    assert worker._merger.counters.changes == 1
     worker.close()

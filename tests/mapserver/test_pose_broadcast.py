@@ -43,17 +43,17 @@ def merged(*graphs: PoseGraph) -> MergedMap:
 
 @pytest.fixture(autouse=True)
 def no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is told a second time, unless a test says so."""
+    """Nothing is sent a second time, unless a test says so."""
     monkeypatch.setattr(pose_broadcast, "BEAT", math.inf)
 
 
-class Told:
+class Received:
     """A pose broadcast, and what it publishes."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.heard: list[PoseNews] = []
         self.bus, self.agent = fleet.join(), fleet.join()
-        self.herald = PoseBroadcast(self.bus, KEYS, "s0")
+        self.broadcast = PoseBroadcast(self.bus, KEYS, "s0")
         self.agent.subscribe(KEYS.poses("s0", "r0"), self._hear)
         self.agent.subscribe(KEYS.server_status("s0"), lambda _: self._marks.append(1))
         self._marks: list[int] = []
@@ -64,7 +64,7 @@ class Told:
 
     def tell(self, *graphs: PoseGraph) -> list[PoseNews]:
         before = len(self.heard)
-        self.herald.tell(merged(*graphs), next(self._clock))
+        self.broadcast.tell(merged(*graphs), next(self._clock))
         self.wait()
         return self.heard[before:]
 
@@ -90,7 +90,7 @@ def zenoh() -> Iterator[ZenohFleet]:
 
 
 def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) -> None:
-    result = Told(memory)
+    result = Received(memory)
     (first,) = result.tell(graph(A))
     assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
     assert result.tell(graph(A, 0.049)) == []
@@ -103,7 +103,7 @@ def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) 
 
 
 def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> None:
-    result = Told(memory)
+    result = Received(memory)
     result.tell(graph(A), graph(B))
     one = graph(A)
     one.means[3, 1] = 0.2
@@ -117,7 +117,7 @@ def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> 
 
 
 def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
-    result = Told(memory)
+    result = Received(memory)
     result.tell(graph(A))
     (news,) = result.tell(graph(A[:-1]))
     assert news.gone == (A[-1],) and not news.placed
@@ -128,11 +128,11 @@ def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
 
 def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose_broadcast, "MOST", 2)
-    result = Told(memory)
+    result = Received(memory)
     pieces = result.tell(graph(A))
     assert [len(news.placed) for news in pieces] == [2, 2, 1]
     assert [(news.after, news.sequence) for news in pieces] == [(0, 1), (1, 2), (2, 3)]
-    broadcast, received = result.herald, result.heard
+    broadcast, received = result.broadcast, result.heard
     broadcast.tell(merged(graph(A, 1.0)), 100.0)
     broadcast.tell(merged(graph(A, 2.0)), 101.9)
     result.wait()

@@ -125,7 +125,7 @@ def test_recently_blocked_edges_are_reported(router: Router) -> None:
         assert "recently could not get through" in wary.hops[0].words
     else:
         assert "recently could not get through" in wary.gaps[0].words
-    assert wary.gaps, "the way that would be cheaper is told"
+    assert wary.gaps, "the way that would be cheaper is reported"
 
 
 def test_unconnected_maps_are_explained_instead_of_a_route(router: Router, sent: bool) -> None:
@@ -169,7 +169,9 @@ def renumbered(change: NodePut | EdgePut, more: int) -> NodePut | EdgePut:
 
 def test_a_retired_map_is_explained_with_the_persons_name() -> None:
     merger = fleet()
-    merger.rule(ManualConstraints([ManualConstraint((OTHER, OTHER), True, "anna", 10**18, "burnt down")]))
+    merger.constrain(
+        ManualConstraints([ManualConstraint((OTHER, OTHER), True, "anna", 10**18, "burnt down")])
+    )
     explanation = explain_route(Router(merger.merged()), nodes_of(ME)[0], nodes_of(OTHER)[0])
     assert not explanation.found and "anna" in explanation.reason and "burnt down" in explanation.reason
 

@@ -167,7 +167,7 @@ def serving(path: Path) -> Iterator[Fleet]:
         fleet.close()
 
 
-def told(answers: list[RelocalizeAnswer]) -> list[tuple[object, ...]]:
+def whereabouts(answers: list[RelocalizeAnswer]) -> list[tuple[object, ...]]:
     return [
         (answer.certainty, answer.reason, [(c.node, round(c.probability, 9)) for c in answer.candidates])
         for answer in answers
@@ -179,14 +179,14 @@ def test_three_changes_of_one_robot_end_nothing(name: str, tmp_path: Path) -> No
     path = tmp_path / "s0.sqlite"
     stored(path, sound_logs()).close()
     with serving(path) as fleet:
-        before, places = fleet.status(), told(fleet.where())
+        before, places = fleet.status(), whereabouts(fleet.where())
         assert before["links"] and places[0][0] is Certainty.FOUND
         fleet.tell(BAD, attacks()[name])
         eventually(lambda: fleet.status()["nodes"] == int(str(before["nodes"])) + 2)
         assert fleet.server.settle(30)
         during = fleet.status()
         assert during["links"] == before["links"] and not during["set_apart"]
-        assert told(fleet.where()) == places
+        assert whereabouts(fleet.where()) == places
         refused = [refusal.reason for ack in fleet.acks for refusal in ack.refusals]
         assert bool(refused) is (name != "fewer landmarks than are shared")
     with serving(path) as fleet:
@@ -194,7 +194,7 @@ def test_three_changes_of_one_robot_end_nothing(name: str, tmp_path: Path) -> No
         assert {k: after[k] for k in ("summary", "event", "set_apart")} == {
             k: during[k] for k in ("summary", "event", "set_apart")
         }
-        assert told(fleet.where()) == places
+        assert whereabouts(fleet.where()) == places
 
 
 def fails_with(monkeypatch: pytest.MonkeyPatch, bad: MapId) -> None:
@@ -217,30 +217,32 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
     fails_with(monkeypatch, BAD)
     words = "map bad.1 is set apart: the merge fails with it (ZeroDivisionError: a defect)"
     with serving(path) as fleet:
-        places, links = told(fleet.where()), fleet.status()["links"]
+        places, links = whereabouts(fleet.where()), fleet.status()["links"]
         fleet.tell(BAD, messages(BAD, [NodePut(node(1)), NodePut(node(2))]))
         eventually(lambda: fleet.status()["set_apart"])
         assert fleet.server.settle(30)
         status = fleet.status()
         assert (status["set_apart"], status["links"], status["event"]) == (1, links, words)
-        assert told(fleet.where()) == places
+        assert whereabouts(fleet.where()) == places
         assert [event.words for event in fleet.server.history()].count(words) == 1
     caplog.clear()
     with serving(path) as fleet:
         status = fleet.status()
         assert (status["set_apart"], status["links"], status["event"]) == (1, links, words)
-        assert told(fleet.where()) == places
+        assert whereabouts(fleet.where()) == places
         # It was said before.
         assert [event.words for event in fleet.server.history()].count(words) == 1
         retire = ManualConstraint((BAD, BAD), True, "anna", 10**18, "it is mad")
-        reply = fleet.ask(KEYS.rule("s0"), encode(retire))
+        reply = fleet.ask(KEYS.constrain("s0"), encode(retire))
         assert not reply.error
         assert fleet.server.settle(30)
         status = fleet.status()
-        assert (status["set_apart"], status["links"], status["rulings"]) == (0, links, 1)
+        assert (status["set_apart"], status["links"], status["constraints"]) == (0, links, 1)
         assert status["event"] == "map bad.1 is no longer set apart"
-        assert told(fleet.where()) == places
-        never = fleet.ask(KEYS.rule("s0"), encode(ManualConstraint((MapId("x", 9),) * 2, True, "anna", 1)))
+        assert whereabouts(fleet.where()) == places
+        never = fleet.ask(
+            KEYS.constrain("s0"), encode(ManualConstraint((MapId("x", 9),) * 2, True, "anna", 1))
+        )
         assert "there is no map x.9" in never.error
 
 
@@ -258,10 +260,12 @@ def test_a_map_can_be_retired_when_nothing_can_be_merged(
         patch.setattr(Merger, "apart", fails)
         with serving(path) as fleet:
             assert not fleet.status()["nodes"]
-            reply = fleet.ask(KEYS.rule("s0"), encode(ManualConstraint((BAD, BAD), True, "anna", 10**18)))
+            reply = fleet.ask(
+                KEYS.constrain("s0"), encode(ManualConstraint((BAD, BAD), True, "anna", 10**18))
+            )
             assert not reply.error, reply.error
     with serving(path) as fleet:
-        assert fleet.status()["rulings"] == 1
+        assert fleet.status()["constraints"] == 1
 
 
 class Beside:
@@ -276,7 +280,7 @@ class Beside:
         self.nodes = sorted(alone.poses)
         self.poses = {one: alone.pose(one) for one in self.nodes}
         self.links = [link.pair for link in alone.links]
-        self.places = [told([self.answers.relocalizer.answer(view)]) for view in views()]
+        self.places = [whereabouts([self.answers.relocalizer.answer(view)]) for view in views()]
 
     def merged(self, more: list[tuple[MapId, ChangeBody]]) -> tuple[MergedMap, Merger]:
         merger = Merger()
@@ -307,7 +311,7 @@ class Beside:
         # Which takes as long as the merge.
         if seed % 4 < len(self.places):
             view = views()[seed % 4]
-            assert told([self.answers.relocalizer.answer(view)]) == self.places[seed % 4], seed
+            assert whereabouts([self.answers.relocalizer.answer(view)]) == self.places[seed % 4], seed
 
 
 @pytest.fixture
@@ -321,9 +325,9 @@ def beside(tmp_path: Path) -> Iterator[Beside]:
     faiss.omp_set_num_threads(threads)
 
 
-@pytest.mark.parametrize("part", range(4))
-def test_300_random_legal_contents_change_nothing_for_sound_robots(part: int, beside: Beside) -> None:
-    for seed in range(75 * part, 75 * (part + 1)):
+@pytest.mark.parametrize("part", range(2))
+def test_random_legal_contents_change_nothing_for_sound_robots(part: int, beside: Beside) -> None:
+    for seed in range(60 * part, 60 * (part + 1)):
         beside.check(seed)
 
 
@@ -356,7 +360,7 @@ def test_a_content_whose_loops_have_singular_covariances_changes_nothing(beside:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Beside) -> None:
-    for seed in range(300, 3300):
+    for seed in range(120, 3120):
         beside.check(seed)
 
 
@@ -386,15 +390,3 @@ def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
         stop.set()
         hurrying.join()
         worker.close()
-
-
-def test_the_last_waiting_write_of_a_node_counts() -> None:
-    worker = MergeWorker(LiveSchedule(), 1.0)
-    nodes = [replace(node(1), stamp_ns=k) for k in range(50)]
-    for k, one in enumerate(nodes):
-        worker.take(Change(BAD, k + 1, 0, NodePut(one)))
-    worker.start()
-    assert worker.settle(30) and worker.settled
-    assert worker.answers.merged.maps[BAD].nodes[NodeId(*BAD, 1)] is nodes[-1]
-    assert worker._merger.counters.changes == 1
-    worker.close()

@@ -35,7 +35,7 @@ def port() -> Iterator[int]:
 
 
 @pytest.fixture
-def nobody() -> str:
+def closed() -> str:
     """An endpoint without a listener."""
     return f"tcp/127.0.0.1:{free_port()}"
 

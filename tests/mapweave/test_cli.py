@@ -42,14 +42,14 @@ def test_a_wrong_use_shows_how_to_use_it(arguments, capfd):
 
 
 @pytest.mark.parametrize("name", ["R0", "a b", "", "r0/1", "*", "ä", "x" * 33, "-x"])
-def test_names_that_cannot_be_in_a_key(name, capfd, recording, nobody, tmp_path):
+def test_names_that_cannot_be_in_a_key(name, capfd, recording, closed, tmp_path):
     output = complaint(capfd, "agent", "--", name)
     assert "use 1 to 32 of a-z" in output
     if name:
-        assert "use 1 to 32 of a-z" in complaint(capfd, "agent", "r0", "--connect", nobody, f"--fleet={name}")
+        assert "use 1 to 32 of a-z" in complaint(capfd, "agent", "r0", "--connect", closed, f"--fleet={name}")
         assert "use 1 to 32 of a-z" in complaint(capfd, "replay", recording, "--offline", f"--name={name}")
         data = tmp_path / "data"
-        output = complaint(capfd, "server", "--listen", nobody, f"--name={name}", "--data", data)
+        output = complaint(capfd, "server", "--listen", closed, f"--name={name}", "--data", data)
         assert "use 1 to 32 of a-z" in output
         assert not data.exists(), "nothing is left behind"
 
@@ -76,8 +76,8 @@ def test_demos_out_of_range(arguments, capfd, tmp_path):
         (["nowhere.toml"], "nowhere.toml: no such file"),
     ],
 )
-def test_scenarios_that_cannot_be_run(arguments, words, capfd, nobody, tmp_path):
-    for what in (["run", "--out", tmp_path / "out"], ["serve", "--connect", nobody]):
+def test_scenarios_that_cannot_be_run(arguments, words, capfd, closed, tmp_path):
+    for what in (["run", "--out", tmp_path / "out"], ["serve", "--connect", closed]):
         assert words in complaint(capfd, "sim", what[0], *arguments, *what[1:])
     assert not (tmp_path / "out" / "agents").exists()
 
@@ -129,10 +129,10 @@ def test_a_live_view_at_no_port_starts_no_fleet(capfd, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_epoch_out_of_range(capfd, recording, tmp_path, nobody):
+def test_an_epoch_out_of_range(capfd, recording, tmp_path, closed):
     for epoch in (-1, 2**60):
         data = tmp_path / f"agent{epoch}"
-        output = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", data, f"--epoch={epoch}")
+        output = complaint(capfd, "agent", "r0", "--connect", closed, "--data", data, f"--epoch={epoch}")
         assert "epoch" in output and not data.exists(), "before any body is waited for"
         data = tmp_path / str(epoch)
         output = complaint(capfd, "replay", recording, "--offline", "--data", data, f"--epoch={epoch}")

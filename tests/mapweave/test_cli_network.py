@@ -36,10 +36,10 @@ def test_a_port_that_is_taken(capfd, port, tmp_path):
     assert f"cannot listen at tcp/127.0.0.1:{port}: the port is taken" in output
 
 
-def test_a_port_for_people_that_is_taken(capfd, port, nobody, tmp_path):
-    output = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "a", "--http", port)
+def test_a_port_for_people_that_is_taken(capfd, port, closed, tmp_path):
+    output = complaint(capfd, "server", "--listen", closed, "--data", tmp_path / "a", "--http", port)
     assert f"cannot listen at http 127.0.0.1:{port}: the port is taken" in output
-    output = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "b", "--http", "here")
+    output = complaint(capfd, "server", "--listen", closed, "--data", tmp_path / "b", "--http", "here")
     assert "write a port, or HOST:PORT" in output
     assert not (tmp_path / "b").exists()
 
@@ -49,14 +49,14 @@ def test_an_address_of_another_machine(capfd, tmp_path):
     assert "cannot listen at tcp/192.0.2.1:7447" in output
 
 
-def test_asking_without_a_server(capfd, recording, nobody):
+def test_asking_without_a_server(capfd, recording, closed):
     picture = recording / "images" / "0.png"
-    output = complaint(capfd, "relocalize", picture, "--connect", nobody, "--timeout", "0.3")
-    assert f"no router at {nobody}: start `mapweave server`" in output
+    output = complaint(capfd, "relocalize", picture, "--connect", closed, "--timeout", "0.3")
+    assert f"no router at {closed}: start `mapweave server`" in output
 
 
-def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
-    rest = ["--connect", nobody, "--timeout", "0.1"]
+def test_asking_about_an_image(capfd, recording, tmp_path, closed):
+    rest = ["--connect", closed, "--timeout", "0.1"]
     lonely = tmp_path / "a.png"
     lonely.write_bytes((recording / "images" / "0.png").read_bytes())
     assert "give the intrinsics with --camera" in complaint(capfd, "relocalize", lonely, *rest)
@@ -77,8 +77,18 @@ def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
     )
 
 
-def test_an_agent_interrupted_before_its_base_answers_reports_it(nobody, tmp_path):
-    command = [sys.executable, "-m", "mapweave", "agent", "r0", "--connect", nobody, "--data", str(tmp_path)]
+def test_an_agent_interrupted_before_its_base_answers_reports_it(closed, tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "mapweave",
+        "agent",
+        "r0",
+        "--connect",
+        closed,
+        "--data",
+        str(tmp_path),
+    ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         watchdog = threading.Timer(40, process.kill)
         watchdog.start()
@@ -102,9 +112,9 @@ def test_an_agent_interrupted_before_its_base_answers_reports_it(nobody, tmp_pat
         ),
     ],
 )  # fmt: skip
-def test_waiting_is_reported_with_its_reason(command, hints, nobody, tmp_path):
+def test_waiting_is_reported_with_its_reason(command, hints, closed, tmp_path):
     data = ["--data", str(tmp_path)] if command[0] == "agent" else []
-    whole = [sys.executable, "-m", "mapweave", *command, "--connect", nobody, *data]
+    whole = [sys.executable, "-m", "mapweave", *command, "--connect", closed, *data]
     with subprocess.Popen(whole, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
         watchdog = threading.Timer(40, process.kill)
         watchdog.start()

@@ -8,12 +8,12 @@ import time
 import numpy as np
 import pytest
 
-from mapweave.agent.fleet_client import encode_mission
-from mapweave.agent.mission import GoTo, Idle
 from mapweave.demo.options import DemoOptions
 from mapweave.demo.run import run_demo
 from mapweave.evaluation.map_score import pose_error, score_map
+from mapweave.fleet import send_order
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children, free_port
@@ -38,6 +38,7 @@ def wait_for(condition, seconds, children, what):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 @needs_simulator
 @pytest.mark.timeout(420)
 def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
@@ -69,7 +70,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
 
             wait_for(explored, 240, children, "no robot explores")
             for name in ("r0", "r1"):
-                assert bus.ask(keys.mission(name), encode_mission(Idle()), 10)[0].payload == b"ok"
+                assert send_order(bus, keys, MissionOrder.new(name, MissionKind.STOP, "test")).open
 
             def idle():
                 return {a.status.mission for a in agents().values()} == {"idle"}
@@ -96,7 +97,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
             goal = own[0].id
             place = truth[goal] @ Pose2(-0.1, 0.15, 2.0)
             control.kidnap("r0", place)
-            assert bus.ask(keys.mission("r0"), encode_mission(GoTo(goal)), 10)[0].payload == b"ok"
+            assert send_order(bus, keys, MissionOrder.new("r0", MissionKind.GO, "test", goal)).open
 
             def parked():
                 status = agents()["r0"].status

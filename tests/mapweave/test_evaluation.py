@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -14,29 +15,32 @@ import pytest
 import skimage.data
 
 from mapweave.cli import main
+from mapweave.evaluation.asking_again import Asked, trial_figures, trials_of
 from mapweave.evaluation.photographs import evidence
 from mapweave.evaluation.verdict import Verdict, figures
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import Certainty
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, Whereabouts
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 
 
-def render(world_from_robot: Pose2) -> np.ndarray:
+def render(world_from_robot: Pose2, camera: Camera = CAMERA) -> np.ndarray:
     """(240, 320) grey: two photographs on walls 2.2 m and 3.2 m from the origin, by exact homographies."""
-    image = np.full((CAMERA.height, CAMERA.width), 128, np.uint8)
+    size = camera.width, camera.height
+    image = np.full((camera.height, camera.width), 128, np.uint8)
     hung = [(skimage.data.coffee(), 3.2, 0.2, 1.5, 2.6), (skimage.data.astronaut(), 2.2, 1.9, 1.3, 1.8)]
     for picture, x, y, z, width in hung:
         grey = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
         height = width * grey.shape[0] / grey.shape[1]
         corners = np.array([[x, y, z], [x, y - width, z], [x, y - width, z - height], [x, y, z - height]])
-        seen = CAMERA.project(world_from_robot.inverse().apply(corners)).astype(np.float32)
+        seen = camera.project(world_from_robot.inverse().apply(corners)).astype(np.float32)
         own = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (grey.shape[1], grey.shape[0]) - 0.5
         to_image = cv2.getPerspectiveTransform(own.astype(np.float32), seen)
-        drawn = cv2.warpPerspective(grey, to_image, (320, 240), flags=cv2.INTER_AREA)
-        mask = cv2.warpPerspective(np.full_like(grey, 255), to_image, (320, 240))
+        drawn = cv2.warpPerspective(grey, to_image, size, flags=cv2.INTER_AREA)
+        mask = cv2.warpPerspective(np.full_like(grey, 255), to_image, size)
         image = np.where(mask > 127, drawn, image).astype(np.uint8)
     return image
 
@@ -45,6 +49,28 @@ def render(world_from_robot: Pose2) -> np.ndarray:
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One robot drives ahead; another one later, next to it, then faces a blank wall behind."""
     folder = tmp_path_factory.mktemp("recordings") / "drive"
+    return recorded(folder, render, CAMERA_TOML)
+
+
+SMALL = Camera(160, 120, 138.5, 138.5, 79.5, 59.5, mount_height=0.3)
+SMALL_TOML = "width = 160\nheight = 120\nfx = 138.5\nfy = 138.5\ncx = 79.5\ncy = 59.5\nheight_m = 0.3\n"
+WIDE = Camera(500, 400, 150.0, 150.0, 250.0, 200.0, mount_height=0.3)
+FISHEYE_TOML = (
+    "width = 320\nheight = 240\nfx = 130.0\nfy = 130.5\ncx = 158.6\ncy = 120.9\nheight_m = 0.3\n"
+    'lens = "equidistant"\ndistortion = [-0.02, 0.004, -0.003, 0.0005]\n'
+)
+
+
+def seen_by_fisheye(world_from_robot: Pose2) -> np.ndarray:
+    """The same walls through a fisheye lens of 140 degrees, by OpenCV's model."""
+    matrix = np.array([[130.0, 0, 158.6], [0, 130.5, 120.9], [0, 0, 1]])
+    pixels = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), axis=-1).reshape(-1, 1, 2)
+    rays = cv2.fisheye.undistortPoints(pixels, matrix, np.array([-0.02, 0.004, -0.003, 0.0005]))
+    at = np.clip(rays.reshape(240, 320, 2) * WIDE.fx + [WIDE.cx, WIDE.cy], -1.0, 1e4).astype(np.float32)
+    return cv2.remap(render(world_from_robot, WIDE), at, None, cv2.INTER_LINEAR, borderValue=128)
+
+
+def recorded(folder: Path, see: Callable[[Pose2], np.ndarray], camera_toml: str) -> Path:
     (folder / "images").mkdir(parents=True)
     first = [Pose2(0.03 * k, 0.0, 0.0) for k in range(36)]
     second = [Pose2(0.1 + 0.09 * k, 0.06, 0.02) for k in range(9)] + [Pose2(0.5, 0.0, math.pi)] * 3
@@ -53,13 +79,13 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
         truth.write("stamp_s,x_m,y_m,heading_rad\n")
         before = first[0]
         for k, pose in enumerate(first + second):
-            cv2.imwrite(str(folder / "images" / f"{k}.png"), render(pose))
+            cv2.imwrite(str(folder / "images" / f"{k}.png"), see(pose))
             moved = before.inverse() @ pose
             odometry.write(f"{moved.x},{moved.heading}\n")
             truth.write(f"{0.1 * k:.3f},{pose.x},{pose.y},{pose.heading}\n")
             before = pose
     (folder / "times.txt").write_text("".join(f"{0.1 * k:.3f}\n" for k in range(48)))
-    (folder / "camera.toml").write_text(CAMERA_TOML)
+    (folder / "camera.toml").write_text(camera_toml)
     (folder / "splits.toml").write_text(
         '[[robot]]\nname = "a"\nfirst = 0\nlast = 35\n[[robot]]\nname = "b"\nfirst = 36\nlast = 47\n'
     )
@@ -99,12 +125,39 @@ def test_a_drive(drive: Path, capfd, tmp_path: Path) -> None:
     assert values["nodes"] >= 1
     assert values["recall_at_1"] >= 0.8
     assert (values["precision"], values["false_accept"]) == (1.0, 0.0)
+    assert values["recall_within_2m"] >= values["recall_at_1"]
+    assert (values["found_wrong"], values["decided_wrong"], values["decided_precision"]) == (0, 0, 1.0)
     assert values["error_m_median"] < 0.1
     assert values["error_deg_median"] < 1.0
     with (tmp_path / "out" / "answers-depths.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 12
     assert [row["certainty"] for row in rows[-3:]] == ["unknown"] * 3
+
+
+@pytest.mark.parametrize(
+    ("see", "camera_toml"),
+    [(lambda pose: render(pose, SMALL), SMALL_TOML), (seen_by_fisheye, FISHEYE_TOML)],
+    ids=["160x120", "fisheye"],
+)
+def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, capfd, tmp_path: Path) -> None:
+    folder = recorded(tmp_path / "drive", see, camera_toml)
+    values = report(capfd, folder)
+    assert values["recall_at_1"] >= 0.8
+    assert (values["precision"], values["false_accept"]) == (1.0, 0.0)
+    assert values["error_m_median"] < 0.1
+    assert values["error_deg_median"] < 1.0
+    (folder / "splits.toml").unlink()
+    for name in ("odometry.csv", "truth.csv", "times.txt"):
+        kept = (folder / name).read_text().splitlines()[: 36 + (name != "times.txt")]
+        (folder / name).write_text("\n".join(kept) + "\n")
+    for image in folder.glob("images/*.png"):
+        if int(image.stem) >= 36:
+            image.unlink()
+    assert main(["eval", "replay", str(folder), "--json"]) == 0
+    values = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
+    assert values["frames_used"] == 1.0
+    assert values["ate_m"] < 0.02
 
 
 def test_a_drives_error_is_measured_against_its_truth(drive: Path, capfd, tmp_path: Path) -> None:
@@ -131,6 +184,7 @@ def test_photographs(walk: Path, capfd, tmp_path: Path) -> None:
     assert (values["queries"], values["expected"], values["nodes"]) == (4, 3, 3)
     assert (values["recall_at_1"], values["precision"], values["unknown_share"]) == (1.0, 1.0, 0.25)
     assert (values["error_frames_median"], values["false_accept"]) == (0.0, 0.0)
+    assert (values["recall_within_2m"], values["decided"]) == (1.0, 3), "the last one is followed by nothing"
     assert (tmp_path / "out" / "answers-looks.csv").exists()
     # Two references changed over: what was right is wrong.
     table = (walk / "lap_truth.csv").read_text()
@@ -168,6 +222,25 @@ def test_figures_by_hand() -> None:
     assert outcome["error_m_median"] == 4.7
     assert outcome["answer_ms_p50"] == 20.0
     assert "error_frames_median" not in outcome
+
+
+def test_a_robot_asks_again_until_it_knows_or_has_driven_two_metres() -> None:
+    """Answers every metre: found at 3 m, rightly, and at 6 m, wrongly; nothing is certain elsewhere."""
+    node, here = NodeId("r0", 1, 1), PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
+    place = Whereabouts(node, here, None, NO_COMPONENT, 30, 0.9)
+    nothing = RelocalizeAnswer(Certainty.UNKNOWN, (), "")
+    found = RelocalizeAnswer(Certainty.FOUND, (place,), "")
+    asked = [
+        Asked(found if k in (3, 6) else nothing, Pose2(float(k), 0, 0), float(k), 0.0, expected=k < 5)
+        for k in range(8)
+    ]
+    trials = trials_of(asked, lambda k, given: k == 3)
+    assert [trial.decided for trial in trials] == [False, True, True, True, True, True, True, False]
+    assert [trial.right for trial in trials] == [None, True, True, True, False, False, False, None]
+    outcome = trial_figures(trials)
+    assert outcome == {
+        "recall_within_2m": 0.6, "decided": 6, "decided_wrong": 3, "decided_precision": 0.5,
+    }  # fmt: skip
 
 
 def test_evidence_bounds_chance() -> None:

@@ -11,26 +11,26 @@ import pytest
 
 from mapweave.drawing.link_picture import draw_link
 from mapweave.explanation_text import MOST_LINKS, WIDTH, pair_words
-from mapweave.hybridmap.explanation import PairExplanation, Witness
+from mapweave.hybridmap.explanation import LinkAgreement, PairExplanation
 from mapweave.hybridmap.node import NodeId
 from mapweave.merge.explanation.node_explanation import explain_nodes
-from tests.mapserver.desks import two_maps
+from tests.mapserver.stub_services import two_maps
 
 
 @pytest.fixture(scope="module")
-def told() -> PairExplanation:
+def explanation() -> PairExplanation:
     merged = two_maps()
     return explain_nodes(merged, *next(link.pair for link in merged.links if not link.within))
 
 
 @pytest.mark.parametrize(("agree", "against"), [(40, 3), (40, 40), (2, 40), (40, 0), (3, 4), (0, 0)])
 def test_contradicting_links_are_listed_among_many_that_agree(
-    told: PairExplanation, agree: int, against: int
+    explanation: PairExplanation, agree: int, against: int
 ) -> None:
     distances = [*(0.1 + 0.1 * k for k in range(agree)), *(100.0 + k for k in range(against))]
     nodes = (NodeId("r0", 1, 1), NodeId("r1", 1, 1))
-    witnesses = tuple(Witness(*nodes, d, d < 50.0, True) for d in distances)
-    lines = pair_words(replace(told, witnesses=witnesses))
+    other_links = tuple(LinkAgreement(*nodes, d, d < 50.0, True) for d in distances)
+    lines = pair_words(replace(explanation, other_links=other_links))
     counts = [sum(f": {word}, " in line for line in lines) for word in ("agrees", "contradicts")]
     assert sum(counts) == min(agree + against, MOST_LINKS)
     assert counts[1] >= min(against, MOST_LINKS // 2) and counts[0] >= min(agree, MOST_LINKS // 2)
@@ -39,18 +39,20 @@ def test_contradicting_links_are_listed_among_many_that_agree(
     assert not nearest or "10.0 standard deviations" in nearest[0]
 
 
-def test_every_number_of_the_evidence_is_next_to_its_name(told: PairExplanation) -> None:
-    lines = pair_words(told)
+def test_every_number_of_the_evidence_is_next_to_its_name(explanation: PairExplanation) -> None:
+    lines = pair_words(explanation)
     begin = next(k for k, line in enumerate(lines) if line.startswith("  evidence "))
     rest = [line for line in lines[begin:] if line.startswith(("  evidence ", " " * 16))]
     assert len(rest) > 1 and max(map(len, rest)) <= WIDTH
-    for name, value in told.evidence.items():
+    for name, value in explanation.evidence.items():
         assert any(f"{name} {value:.3g}" in line for line in rest)
 
 
 @pytest.mark.parametrize("words", ["short", "quite long " * 60])
-def test_the_picture_holds_all_words_of_its_title(told: PairExplanation, words: str, tmp_path: Path) -> None:
-    draw_link(replace(told, reason=words.strip()), tmp_path / "link.png")
+def test_the_picture_holds_all_words_of_its_title(
+    explanation: PairExplanation, words: str, tmp_path: Path
+) -> None:
+    draw_link(replace(explanation, reason=words.strip()), tmp_path / "link.png")
     image = cv2.imread(str(tmp_path / "link.png"), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     assert (image[:4] > 250).all() and (image[-4:] > 250).all(), "nothing is cut off"

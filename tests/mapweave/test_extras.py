@@ -41,34 +41,42 @@ CASES: list[tuple[str, str, str]] = [
     ("sim list", "", "warehouse"),
     ("sim run", "office --out {tmp}", TRIAL),
     ("sim batch", "office --out {tmp}", TRIAL),
-    ("sim serve", "office --connect {nobody}", SIM),
-    ("server", "--listen {nobody} --data {tmp}", SERVER),
-    ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its robot
+    ("sim serve", "office --connect {closed}", SIM),
+    ("server", "--listen {closed} --data {tmp}", SERVER),
+    ("agent", "R0 --connect {closed}", "R0"),  # a name that cannot be: else it waits for its robot
+    ("status", "--connect nowhere", "endpoints look like"),
+    ("go", "R0 r0.1.1 --connect {closed}", "R0"),
+    ("explore", "R0 --connect {closed}", "R0"),
+    ("stop", "R0 --connect {closed}", "R0"),
     ("robots", "", "koala"),
     ("router", "--listen nowhere", "endpoints look like"),
-    ("record", "R0 --out {tmp}/drive --connect {nobody}", "R0"),
+    ("record", "R0 --out {tmp}/drive --connect {closed}", "R0"),
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
     ("info", "{recording}", "3 images"),
+    ("calibrate target", "--out {tmp}/board.pdf", "Print it at 100 %"),
+    ("calibrate camera", "{recording}", "no view shows the target"),
+    ("calibrate camera", "--source {tmp}/none.avi --http 0", SERVER),
     ("settings", "", "[network]"),
-    ("relocalize", "{recording}/images/0.png --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("relocalize", "{recording}/images/0.png --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("eval relocalize", "{recording}", SERVER),
     ("eval replay", "{recording} --out {tmp}/replay", "frames"),
     ("eval merge", "{recording}", 'needs the extras "server" and "viz"'),
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said
     ("map show", "{own} --out {tmp}/own.png", VIZ),
-    ("map explain", "--connect {nobody} --timeout 0.1", WITHOUT_SERVER),
-    ("map explain", "r0.1.1 r1.1.1 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map fetch", "{tmp}/none/map.mapweave --connect {closed}", "there is no folder"),
+    ("map explain", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
+    ("map explain", "r0.1.1 r1.1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map explain", "--map {merged}", SERVER),
     ("map explain", "{link} --map {merged} --draw {tmp}/link.png", VIZ),
-    ("map route", "r0.1.1 r0.1.3 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map route", "r0.1.1 r0.1.3 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map route", "r0.1.1 r0.1.3 --map {merged}", SERVER),
     ("map route", "r0.1.1 r0.1.3 --map {merged} --draw {tmp}/way.png", VIZ),
-    ("map history", "--connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map history", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map history", "--map {merged}", "no joins"),
-    ("map unmerge", "r0.1 r1.1 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map unmerge", "r0.1 r1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map unmerge", "r0.1 r1.1 --map {merged} --out {tmp}/apart.mapweave", SERVER),
-    ("map retire", "r0.1 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map retire", "r0.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map retire", "r0.1 --map {merged} --out {tmp}/less.mapweave", SERVER),
     ("map merge", "{own} -o {tmp}/out.mapweave", SERVER),
     ("map extract", "{tmp}/none.sqlite -o {tmp}/maps", "no such file"),
@@ -92,14 +100,14 @@ def merged() -> MergedMap:
 
 
 @pytest.fixture
-def filled(merged: MergedMap, recording: Path, nobody: str, tmp_path: Path) -> dict[str, object]:
+def filled(merged: MergedMap, recording: Path, closed: str, tmp_path: Path) -> dict[str, object]:
     """The values of the braces in CASES."""
     own, whole = tmp_path / "own.mapweave", tmp_path / "merged.mapweave"
     write_map_file(own, MapFile("agent", "r0.1", tuple(merged.maps[MapId("r0", 1)].contents())))
     write_map_file(whole, map_file_of(merged))
     link = next(link for link in merged.links if not link.within)
     return {
-        "tmp": tmp_path, "nobody": nobody, "recording": recording, "own": own, "merged": whole,
+        "tmp": tmp_path, "closed": closed, "recording": recording, "own": own, "merged": whole,
         "link": f"{link.a} {link.b}",
     }  # fmt: skip
 

@@ -12,8 +12,8 @@ import pytest
 from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.replication.journal import Journal
-from mapweave.agent.status_message import AgentStatus, decode_agent_status
 from mapweave.cli import main
+from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -26,6 +26,7 @@ from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.mapweave.command_line import complaint
@@ -76,7 +77,7 @@ def network(tmp_path: Path) -> Iterator[tuple[Children, ZenohBus, str]]:
 
 
 @pytest.mark.timeout(600)
-def test_agents_that_are_killed_begun_afresh_and_robbed_of_their_disk_lose_no_map(
+def test_agents_that_are_killed_begun_again_and_robbed_of_their_disk_lose_no_map(
     network: tuple[Children, ZenohBus, str], tmp_path: Path
 ) -> None:
     children, bus, endpoint = network
@@ -92,7 +93,7 @@ def test_agents_that_are_killed_begun_afresh_and_robbed_of_their_disk_lose_no_ma
     def report() -> AgentStatus | None:
         children.check()
         replies = [r for r in bus.ask(KEYS.agent_status("r0"), b"", 2.0) if not r.error]
-        return decode_agent_status(replies[0].payload) if replies else None
+        return decode(replies[0].payload, AgentStatus) if replies else None
 
     def mapped(nodes: int) -> AgentStatus:
         """Wait until a map has so many nodes, all of them on the server's disk."""
@@ -215,8 +216,8 @@ def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, 
     assert (tmp_path / "out" / "r0.2.mapweave").exists()
 
 
-def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, nobody, simulator):
-    output = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", tmp_path, "--resume", "r0.3")
+def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, closed, simulator):
+    output = complaint(capfd, "agent", "r0", "--connect", closed, "--data", tmp_path, "--resume", "r0.3")
     assert "there is no journal of r0" in output
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 

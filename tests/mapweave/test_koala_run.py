@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.agent.fleet_client import encode_mission
-from mapweave.agent.mission import GoTo, Idle
 from mapweave.evaluation.map_score import pose_error, score_map
+from mapweave.fleet import send_order
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children, free_port
 from mapweave.scenarios.reports import Reports
@@ -110,7 +110,7 @@ def test_a_koala_maps_is_carried_off_and_parks(
                 wait_for(lambda: agent(lambda status: True), 40, "no agent")
                 time.sleep(EXPLORE)
                 children.check()
-                assert bus.ask(keys.mission("r0"), encode_mission(Idle()), 10)[0].payload == b"ok"
+                assert send_order(bus, keys, MissionOrder.new("r0", MissionKind.STOP, "test")).open
                 wait_for(lambda: agent(lambda status: status.mission == "idle"), 10, "does not stop")
                 stored = lambda status: reports.server("s0").nodes == status.nodes  # noqa: E731
                 wait_for(lambda: agent(stored), 30, "nodes are not stored")
@@ -123,11 +123,11 @@ def test_a_koala_maps_is_carried_off_and_parks(
                 assert len(nodes) >= least_nodes
                 assert score.ate < 0.15
 
-                # It is carried off and turned around, and not told.
+                # It is carried off and turned around without odometry.
                 goal = next(n.id for n in nodes.values() if len(n.landmarks) >= 30)
                 with koala.world:
                     simulation.kidnap("r0", truth[goal] @ Pose2(-0.1, 0.15, 2.0))
-                assert bus.ask(keys.mission("r0"), encode_mission(GoTo(goal)), 10)[0].payload == b"ok"
+                assert send_order(bus, keys, MissionOrder.new("r0", MissionKind.GO, "test", goal)).open
                 parked = lambda status: status.mission == "goto" and status.finished  # noqa: E731
                 wait_for(lambda: agent(parked), 150, "not parked")
                 with koala.world:

@@ -47,7 +47,7 @@ print(json.dumps([from_import, [name for name in libraries if name in sys.module
     assert heavy == []
 
 
-def test_each_name_is_what_type_checkers_are_told() -> None:
+def test_each_name_is_what_type_checkers_see() -> None:
     """The block for type checkers lists the same names from the same modules."""
     (block,) = (node for node in ast.parse(SOURCE.read_text()).body if isinstance(node, ast.If))
     imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]

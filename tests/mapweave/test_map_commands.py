@@ -169,8 +169,8 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", "--map", path)
     assert "r0.1 and r1.1 are not one map: undone with all links" in out and not links(path)
     assert "by anna on 20" in out and '"two kitchens"' in out
-    assert json.loads(said("map", "show", path, "--no-picture", "--json"))["rulings"] == 1
-    # A later merge with others heeds it too.
+    assert json.loads(said("map", "show", path, "--no-picture", "--json"))["constraints"] == 1
+    # A later merge with others applies it too.
     said("map", "merge", path, "-o", path)
     assert not links(path)
     out = said("map", "unmerge", "r1.1", "r0.1", "--undo", "--by", "bob", "--map", path)
@@ -178,8 +178,8 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     out = said("map", "explain", "r0.1", "r1.1", "--map", path)
     assert "anna decided that they shall not" in out and "bob decided that they may be linked again" in out
     lines = said("map", "history", "--map", path).splitlines()
-    kinds = [line.split("UTC  ")[1][:10].strip() for line in lines]
-    assert kinds == ["ruled", "parted", "ruled", "joined"]
+    kinds = [line.split("UTC  ")[1].split("  ")[0] for line in lines]
+    assert kinds == ["constrained", "parted", "constrained", "joined"]
     assert all("anna" in line and "two kitchens" in line for line in lines[:2]) and "bob" in lines[2]
     # The history of a file is kept in files made of it, once.
     said("map", "merge", path, files[3], "-o", tmp_path / "again.mapweave")
@@ -203,7 +203,7 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     assert "not one map: map r1.1 is retired by anna on 20" in out and '"rebuilt"' in out
     out = said("map", "explain", "r0.1.1", "r1.1.1", "--map", path)
     assert "are not linked: map r1.1 is retired by anna" in out
-    # A later merge with others heeds it too.
+    # A later merge with others applies it too.
     said("map", "merge", path, "-o", path)
     assert not links(path)
     said("map", "retire", "r1.1", "--undo", "--map", path)
@@ -330,10 +330,10 @@ def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Sa
         # The same numbers from the server, once it has merged all, as from the file merged without one.
         offline = json.loads(said("map", "explain", *pair, "--json", "--map", files[3]))
 
-        def told(answer: dict[str, Any]) -> tuple[object, ...]:
-            return answer["shared"], answer["reason"], [w["a"] for w in answer["witnesses"]]
+        def content(answer: dict[str, Any]) -> tuple[object, ...]:
+            return answer["shared"], answer["reason"], [w["a"] for w in answer["other_links"]]
 
-        while told(served := json.loads(said("map", "explain", *pair, "--json", *at))) != told(offline):
+        while content(served := json.loads(said("map", "explain", *pair, "--json", *at))) != content(offline):
             assert time.monotonic() < end, "the server explains otherwise"
         assert served["probability"] == pytest.approx(offline["probability"], rel=1e-4)
         ways = [
@@ -357,7 +357,13 @@ def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Sa
         assert "r0.1 and r1.1 are one map: " in out
         history = json.loads(said("map", "history", "--json", *at))["history"]
         # What the first server saw, too; a restarted server does not report joined maps again.
-        assert [event["kind"] for event in history] == ["joined", "ruled", "parted", "ruled", "joined"]
+        assert [event["kind"] for event in history] == [
+            "joined",
+            "constrained",
+            "parted",
+            "constrained",
+            "joined",
+        ]
         assert "two kitchens" in history[1]["words"] and "two kitchens" in history[2]["words"]
         assert [event["stamp_ns"] for event in history] == sorted(event["stamp_ns"] for event in history)
         lines = said("map", "history", "--most", "2", *at).splitlines()

@@ -71,7 +71,7 @@ def test_the_summary_of_an_agents_map(agent_file, capfd):
         "edges": {"turned": len(TOUR) - 1},
         "links": 0,
         "refused": 0,
-        "rulings": 0,
+        "constraints": 0,
         "components": 1,
         "landmarks_per_node_median": float(np.median(counts)),
         "picture": str(agent_file.with_suffix(".png")),

@@ -251,7 +251,7 @@ def test_recall_counts_places_not_pairs_of_images():
     true = truth[a].inverse() @ truth[b]
     assert link_recall([], truth, []) == 0.0
     assert link_recall([link(a, b, true)], truth, []) == 1.0
-    assert link_recall([link(a, b, true @ Pose2(0.6))], truth, []) == 0.0, "a false link helps nobody"
+    assert link_recall([link(a, b, true @ Pose2(0.6))], truth, []) == 0.0, "a false link does not help"
     far = link(node(9, "a"), b, truth[node(9, "a")].inverse() @ truth[b])
     assert link_recall([far], truth, []) == 0.5, "a true link from elsewhere helps only b's place"
 

@@ -19,7 +19,7 @@ from mapweave.agent.observation import Command, Observation, Odometry, RobotDesc
 from mapweave.hybridmap.camera import Camera
 
 class Still:
-    '''A robot that looks at noise and writes down what it is told to do.'''
+    '''A robot that looks at noise and writes down its commands.'''
     def __init__(self, settings):
         self.log = open(settings.options["log"], "a", buffering=1)
         self.image = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
@@ -73,7 +73,7 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path:
             started.append(
                 Started(
                     tmp_path, name, "agent", "r0", "--robot", f"{driver}:Still", "--connect", endpoint,
-                    "--settings", settings(tmp_path, name), "--data", tmp_path / name,
+                    "--settings", settings(tmp_path, name), "--data", tmp_path / name, "--epoch", "1",
                 )
             )  # fmt: skip
             return started[-1]
@@ -106,12 +106,12 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path:
     ("stamp", "words"),
     [("time.time()", "stamp_ns .* whole nanoseconds"), ("7", "stamp_ns stands still at 7")],
 )
-def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: Path, nobody: str) -> None:
+def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: Path, closed: str) -> None:
     driver = tmp_path / "still.py"
     driver.write_text(DRIVER.replace("{stamp}", stamp))
     agent = Started(
-        tmp_path, "agent", "agent", "r0", "--robot", f"{driver}:Still", "--connect", nobody,
-        "--settings", settings(tmp_path, "agent"), "--data", tmp_path / "data",
+        tmp_path, "agent", "agent", "r0", "--robot", f"{driver}:Still", "--connect", closed,
+        "--settings", settings(tmp_path, "agent"), "--data", tmp_path / "data", "--epoch", "1",
     )  # fmt: skip
     assert agent.process.wait(60) == 1
     *_, last = agent.said.read_text().splitlines()

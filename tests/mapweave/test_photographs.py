@@ -83,7 +83,7 @@ def test_a_map_file_says_where_a_photograph_was_taken(stretch) -> None:
     relocalizer = relocalizer_of(MapFile("agent", "hall", tuple(changes)))
     view = view_of(read_grey(images[3]), camera, distortion)
     answer = relocalizer.answer(view)
-    # Nobody has measured the scale.
+    # The scale was never measured.
     assert answer.certainty is Certainty.PLACE, answer.reason
     assert answer.candidates[0].node.number == 4
 

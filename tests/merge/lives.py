@@ -41,7 +41,7 @@ class Life:
         self.known: dict[Pair, Verdict] = {}
         self.verdicts = Verdicts()
         self.touched: set[MapId] = set()
-        self.rulings = ManualConstraints()
+        self.constraints = ManualConstraints()
         self.number = 0
 
     def there(self, pair: Pair) -> bool:
@@ -90,7 +90,7 @@ class Life:
             ends = pair if rng.random() < 0.7 or pair[0].map == pair[1].map else (pair[0].map, pair[1].map)
             self.number += 1
             constraint = ManualConstraint(ends, bool(rng.random() < 0.6), "anna", self.number)
-            self.rulings = self.rulings + ManualConstraints([constraint])
+            self.constraints = self.constraints + ManualConstraints([constraint])
 
     def _loop(self) -> None:
         """A robot recognises a place of its own, or drives there, and may be mistaken."""
@@ -110,8 +110,8 @@ class Life:
         edge = Edge(EdgeId(map_id.agent, 1, 1000 + self.number), a, b, a_from_b, kind)
         self.change(map_id, EdgePut(edge))
 
-    def anew(self) -> MergedMap:
+    def rebuilt(self) -> MergedMap:
         links = [v for v in self.known.values() if isinstance(v, Link)]
         refused = [v for v in self.known.values() if isinstance(v, RefusedLink)]
-        undone = apply_constraints(self.maps, links, self.rulings)
+        undone = apply_constraints(self.maps, links, self.constraints)
         return undone.completed(merge_maps(undone.maps, undone.links, [*refused, *undone.refused]))

@@ -30,7 +30,7 @@ class Daily:
 
     def __init__(self, seed: int, false_share: float = 0.0) -> None:
         self.days = drives(np.random.default_rng(seed), DriveSettings(FLOOR, false_share=false_share))
-        self.islands, self.verdicts, self.rulings = Islands(exact=60), Verdicts(), ManualConstraints()
+        self.islands, self.verdicts, self.constraints = Islands(exact=60), Verdicts(), ManualConstraints()
         self.maps: dict[MapId, HybridMap] = {}
         self.links: dict[Pair, Link] = {}
         self.truth: dict[NodeId, Pose2] = {}
@@ -52,7 +52,7 @@ class Daily:
             self.touched |= {link.a.map, link.b.map}
 
     def merged(self) -> MergedMap:
-        merged = self.islands.merge(self.maps, self.verdicts, self.touched, self.rulings)
+        merged = self.islands.merge(self.maps, self.verdicts, self.touched, self.constraints)
         self.touched = set()
         return merged
 
@@ -62,8 +62,8 @@ class Daily:
             merged = self.merged()
         return merged
 
-    def anew(self) -> MergedMap:
-        undone = apply_constraints(self.maps, self.links.values(), self.rulings)
+    def rebuilt(self) -> MergedMap:
+        undone = apply_constraints(self.maps, self.links.values(), self.constraints)
         return undone.completed(merge_maps(undone.maps, undone.links, undone.refused))
 
 
@@ -84,33 +84,35 @@ def test_standing_decisions_agree_with_deciding_everything(seed: int, false_shar
     daily = Daily(seed, false_share)
     daily.live(5)
     for _ in range(4):
-        check(daily.live(1), daily.anew())
+        check(daily.live(1), daily.rebuilt())
 
 
 def test_constraints_apply_to_standing_decisions() -> None:
     daily = Daily(5)
     merged = daily.live(6)
     pair = merged.links[len(merged.links) // 2].pair
-    daily.rulings = ManualConstraints([ManualConstraint(pair, True, "anna", 1)])
+    daily.constraints = ManualConstraints([ManualConstraint(pair, True, "anna", 1)])
     daily.touched |= {pair[0].map, pair[1].map}
     merged = daily.merged()
     assert "undone by anna" in merged.explain(*pair)
-    check(merged, daily.anew())
+    check(merged, daily.rebuilt())
     daily.live(2)
     assert "undone by anna" in daily.merged().explain(*pair)
-    daily.rulings = daily.rulings + ManualConstraints([ManualConstraint(pair, False, "anna", 2)])
+    daily.constraints = daily.constraints + ManualConstraints([ManualConstraint(pair, False, "anna", 2)])
     daily.touched |= {pair[0].map, pair[1].map}
     merged = daily.merged()
     assert pair in {link.pair for link in merged.links}
-    check(merged, daily.anew())
+    check(merged, daily.rebuilt())
 
 
 def test_maps_and_nodes_of_earlier_days_are_retired() -> None:
     daily = Daily(6)
     daily.live(6)
-    daily.rulings = ManualConstraints([ManualConstraint((MapId("r0", 2), MapId("r0", 2)), True, "anna", 1)])
+    daily.constraints = ManualConstraints(
+        [ManualConstraint((MapId("r0", 2), MapId("r0", 2)), True, "anna", 1)]
+    )
     daily.touched.add(MapId("r0", 2))
-    check(daily.merged(), daily.anew())
+    check(daily.merged(), daily.rebuilt())
     hybrid_map = HybridMap(daily.maps[MapId("r0", 3)].contents())
     gone = sorted(hybrid_map.nodes)[1]
     hybrid_map.apply(NodeRetired(gone))
@@ -121,7 +123,7 @@ def test_maps_and_nodes_of_earlier_days_are_retired() -> None:
         daily.touched |= {pair[0].map, pair[1].map}
     daily.touched.add(MapId("r0", 3))
     daily.live(1)
-    check(daily.merged(), daily.anew())
+    check(daily.merged(), daily.rebuilt())
 
 
 @pytest.mark.parametrize("seed", [9, 11])
@@ -140,7 +142,7 @@ def test_a_false_join_is_undone_when_later_maps_contradict_it(seed: int) -> None
     result = {link.pair for link in false}
     estimated = []
     for _ in range(3):
-        merged, fresh = daily.live(1), daily.anew()
+        merged, fresh = daily.live(1), daily.rebuilt()
         outcome = result & {link.pair for link in merged.links}
         assert outcome == result & {link.pair for link in fresh.links}
         estimated.append(bool(outcome))

@@ -20,13 +20,13 @@ from mapweave.merge.settings import MergeSettings
 from tests.merge.lives import DENSE, Life
 
 
-def told(merged: MergedMap) -> tuple[object, ...]:
+def contents(merged: MergedMap) -> tuple[object, ...]:
     """Everything but numbers."""
     return (
         [link.pair for link in merged.links],
         sorted((r.pair, r.reason, str(r.edge)) for r in merged.refused),
         set(merged.components),
-        merged.rulings.in_force,
+        merged.constraints.in_force,
         set(merged.maps),
     )
 
@@ -40,10 +40,10 @@ def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> Non
     for _ in range(45):
         life.step()
         if life.rng.random() < 0.4:
-            merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
             life.touched = set()
-            fresh = life.anew()
-            assert told(merged) == told(fresh)
+            fresh = life.rebuilt()
+            assert contents(merged) == contents(fresh)
             assert [graph.anchor for graph in merged.graphs] == [graph.anchor for graph in fresh.graphs]
             assert list(merged.poses) == list(fresh.poses)
             for node, place in merged.poses.items():
@@ -51,7 +51,7 @@ def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> Non
                 assert place.component == other.component
                 assert place.merged_from_robot.mean == other.merged_from_robot.mean
                 assert np.array_equal(place.merged_from_robot.covariance, other.merged_from_robot.covariance)
-    assert len(islands.merge(life.maps, life.verdicts, set(), life.rulings).poses) > 20
+    assert len(islands.merge(life.maps, life.verdicts, set(), life.constraints).poses) > 20
 
 
 @pytest.mark.parametrize(("seed", "false_share"), [(40, 0.0), (41, 0.3), (42, 0.5)])
@@ -64,9 +64,9 @@ def test_joint_decisions_agree_with_a_fresh_merge(
     for _ in range(50):
         life.step()
         if life.rng.random() < 0.3:
-            merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
             life.touched = set()
-            assert told(merged) == told(life.anew())
+            assert contents(merged) == contents(life.rebuilt())
 
 
 @pytest.mark.parametrize("seed", [43, 44, 45])
@@ -78,9 +78,9 @@ def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch: pyt
     life, islands = Life(seed, 0.0, DENSE), Islands(exact=0)
     for _ in range(60):
         life.step(quiet=True)
-        merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+        merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
         life.touched = set()
-    fresh = life.anew()
+    fresh = life.rebuilt()
     assert set(merged.components) == set(fresh.components)
     one, two = ({link.pair for link in links} for links in (merged.links, fresh.links))
     assert len(two) > 150 and len(one ^ two) <= 0.03 * len(two)
@@ -99,10 +99,10 @@ def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int
             which = sorted(life.maps)[int(life.rng.integers(len(life.maps)))]
             life.number += 1
             constraint = ManualConstraint((which, which), bool(life.rng.random() < 0.6), "anna", life.number)
-            life.rulings = life.rulings + ManualConstraints([constraint])
+            life.constraints = life.constraints + ManualConstraints([constraint])
         if life.rng.random() < 0.4:
-            merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
-            life.touched, fresh = set(), life.anew()
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
+            life.touched, fresh = set(), life.rebuilt()
             one, two = ({link.pair for link in some.links} for some in (merged, fresh))
             apart, links = apart + len(one ^ two), links + len(two)
             assert set(merged.poses) == set(fresh.poses)
@@ -119,11 +119,11 @@ def test_all_is_decided_together_now_and_then_only(monkeypatch: pytest.MonkeyPat
     life, islands = Life(4, 0.0, DENSE), Islands(exact=0)
     for _ in range(60):
         life.step(quiet=True)
-        islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+        islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
         life.touched = set()
     assert 3 < sum(times) < 30 and not all(times[-8:])
     times.clear()
-    islands.merge(life.maps, life.verdicts, set(life.maps), life.rulings)
+    islands.merge(life.maps, life.verdicts, set(life.maps), life.constraints)
     assert times == [False]
 
 
@@ -135,9 +135,9 @@ def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.Mon
         life, islands = Life(49, 0.3, DENSE), Islands(exact=0)
         for _ in range(40):
             life.step()
-            merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
             life.touched = set()
-        collected.append((told(merged), [merged.pose(node).vector.tobytes() for node in merged.poses]))
+        collected.append((contents(merged), [merged.pose(node).vector.tobytes() for node in merged.poses]))
     assert collected[0] == collected[1]
 
 
@@ -145,10 +145,10 @@ def test_untouched_components_are_kept() -> None:
     life, islands = Life(7, 0.0), Islands(MergeSettings())
     for _ in range(60):
         life.step()
-    first = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+    first = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
     alone = MapId("z", 1)
     node = next(iter(life.maps[min(life.maps)].nodes.values()))
     life.maps[alone] = HybridMap([NodePut(replace(node, id=NodeId("z", 1, 1)))])
-    second = islands.merge(life.maps, life.verdicts, {alone}, life.rulings)
+    second = islands.merge(life.maps, life.verdicts, {alone}, life.constraints)
     assert {id(g) for g in first.graphs} <= {id(g) for g in second.graphs}
     assert len(second.graphs) > len(first.graphs)

@@ -11,11 +11,11 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
-from mapweave.merge.pose_graph.candidates import choose_pairs, overlaps
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import verify
 from synthetic.world import World, room, take_map
+from tests.merge.pose_graph.all_pairs import choose_pairs, overlaps
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 

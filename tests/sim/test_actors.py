@@ -19,15 +19,15 @@ from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
 from mapweave.sim.worlds.catalog import KINDS, make_world
 
-NOBODY = np.zeros((0, 2))
+NO_OTHERS = np.zeros((0, 2))
 
 
 def test_a_person_walks_to_and_fro_at_its_speed() -> None:
     """Along both legs and back, never faster, looking where it goes."""
-    actor = Actor("person", ((0.0, 0.0), (1.0, 0.0), (1.0, 0.5)), 0.5, 100, NOBODY, 0.16)
+    actor = Actor("person", ((0.0, 0.0), (1.0, 0.0), (1.0, 0.5)), 0.5, 100, NO_OTHERS, 0.16)
     poses = [actor.pose]
     for _ in range(62):
-        actor.walk(0.1, NOBODY)
+        actor.walk(0.1, NO_OTHERS)
         poses.append(actor.pose)
     steps = np.array([p.distance(q) for p, q in pairwise(poses)])
     assert steps.max() <= 0.05 + 1e-9

@@ -47,7 +47,7 @@ def test_a_robot_describes_what_was_ordered() -> None:
 @pytest.mark.parametrize(
     ("table", "says"),
     [
-        ({"name": "a", "camera": "fisheye"}, "no camera 'fisheye'; there are webcam"),
+        ({"name": "a", "camera": "telephoto"}, "no camera 'telephoto'; there are webcam"),
         ({"name": "a", "camera": 3}, "must be a name"),
         ({"name": "a", "camera": {"read_nois": 1.0}}, "did you mean 'read_noise'"),
         ({"name": "a", "camera": {"exposure": {"seconds": 9.0}}}, "exposure: seconds is 9"),

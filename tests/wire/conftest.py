@@ -75,7 +75,7 @@ def ranges(draw: st.DrawFn) -> Ranges:
 
 
 @st.composite
-def wakes(draw: st.DrawFn, ranges: Ranges) -> TrajectorySegment:
+def segments(draw: st.DrawFn, ranges: Ranges) -> TrajectorySegment:
     count = draw(st.integers(0, MOST))
     random = np.random.default_rng(draw(seeds))
     poses = random.uniform([-FURTHEST, -FURTHEST, -3.1], [FURTHEST, FURTHEST, 3.1], (count, 3))
@@ -103,7 +103,7 @@ def nodes(draw: st.DrawFn) -> Node:
         clock,
         radius,
         seen,
-        draw(wakes(seen)),
+        draw(segments(seen)),
     )
 
 

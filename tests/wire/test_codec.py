@@ -46,10 +46,10 @@ def test_a_node_keeps_its_content(some: SimpleNamespace, data: st.DataObject) ->
     assert np.abs(back.ranges.distances - node.ranges.distances).max(initial=0.0) <= node.ranges.reach / 500
     nothing = node.ranges.distances >= node.ranges.reach
     assert (back.ranges.distances[nothing] == back.ranges.reach).all()
-    assert np.abs(back.wake.ages - node.wake.ages).max(initial=0.0) <= 0.006
-    assert np.abs(back.wake.node_from_robot - node.wake.node_from_robot).max(initial=0.0) <= 0.6e-3
-    assert back.wake.distances.shape == node.wake.distances.shape
-    assert np.abs(back.wake.distances - node.wake.distances).max(initial=0.0) <= node.ranges.reach / 500
+    assert np.abs(back.segment.ages - node.segment.ages).max(initial=0.0) <= 0.006
+    assert np.abs(back.segment.node_from_robot - node.segment.node_from_robot).max(initial=0.0) <= 0.6e-3
+    assert back.segment.distances.shape == node.segment.distances.shape
+    assert np.abs(back.segment.distances - node.segment.distances).max(initial=0.0) <= node.ranges.reach / 500
     assert_close(back.map_from_robot, node.map_from_robot)
     old, new = node.landmarks, back.landmarks
     assert len(old) == len(new)
@@ -275,8 +275,8 @@ FORGERIES: list[tuple[str, dict[str, Any], str]] = [
     ("node", {"c": struct.pack("<HH6d", 320, 240, -1, 1, 1, 1, 1, 1)}, "focal"),
     ("node", {"c": struct.pack("<HH6d", 320, 240, math.nan, 1, 1, 1, 1, 1)}, "out of range"),
     ("node", {"m": b"\0" * 15}, "15 bytes are too few"),
-    ("node", {"m": b"\3" + b"\0" * 20}, "version 3, this program reads 2"),
-    ("node", {"m": b"\2" + b"\0" * 20}, "checksum"),
+    ("node", {"m": b"\2" + b"\0" * 20}, "version 2, this program reads 1"),
+    ("node", {"m": b"\1" + b"\0" * 20}, "checksum"),
     ("node", {"m": "text"}, r"Expected `bytes`, got `str` - at `\$.m`"),
     ("edge", {"a": -1}, r"Expected `int` >= 0 - at `\$.a`"),
     ("edge", {"a": 17}, "to itself"),

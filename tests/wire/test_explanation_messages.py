@@ -17,13 +17,13 @@ from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.explanation import (
     FleetExplanation,
     Hop,
+    LinkAgreement,
     MapsExplanation,
     Misfit,
     NearMiss,
     PairExplanation,
     RouteExplanation,
     Standing,
-    Witness,
 )
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId, Node, NodeId
@@ -55,7 +55,7 @@ def explanation() -> PairExplanation:
     matches, misfit = np.array([[1, 2], [3, 4]]), Misfit(pose, np.array([0.1, 0.2, -0.3]), 4.5, False)
     return PairExplanation(
         a, b, Standing.LINKED, "because", matches, matches[:1], np.array([math.nan]), pose,
-        {"inliers": 12.0, "rms_px": 0.7}, 0.9, misfit, (Witness(NODE_A, NODE_B, 2.5, True, False),),
+        {"inliers": 12.0, "rms_px": 0.7}, 0.9, misfit, (LinkAgreement(NODE_A, NODE_B, 2.5, True, False),),
         ("a has recognised the one at the other",), (ManualConstraint((A, B), True, "anna", 1, "why"),),
     )  # fmt: skip
 
@@ -71,10 +71,10 @@ def test_two_nodes_come_back() -> None:
     assert np.array_equal(back.matches, result.matches) and np.array_equal(back.shared, result.shared)
     assert np.array_equal(back.residuals_px, result.residuals_px, equal_nan=True)
     assert back.a_from_b is not None and np.allclose(back.a_from_b.mean.vector, [0.25, -0.5, 0.125])
-    assert (back.evidence, back.probability, back.witnesses) == (result.evidence, 0.9, result.witnesses)
+    assert (back.evidence, back.probability, back.other_links) == (result.evidence, 0.9, result.other_links)
     assert back.misfit is not None and np.allclose(back.misfit.off, [0.1, 0.2, -0.3])
     assert (back.misfit.strain2, back.misfit.alone) == (4.5, False)
-    assert (back.claims, back.rulings) == (result.claims, result.rulings)
+    assert (back.claims, back.constraints) == (result.claims, result.constraints)
     assert np.array_equal(back.a.landmarks.pixels, decode(encode(back), PairExplanation).a.landmarks.pixels)
 
 
@@ -84,7 +84,7 @@ def test_nothing_but_words_comes_back_too() -> None:
     back = decode(
         encode(PairExplanation(a, b, Standing.REFUSED, "no", nothing, nothing, np.zeros(0))), PairExplanation
     )
-    assert back.a_from_b is None and back.misfit is None and back.probability is None and not back.witnesses
+    assert back.a_from_b is None and back.misfit is None and back.probability is None and not back.other_links
 
 
 ids = st.builds(NodeId, st.sampled_from(["a", "b9"]), st.integers(0, 9), st.integers(0, 2**53))
@@ -93,7 +93,7 @@ words = st.text(st.characters(codec="utf-8", categories=["L", "N", "P", "Zs"]), 
 )
 counts = st.integers(0, 2**40)
 amounts = st.floats(0, 4e6)
-rulings = st.builds(
+constraints = st.builds(
     ManualConstraint,
     st.tuples(ids, ids).filter(lambda e: e[0] != e[1])
     | st.tuples(ids, ids).map(lambda e: (e[0].map, e[1].map)).filter(lambda e: e[0] != e[1]),
@@ -102,7 +102,7 @@ rulings = st.builds(
 maps = st.builds(
     MapsExplanation, ids.map(lambda n: n.map), ids.map(lambda n: n.map), st.booleans(), words, counts, counts,
     counts, counts, st.lists(st.builds(NearMiss, ids, ids, counts, counts, words), max_size=3).map(tuple),
-    st.lists(rulings, max_size=3).map(tuple),
+    st.lists(constraints, max_size=3).map(tuple),
 )  # fmt: skip
 
 
@@ -116,19 +116,19 @@ routes = st.builds(
 
 
 @given(routes)
-def test_routes_come_back(told: RouteExplanation) -> None:
-    assert decode(encode(told), RouteExplanation) == told
+def test_routes_come_back(explanation: RouteExplanation) -> None:
+    assert decode(encode(explanation), RouteExplanation) == explanation
 
 
 @given(st.lists(maps, max_size=4).map(lambda some: FleetExplanation(tuple(some))))
-def test_maps_come_back(told: FleetExplanation) -> None:
-    assert decode(encode(told), FleetExplanation) == told
+def test_maps_come_back(explanation: FleetExplanation) -> None:
+    assert decode(encode(explanation), FleetExplanation) == explanation
 
 
-@given(rulings)
-def test_constraints_and_questions_round_trip(ruling: ManualConstraint) -> None:
-    assert decode(encode(ruling), ManualConstraint) == ruling
-    request = ExplainRequest(ruling.ends)
+@given(constraints)
+def test_constraints_and_questions_round_trip(constraint: ManualConstraint) -> None:
+    assert decode(encode(constraint), ManualConstraint) == constraint
+    request = ExplainRequest(constraint.ends)
     assert decode(encode(request), ExplainRequest) == request
     assert decode(encode(ExplainRequest()), ExplainRequest).ends is None
 
@@ -145,8 +145,9 @@ def test_constraints_and_questions_round_trip(ruling: ManualConstraint) -> None:
         ("probability", 1.5), ("misfit", [1, 2]), ("misfit", {**MISFIT, "merged_a_from_b": b""}),
         ("misfit", {**MISFIT, "off": ["f8", [2], bytes(16)]}), ("misfit", {**MISFIT, "alone": 1}),
         ("misfit", {**MISFIT, "off": ["f8", [3], struct.pack("<3d", 0.0, math.nan, 0.0)]}),
-        ("misfit", {**MISFIT, "strain2": -1.0}), ("witnesses", [[1]]), ("witnesses", [{"a": ["a", 1, 2]}]),
-        ("rulings", [[1, 2]]), ("reason", "two\nlines"), ("evidence", {"inliers": "many"}),
+        ("misfit", {**MISFIT, "strain2": -1.0}), ("other_links", [[1]]),
+        ("other_links", [{"a": ["a", 1, 2]}]),
+        ("constraints", [[1, 2]]), ("reason", "two\nlines"), ("evidence", {"inliers": "many"}),
         ("a", b"no node"), ("a", encode_body(NodeRetired(NODE_A))), ("claims", [7]),
     ],
 )  # fmt: skip
@@ -158,7 +159,7 @@ def test_a_damaged_explanation_is_refused_in_one_line(field: str, value: Any) ->
     assert decode(msgpack.packb({**fields, "misfit": MISFIT}), PairExplanation).misfit is not None
 
 
-def ruled(*ends: list[Any]) -> bytes:
+def constrained(*ends: list[Any]) -> bytes:
     rest = {"apart": True, "who": "x", "stamp_ns": 0, "because": ""}
     return msgpack.packb({"v": 1, "ends": list(ends), **rest})
 
@@ -169,11 +170,11 @@ def ruled(*ends: list[Any]) -> bytes:
 )
 def test_a_constraint_without_effect_is_refused(ends: list[Any]) -> None:
     with pytest.raises(InvalidMessage):
-        decode(ruled(*ends), ManualConstraint)
+        decode(constrained(*ends), ManualConstraint)
 
 
 def test_a_constraint_on_one_map_retires_it() -> None:
-    assert decode(ruled(["a", 1], ["a", 1]), ManualConstraint).retires == MapId("a", 1)
+    assert decode(constrained(["a", 1], ["a", 1]), ManualConstraint).retires == MapId("a", 1)
 
 
 def test_undecodable_values_are_not_encoded() -> None:

@@ -18,12 +18,12 @@ from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
     FleetExplanation,
+    LinkAgreement,
     MapsExplanation,
     Misfit,
     NearMiss,
     PairExplanation,
     Standing,
-    Witness,
 )
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
@@ -104,7 +104,7 @@ def explanations(some: SimpleNamespace, a: Node, pose: PoseGaussian) -> list[tup
     constraint = ManualConstraint((a.id, b.id), True, "anna", 5, "two kitchens")
     pairs = np.array([[1, 2], [3, 4]])
     misfit = Misfit(pose, np.zeros(3), 1.5, False)
-    link = Witness(a.id, b.id, 2.5, True, False)
+    link = LinkAgreement(a.id, b.id, 2.5, True, False)
     pair = PairExplanation(
         a, b, Standing.LINKED, "why", pairs, pairs[:1], np.array([0.5]), pose, {"inliers": 12.0}, 0.9,
         misfit, (link,), ("r0 says so",), (constraint,),

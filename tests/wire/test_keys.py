@@ -46,7 +46,6 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
         KEYS.any_known(): KEYS.known(server),
         KEYS.any_server_map(): KEYS.server_map(server),
         KEYS.server_statuses(): KEYS.server_status(server),
-        KEYS.servers_alive(): KEYS.server_alive(server),
         KEYS.robot_drivers(): KEYS.robot_driver(server, one.epoch),
     }
     others = [KEYS.log(one), KEYS.mission(one.agent), KEYS.robot_describe(server), f"{KEYS.root}/sim/alive"]
@@ -65,8 +64,6 @@ def test_a_key_is_parsed(one: MapId, server: str) -> None:
     assert KEYS.parse_agent_alive(KEYS.agent_alive(one)) == one
     assert KEYS.parse_agent_status(KEYS.agent_status(one.agent)) == one.agent
     assert KEYS.parse_ack(KEYS.ack(server, one.agent)) == (server, one.agent)
-    assert KEYS.parse_server_alive(KEYS.server_alive(server)) == server
-    assert KEYS.parse_server_status(KEYS.server_status(server)) == server
     assert KEYS.parse_robot_driver(KEYS.robot_driver(server, one.epoch)) == (server, one.epoch)
 
 

@@ -126,7 +126,7 @@ class _Question:
         self.retry_after = 0.0
 
     def reply(self, payload: bytes) -> None:
-        raise AssertionError("nobody replies here")
+        raise AssertionError("no server replies here")
 
     def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         self.refusal, self.retry_after = reason, retry_after

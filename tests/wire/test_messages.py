@@ -84,7 +84,7 @@ def test_nonsense_is_refused(decode: object, data: bytes) -> None:
 
 
 @pytest.mark.parametrize(("covered", "numbers"), [(9, [4, 4]), (9, [2]), (9, [10]), (1, [])])
-def test_nobody_makes_a_piece_of_a_log_that_is_none(covered: int, numbers: list[int]) -> None:
+def test_invalid_pieces_of_a_log_are_refused(covered: int, numbers: list[int]) -> None:
     with pytest.raises(InvalidValue):
         LogAnswer(1, 3, covered, tuple((number, b"") for number in numbers))
     with pytest.raises(InvalidValue):
@@ -193,8 +193,8 @@ def test_the_cache_returns_its_entries() -> None:
     assert np.allclose(back.views, views, atol=1e-5)
     assert back.reason == "512 of 600 views"
     assert encode(back) == encoded
-    nothing = decode(encode(KnownAnswer(np.zeros((0, 4)), "nobody")), KnownAnswer)
-    assert (nothing.views.shape, nothing.reason) == ((0, 4), "nobody")
+    nothing = decode(encode(KnownAnswer(np.zeros((0, 4)), "unknown")), KnownAnswer)
+    assert (nothing.views.shape, nothing.reason) == ((0, 4), "unknown")
 
 
 @pytest.mark.parametrize(

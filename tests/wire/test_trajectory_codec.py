@@ -71,4 +71,4 @@ def test_mismatched_arrays_are_refused(ages, poses, distances):
 def test_a_node_refuses_a_trajectory_of_other_sensors(some, distances):
     node = replace(some.node(), ranges=TWO)
     with pytest.raises(InvalidValue, match="trajectory"):
-        replace(node, wake=TrajectorySegment(np.zeros(1), np.zeros((1, 3)), np.array(distances)))
+        replace(node, segment=TrajectorySegment(np.zeros(1), np.zeros((1, 3)), np.array(distances)))

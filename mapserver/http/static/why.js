@@ -1,5 +1,5 @@
 "use strict";
-const byId = id => document.getElementById(id), told = byId("told");
+const byId = id => document.getElementById(id), result = byId("result");
 const SVG = "http://www.w3.org/2000/svg", BAD_PX = 10;
 const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 function add(parent, name, text, kind) {
@@ -54,10 +54,10 @@ function to(parent, a, b, words) {
   link.href = "why?" + new URLSearchParams({ a, b });
 }
 function showPair(pair) {
-  const box = add(told, "section", "", pair.standing === "linked" || pair.standing === "own" ? "good" : "");
+  const box = add(result, "section", "", pair.standing === "linked" || pair.standing === "own" ? "good" : "");
   add(box, "p", `${pair.a.id} and ${pair.b.id}: ${pair.standing}: ${pair.reason}.`);
-  if (pair.evidence.doubles)
-    add(box, "p", `${pair.evidence.doubles} of the landmarks that agree are found at other places too.`);
+  if (pair.evidence.aliased)
+    add(box, "p", `${pair.evidence.aliased} of the landmarks that agree are found at other places too.`);
   if (pair.a_from_b) add(box, "p", "Seen from the first, the second is " + pose(pair.a_from_b) + ".");
   if (pair.misfit) add(box, "p", `In the map it is ${pose(pair.misfit.merged_a_from_b)}; off by ` +
     `${metres(pair.misfit.off)}, ${Math.sqrt(pair.misfit.strain2).toFixed(1)} standard deviations` +
@@ -66,12 +66,12 @@ function showPair(pair) {
     const percent = pair.probability > 0.9999 ? "over 99.99" : (100 * pair.probability).toFixed(2);
     add(box, "p", `Right with ${percent} %, by the rest of the map.`);
   }
-  if (pair.witnesses.length) {
-    const agree = pair.witnesses.filter(w => w.agrees).length;
-    add(box, "p", `${agree} of ${pair.witnesses.length} other links between the same pieces of map agree:`);
+  if (pair.other_links.length) {
+    const agree = pair.other_links.filter(w => w.agrees).length;
+    add(box, "p", `${agree} of ${pair.other_links.length} other links between the same pieces of map agree:`);
     const list = add(box, "ul");
     // Of many that agree some leave their lines to those that do not.
-    const ranked = pair.witnesses.slice().sort((v, w) => v.distance2 - w.distance2);
+    const ranked = pair.other_links.slice().sort((v, w) => v.distance2 - w.distance2);
     const against = ranked.filter(w => !w.agrees);
     const shown = ranked.filter(w => w.agrees).slice(0, 12 - Math.min(against.length, 6));
     for (const w of [...shown, ...against.slice(0, 12 - shown.length)]) {
@@ -81,10 +81,10 @@ function showPair(pair) {
         `deviations, ${w.kept ? "stands" : "refused"}`);
     }
   }
-  for (const words of [...pair.claims, ...pair.rulings.map(ruled)]) add(box, "p", words);
+  for (const words of [...pair.claims, ...pair.constraints.map(constraintWords)]) add(box, "p", words);
   picture(box, pair);
 }
-function ruled(r) {
+function constraintWords(r) {
   const when = new Date(r.stamp_ns / 1e6).toISOString().slice(0, 16).replace("T", " ");
   const what = r.ends[0] === r.ends[1] ? (r.apart ? "is retired" : "is in use again")
     : r.apart ? "shall not be linked" : "may be linked again";
@@ -92,11 +92,11 @@ function ruled(r) {
     (r.because ? `: \u201c${r.because}\u201d` : "");
 }
 function showMaps(maps) {
-  if (!maps.length) add(told, "section", "There are no two maps.");
+  if (!maps.length) add(result, "section", "There are no two maps.");
   maps.forEach(showTwo);
 }
 function showTwo(one) {
-  const box = add(told, "section", "", one.joined ? "good" : "");
+  const box = add(result, "section", "", one.joined ? "good" : "");
   add(box, "p", one.reason);
   if (!one.joined)
     add(box, "p", `${one.refused} links refused, ${one.unverified} candidate pairs without a common pose.`);
@@ -108,7 +108,7 @@ function showTwo(one) {
     const lacks = n.lacks.split("; ").filter(words => !one.reason.includes(words));
     item.append(": " + [`${n.matches} match, ${n.inliers} agree`, ...lacks].join("; "));
   }
-  for (const words of one.rulings.map(ruled)) add(box, "p", words);
+  for (const words of one.constraints.map(constraintWords)) add(box, "p", words);
 }
 function showHops(box, hops) {
   const list = add(box, "ol");
@@ -120,7 +120,7 @@ function showHops(box, hops) {
   }
 }
 function showRoute(route) {
-  const box = add(told, "section", "", route.found ? "good" : "failed");
+  const box = add(result, "section", "", route.found ? "good" : "failed");
   add(box, "p", `${route.start} to ${route.goal}: ` +
     `${route.found ? "the route is" : "there is no way"}: ${route.reason}.`);
   if (route.hops.length) showHops(box, route.hops);
@@ -144,7 +144,7 @@ async function explain() {
   const path = asked.get("route") ? "route" : "explain";
   const query = a || b ? "?" + new URLSearchParams({ a, b }) : "";
   if (query) document.title = `${a} ${path === "route" ? "to" : "and"} ${b} - Mapweave`;
-  told.textContent = "Asking ...";
+  result.textContent = "Asking ...";
   for (let tries = 0; tries < 5; tries++) {
     let reply, answer;
     try {
@@ -155,15 +155,15 @@ async function explain() {
       await new Promise(done => setTimeout(done, 1000 * (answer.retry_after || 1)));
       continue;
     }
-    told.textContent = "";
-    if (answer.error) add(told, "section", answer.error, "failed");
+    result.textContent = "";
+    if (answer.error) add(result, "section", answer.error, "failed");
     else if (answer.maps) showMaps(answer.maps);
     else if (answer.hops) showRoute(answer);
     else showPair(answer);
     return;
   }
-  told.textContent = "";
-  add(told, "section", "The map server is too busy; try again in a minute.", "failed");
+  result.textContent = "";
+  add(result, "section", "The map server is too busy; try again in a minute.", "failed");
 }
 explain();
 past();

@@ -39,6 +39,11 @@ class TestCreate(RobotContract):
             seen = drive(robot, Command(), 0.3)
             assert seen[-1].bumped is bumped
 
+    def test_the_battery_is_a_share_of_its_capacity(self, robot: Robot, emulator: Any) -> None:
+        assert drive(robot, Command(), 0.3)[-1].battery == pytest.approx(0.75)
+        emulator.charge = 2700  # a new battery holds a little more than it says
+        assert drive(robot, Command(), 0.3)[-1].battery == 1.0
+
     def test_counters_wrap_around(self, robot: Robot, emulator: Any) -> None:
         # 65536 counts are 29 m; a second before that.
         with emulator.wheels._lock:

@@ -14,7 +14,7 @@ from mapweave.agent.drivers.settings import CameraSettings, RobotSettings
 from mapweave.agent.drivers.waveshare import Waveshare
 from mapweave.agent.observation import Command
 from tests.agent.drivers.contract import RobotContract, drive
-from tests.agent.drivers.emulators import UgvHttp, UgvSerial
+from tests.agent.drivers.waveshare_emulators import UgvHttp, UgvSerial
 
 
 class TestUgvSerial(RobotContract):

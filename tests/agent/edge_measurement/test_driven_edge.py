@@ -34,14 +34,14 @@ def measured(start: NodeId, end: NodeId, start_from_end: Pose2, landmarks: int =
 
 
 class Notebook:
-    """A map into which surveyor are written."""
+    """A map into which traverses are written."""
 
     def __init__(self) -> None:
         self.map = HybridMap()
         self.numbers = iter(range(100, 200))
 
-    def note(self, *surveyor: Traverse) -> Edge:
-        for traverse in surveyor:
+    def note(self, *traverses: Traverse) -> Edge:
+        for traverse in traverses:
             edge = driven_edge(self.map, traverse, lambda: NodeId(*MAP, next(self.numbers)))
             self.map.apply(EdgePut(edge))
         return edge
@@ -53,7 +53,7 @@ def test_drives_both_ways_make_one_edge_with_counts():
     edge = book.note(there, back, there)
     assert (edge.a, edge.b, edge.kind) == (A, B, EdgeKind.DRIVEN)
     assert edge.evidence == {"there": 2.0, "back": 1.0, "inliers": 12.0}
-    assert list(book.map.edges) == [NodeId(*MAP, 100)], "one id, and none drawn in vain"
+    assert list(book.map.edges) == [NodeId(*MAP, 100)], "one id, and none drawn for nothing"
     assert edge.a_from_b.mean.vector == pytest.approx(TRUE.vector, abs=1e-9)
 
 

@@ -156,5 +156,5 @@ def test_a_node_is_refined_once_a_drive_when_the_robot_leaves_it():
     for name in ("pixels", "depths", "depth_sigmas"):
         assert np.array_equal(getattr(sent.node.landmarks, name), getattr(result.landmarks, name))
     assert refinement.see(fixes[0]) is not None, "B is left"
-    assert refinement.see(fixes[2]) is None, "A was told before"
+    assert refinement.see(fixes[2]) is None, "A was known before"
     assert refinement.see(None) is None, "another robot's node is not its own to mend"

@@ -45,7 +45,7 @@ class Drive:
 
     def __init__(self, seed: int = 0) -> None:
         self.rng = np.random.default_rng(seed)
-        self.surveyor = TraverseRecorder(ROBOT)
+        self.recorder = TraverseRecorder(ROBOT)
         self.pose = NODES[A]
         self.measured: list[Traverse] = []
 
@@ -64,12 +64,12 @@ class Drive:
             self.see(fix, odometry)
 
     def see(self, fix: Fix | None, odometry: Odometry = STEP) -> None:
-        traverse = self.surveyor.see(fix, Observation(0, odometry))
+        traverse = self.recorder.see(fix, Observation(0, odometry))
         if traverse is not None:
             self.measured.append(traverse)
 
     @property
-    def told(self) -> list[tuple[NodeId, NodeId]]:
+    def ends(self) -> list[tuple[NodeId, NodeId]]:
         return [(traverse.start, traverse.end) for traverse in self.measured]
 
 
@@ -77,9 +77,9 @@ def test_a_traverse_is_reported_when_the_next_node_is_reached():
     drive = Drive()
     drive.by(A, 20)
     drive.by(B, 10)
-    assert not drive.told, "the next node is in sight, but far"
+    assert not drive.ends, "the next node is in sight, but far"
     drive.by(B, 60)
-    assert drive.told == [(A, B)]
+    assert drive.ends == [(A, B)]
 
 
 def test_traverse_errors_match_the_covariance(monkeypatch):
@@ -111,16 +111,16 @@ def test_without_a_node_nearby_no_traverse_begins():
     drive.pose = Pose2(-0.8)
     drive.by(A, 10)
     drive.by(B, 130)
-    assert not drive.told
+    assert not drive.ends
 
 
-@pytest.mark.parametrize(("steps", "told"), [(20, [(A, B)]), (30, [])])
-def test_a_gap_without_landmarks_must_be_short(steps, told):
+@pytest.mark.parametrize(("steps", "ends"), [(20, [(A, B)]), (30, [])])
+def test_a_gap_without_landmarks_must_be_short(steps, ends):
     drive = Drive()
     drive.by(A, 10)
     drive.by(None, steps)
     drive.by(B, 60)
-    assert drive.told == told
+    assert drive.ends == ends
 
 
 def test_a_node_that_was_glimpsed_is_no_node():
@@ -128,7 +128,7 @@ def test_a_node_that_was_glimpsed_is_no_node():
     drive.by(A, 10)
     drive.by(B, 2)
     drive.by(C, 130)
-    assert drive.told == [(A, C)]
+    assert drive.ends == [(A, C)]
     assert drive.measured[0].start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[C]) < CERTAIN
 
 
@@ -138,9 +138,9 @@ def test_a_robot_lost_in_between_may_have_been_carried():
     drive.see(None)
     drive.pose = Pose2(1.5, 0.1)
     drive.by(B, 10)
-    assert not drive.told
+    assert not drive.ends
     drive.by(C, 100)
-    assert drive.told == [(B, C)], "from there on it measures again"
+    assert drive.ends == [(B, C)], "from there on it measures again"
 
 
 def test_a_detour_does_not_measure_the_straight_way():
@@ -148,7 +148,7 @@ def test_a_detour_does_not_measure_the_straight_way():
     drive.by(A, 10)
     drive.by(B, 60, Odometry(0.05, 2 * math.pi / 60))
     drive.by(B, 80)
-    assert not drive.told
+    assert not drive.ends
 
 
 def test_imprecise_traverses_are_not_reported(monkeypatch):
@@ -156,4 +156,4 @@ def test_imprecise_traverses_are_not_reported(monkeypatch):
     drive = Drive()
     drive.by(A, 20)
     drive.by(B, 60)
-    assert not drive.told
+    assert not drive.ends

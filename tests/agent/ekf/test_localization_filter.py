@@ -142,49 +142,6 @@ def test_landmarks_met_on_the_way() -> None:
     assert not behind.any()
 
 
-def test_handing_over_to_another_node_is_the_unscented_truth() -> None:
-    """Mean and covariance after rebase against samples of the whole state and of the edge."""
-    world = World(3)
-    filter_ = world.filter(world.near(), take=slice(0, 5))
-    world.drive(filter_, 40)
-    edge = PoseGaussian(Pose2(-0.4, 0.2, 0.3), np.diag([0.02, 0.01, 0.02]) ** 2)
-    state = filter_.state
-    mean = np.concatenate([state.pose_vector, state.rays.ravel()])
-    rng = np.random.default_rng(0)
-    samples = rng.multivariate_normal(mean, state.covariance, 6000)
-    edges = rng.multivariate_normal(np.zeros(3), edge.covariance, 6000)
-    moved = []
-    for sample, wobble in zip(samples, edges, strict=True):
-        new_from_node = edge.mean @ Pose2.from_vector(wobble)
-        rays = sample[3:].reshape(-1, 3)
-        points = np.column_stack([1 / rays[:, 2], -rays[:, 0] / rays[:, 2], -rays[:, 1] / rays[:, 2]])
-        there = new_from_node.apply(points)
-        seen = np.column_stack([-there[:, 1], -there[:, 2], np.ones(5)]) / there[:, :1]
-        moved.append([*(new_from_node @ Pose2.from_vector(sample[:3])).vector, *seen.ravel()])
-    filter_.rebase(edge)
-    assert len(filter_.ids) == 5
-    got = filter_.state
-    expected = np.cov(np.array(moved).T)
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        got.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.08
-    )
-    centre = np.concatenate([got.pose_vector, got.rays.ravel()])
-    np.testing.assert_allclose((centre - np.mean(moved, axis=0)) / scale, 0.0, atol=0.1)
-
-
-def test_handing_over_there_and_back() -> None:
-    world = World(4)
-    filter_ = world.filter(world.near())
-    before = filter_.state
-    edge = PoseGaussian(Pose2(-0.4, 0.2, 0.1), np.zeros((3, 3)))
-    filter_.rebase(edge)
-    filter_.rebase(edge.inverse())
-    np.testing.assert_allclose(filter_.state.covariance, before.covariance, atol=1e-10)
-    np.testing.assert_allclose(filter_.state.rays, before.rays, atol=1e-10)
-    np.testing.assert_allclose(filter_.state.pose_vector, before.pose_vector, atol=1e-10)
-
-
 def test_seeing_nothing_grows_the_covariance_and_ends_health() -> None:
     world = World(5)
     filter_ = world.filter(world.near())

@@ -92,7 +92,7 @@ def test_a_place_is_covered_by_its_nodes_fields_of_view():
 # What others have looked around at
 
 MAP = MapId("r0", 1)
-NOBODY = np.zeros((0, 2))
+NO_VIEWS = np.zeros((0, 2))
 
 
 def looks(x: float, y: float, headings: np.ndarray) -> np.ndarray:
@@ -104,23 +104,23 @@ ALL_AROUND = np.remainder(np.arange(0.0, math.tau, 0.9) + math.pi, math.tau) - m
 
 
 def test_any_robots_views_cover_a_place():
-    hearsay = FleetCoverage(MAP, 8.7)
-    assert hearsay.question(np.array([1.0, 2.0])) == WhatIsKnown(-1, MAP, 1.0, 2.0, 8.7)
+    coverage = FleetCoverage(MAP, 8.7)
+    assert coverage.question(np.array([1.0, 2.0])) == WhatIsKnown(-1, MAP, 1.0, 2.0, 8.7)
     theirs = np.concatenate([looks(3.0, 0.0, ALL_AROUND), looks(6.0, 0.0, ALL_AROUND[:4])])
-    hearsay.take(Answer(-1, KnownAnswer(theirs, "")))
-    places = hearsay.places(hearsay.views, 0.7, 0.75)
+    coverage.take(Answer(-1, KnownAnswer(theirs, "")))
+    places = coverage.places(coverage.views, 0.7, 0.75)
     assert np.unique(places, axis=0).tolist() == [[3.0, 0.0]]
     mine = looks(6.1, 0.0, ALL_AROUND[4:])
-    both = hearsay.places(np.concatenate([hearsay.views, mine]), 0.7, 0.75)
+    both = coverage.places(np.concatenate([coverage.views, mine]), 0.7, 0.75)
     assert np.unique(both, axis=0).tolist() == [[3.0, 0.0], [6.0, 0.0]]
 
 
 def test_a_server_that_does_not_answer_takes_nothing_back():
-    hearsay = FleetCoverage(MAP, 8.7)
-    assert hearsay.places(looks(0.0, 0.0, ALL_AROUND), 0.7, 0.75).shape == (0, 2)
-    hearsay.take(Answer(-1, KnownAnswer(looks(3.0, 0.0, ALL_AROUND), "")))
-    hearsay.take(Answer(-1, None, "no map server answered"))
-    assert len(hearsay.views) == len(ALL_AROUND)
+    coverage = FleetCoverage(MAP, 8.7)
+    assert coverage.places(looks(0.0, 0.0, ALL_AROUND), 0.7, 0.75).shape == (0, 2)
+    coverage.take(Answer(-1, KnownAnswer(looks(3.0, 0.0, ALL_AROUND), "")))
+    coverage.take(Answer(-1, None, "no map server answered"))
+    assert len(coverage.views) == len(ALL_AROUND)
 
 
 def corridor() -> OccupancyGrid:
@@ -141,23 +141,23 @@ def test_the_next_viewpoint_is_at_an_unvisited_place():
     def end(others: np.ndarray) -> np.ndarray:
         return next_viewpoint(floor, here, been, others, ExplorerSettings())[-1]
 
-    assert abs(end(NOBODY)[0]) > 1.7, "one of the two ends of what it has seen"
+    assert abs(end(NO_VIEWS)[0]) > 1.7, "one of the two ends of what it has seen"
     left = np.array([[-2.5, 0.0]])
     assert end(left)[0] > 1.7
     assert end(-left)[0] < -1.7
     # Where others are everywhere, the way on leads past them.
     assert abs(end(np.concatenate([left, -left]))[0]) > 1.7
     everywhere = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-1, 2)), axis=-1).reshape(-1, 2) * 1.0
-    assert next_viewpoint(floor, here, everywhere, NOBODY, ExplorerSettings()) == []
+    assert next_viewpoint(floor, here, everywhere, NO_VIEWS, ExplorerSettings()) == []
 
 
 def test_floor_behind_walls_attracts_no_exploration():
     """Along a corridor everything behind its walls is unknown for ever; a wide unknown end is worth more."""
     floor = corridor()
-    middle, end = floor.unknown_in_sight(np.array([[0.0, 0.0], [2.5, 0.0]]), NOBODY, 1.6, 3.0)
+    middle, end = floor.unknown_in_sight(np.array([[0.0, 0.0], [2.5, 0.0]]), NO_VIEWS, 1.6, 3.0)
     assert middle < 0.5
     assert end > 3.0
-    around = floor.unknown_around(1.6, NOBODY)
+    around = floor.unknown_around(1.6, NO_VIEWS)
     assert around[tuple(floor.cells(np.zeros(2)))] > 0.1, "which a square around it does not tell"
     result = floor.unknown_in_sight(np.array([[2.5, 0.0]]), np.array([[4.0, 0.0]]), 1.6, 3.0)
     assert result[0] < end
@@ -166,7 +166,7 @@ def test_floor_behind_walls_attracts_no_exploration():
 def test_visible_floor_agrees_with_a_test_of_each_cell():
     """Every cell is looked at along a line of its own, in steps of a centimetre."""
     floor, here, reach = corridor(), np.array([2.05, 0.35]), 2.5
-    unknown = floor.unknown_around(0.0, NOBODY) > 0.5
+    unknown = floor.unknown_around(0.0, NO_VIEWS) > 0.5
     occupied = floor.room() == 0.0
     area = 0.0
     for row, column in np.argwhere(unknown):
@@ -176,7 +176,7 @@ def test_visible_floor_agrees_with_a_test_of_each_cell():
             line = here + np.arange(0.0, 1.0, 0.01 / away)[:, None] * (cell - here)
             at = floor.cells(line)
             area += 0.01 * (not occupied[at[:, 0], at[:, 1]].any())
-    (result,) = floor.unknown_in_sight(here[None], NOBODY, 1.6, reach)
+    (result,) = floor.unknown_in_sight(here[None], NO_VIEWS, 1.6, reach)
     assert area > 2.0
     assert result == pytest.approx(area, rel=0.1)
 
@@ -184,10 +184,10 @@ def test_visible_floor_agrees_with_a_test_of_each_cell():
 def test_floor_that_others_know_is_not_unknown():
     """Against counting the cells of a square one by one."""
     floor, result = corridor(), np.array([[3.0, 1.0], [-4.0, 0.0]])
-    without, shares = floor.unknown_around(1.0, NOBODY), floor.unknown_around(1.0, result)
+    without, shares = floor.unknown_around(1.0, NO_VIEWS), floor.unknown_around(1.0, result)
     here = tuple(floor.cells(np.array([3.0, 0.0])))
     square = [np.array([3.0 + dx, dy]) for dx in np.arange(-10, 11) * 0.1 for dy in np.arange(-10, 11) * 0.1]
-    point = floor.unknown_around(0.0, NOBODY)
+    point = floor.unknown_around(0.0, NO_VIEWS)
     unknown = [point[tuple(floor.cells(p + 0.05))] > 0.5 for p in square]
     left = [u and math.dist(p + 0.05, result[0] + 0.05) > 1.0 for u, p in zip(unknown, square, strict=True)]
     assert without[here] == pytest.approx(np.mean(unknown), abs=1e-6)

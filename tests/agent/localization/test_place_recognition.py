@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.localization import place_recognition
-from mapweave.agent.localization.place_recognition import lookalikes, recognise_place, recognise_places
+from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, NodeId
@@ -47,9 +47,7 @@ def test_a_view_is_recognised_where_it_was_taken(world, tour, own_map, seed):
     near = tour[int(rng.integers(len(tour)))]
     true = near @ Pose2(*rng.uniform([-0.3, -0.3, -0.2], [0.3, 0.3, 0.2]))
     view, _ = take_view(world, true, rng)
-    places = recognise_place(own_map, view, rng)
-    assert places is not None
-    node, recognition = places
+    node, recognition = recognise_places(own_map, view, rng)[0]
     place = tour[(node.id.number - 1) // 2]
     answered = place @ recognition.node_from_robot.mean
     assert answered.distance(true) < 0.10
@@ -63,9 +61,7 @@ def test_the_node_with_the_most_inliers_is_named(world, tour, own_map, monkeypat
     monkeypatch.setattr(place_recognition, "VOTES", 1)
     rng = np.random.default_rng(3)
     view, _ = take_view(world, tour[3], rng)
-    places = recognise_place(own_map, view, rng)
-    assert places is not None
-    assert places[0].id.number == 2 * 3 + 1
+    assert recognise_places(own_map, view, rng)[0][0].id.number == 2 * 3 + 1
 
 
 def test_a_room_that_was_never_mapped_is_not_recognised(own_map):
@@ -74,38 +70,36 @@ def test_a_room_that_was_never_mapped_is_not_recognised(own_map):
         elsewhere = room(0, 0, 5, 4, 900, rng)
         view, _ = take_view(elsewhere, Pose2(2.5, 2.0, float(rng.uniform(-3, 3))), rng)
         assert len(view) > 50
-        assert recognise_place(own_map, view, rng) is None
+        assert not recognise_places(own_map, view, rng)
 
 
 def test_nothing_to_recognise(world, own_map):
     rng = np.random.default_rng(0)
     view, _ = take_view(world, Pose2(2.5, 2.0), rng)
     empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), CAMERA)
-    assert recognise_place(HybridMap(), view, rng) is None
-    assert recognise_place(own_map, empty, rng) is None
+    assert not recognise_places(HybridMap(), view, rng)
+    assert not recognise_places(own_map, empty, rng)
     (first, *_) = own_map.nodes.values()
     bare = HybridMap([NodePut(replace(first, landmarks=Landmarks.empty()))])
-    assert recognise_place(bare, view, rng) is None
+    assert not recognise_places(bare, view, rng)
     also_bare = HybridMap(
         [*own_map.contents(), NodePut(replace(first, id=NodeId("r0", 1, 999), landmarks=Landmarks.empty()))]
     )
-    assert recognise_place(also_bare, view, rng) is not None
+    assert recognise_places(also_bare, view, rng)
 
 
 @pytest.mark.parametrize(("limit", "value"), [("VOTES", 10_000), ("TRIES", 0), ("LEAST_INLIERS", 10_000)])
 def test_the_limits_are_heeded(world, own_map, monkeypatch, limit, value):
     rng = np.random.default_rng(0)
     view, _ = take_view(world, Pose2(2.5, 2.0, 0.05), rng)
-    assert recognise_place(own_map, view, rng) is not None
+    assert recognise_places(own_map, view, rng)
     monkeypatch.setattr(place_recognition, limit, value)
-    assert recognise_place(own_map, view, rng) is None
+    assert not recognise_places(own_map, view, rng)
 
 
 def test_the_same_chance_gives_the_same_answer(world, own_map):
     view, _ = take_view(world, Pose2(22.1, 2.4, 1.0), np.random.default_rng(0))
-    a, b = (recognise_place(own_map, view, np.random.default_rng(5)) for _ in range(2))
-    assert a is not None
-    assert b is not None
+    a, b = (recognise_places(own_map, view, np.random.default_rng(5))[0] for _ in range(2))
     assert a[0].id == b[0].id
     assert np.array_equal(a[1].pairs, b[1].pairs)
     assert a[1].node_from_robot.mean == b[1].node_from_robot.mean
@@ -128,10 +122,10 @@ def test_two_similar_places_are_reported_and_neighbours_are_not(world, own_map):
     far, near = recalled(3.0), recalled(0.2)
     share = far[1][1].inliers / far[0][1].inliers
     assert 0.3 < share < 0.7
-    result = lookalikes(far, 0.9 * share, 0.5)
+    result = aliased_places(far, 0.9 * share, 0.5)
     assert result is not None
     assert [a.id.number for a in result] == [node.id.number, 99]
-    assert lookalikes(far, 1.1 * share, 0.5) is None, "it is not seen about as well"
-    assert lookalikes(near, 0.9 * share, 0.5) is None, "it is not elsewhere"
-    assert lookalikes(far[:1], 0.1, 0.5) is None
-    assert lookalikes([], 0.1, 0.5) is None
+    assert aliased_places(far, 1.1 * share, 0.5) is None, "it is not seen about as well"
+    assert aliased_places(near, 0.9 * share, 0.5) is None, "it is not elsewhere"
+    assert aliased_places(far[:1], 0.1, 0.5) is None
+    assert aliased_places([], 0.1, 0.5) is None

@@ -40,7 +40,7 @@ def test_slightly_wrong_wheels_are_accepted(moves, longer, wider):
         (lambda m: Odometry(2.0 * m.forward, m.turn), True),  # wheels that spin
     ],
 )
-def test_stories_that_cannot_both_be_true(wheels, disputed):
+def test_wheels_and_images_that_cannot_both_be_right(wheels, disputed):
     moves = [Odometry(0.02, 0.03)] * 40
     dispute, true = drive(moves, wheels)
     assert dispute.with_filter(true) == disputed

@@ -85,4 +85,4 @@ def test_a_new_anchor_sees_the_same_world():
     assert (pixels[:, 0] == [10.0, 1.5]).all()
     assert np.isfinite(pixels[4, 2]).all()
     history.reanchor(Pose2(), np.array([3]))
-    assert len(history.observations(np.array([3]))[0]) == 1, "a view with no living track is forgotten"
+    assert len(history.observations(np.array([3]))[0]) == 1, "a view with no active track is forgotten"

@@ -125,7 +125,7 @@ def test_landmarks_occluded_by_a_person_are_found_again(walls, description):
         seen = walls.observe(before, pose, tick)
         tracking.step(replace(seen, image=past(seen.image, tick - 11)))
         fewest = min(fewest, len(ids & set(tracking.ids.tolist())))
-    assert fewest < 0.75 * len(ids), "somebody was in the way"
+    assert fewest < 0.75 * len(ids), "a person was in the way"
     back = ids & set(tracking.ids.tolist())
     assert len(back) >= 0.8 * len(ids)
     off = tracking.pose.mean.inverse() @ pose

@@ -98,12 +98,12 @@ def test_a_mapped_drive_records_the_trajectory(walls, clocked):
         before = Pose2(x)
     mapper.finish(observation)
     (node,) = mapper.map.nodes.values()
-    ticks = np.rint((node.wake.ages * 1e9 + node.stamp_ns) / 1e8).astype(int)
+    ticks = np.rint((node.segment.ages * 1e9 + node.stamp_ns) / 1e8).astype(int)
     assert len(ticks) == 3 and (np.diff(ticks) == 10).all()
     true = np.array(way)[ticks - 1]
-    assert node.wake.node_from_robot[:, 0] == pytest.approx(true, abs=0.01)
-    assert node.wake.node_from_robot[:, 1:] == pytest.approx(0.0, abs=0.02)
-    assert node.wake.distances[:, 0] == pytest.approx(true + clocked.radius)
+    assert node.segment.node_from_robot[:, 0] == pytest.approx(true, abs=0.01)
+    assert node.segment.node_from_robot[:, 1:] == pytest.approx(0.0, abs=0.02)
+    assert node.segment.distances[:, 0] == pytest.approx(true + clocked.radius)
     # The next node begins with none of it.
     mapper.finish(replace(observation, stamp_ns=observation.stamp_ns + 1))
-    assert sum(len(one.wake) for one in mapper.map.nodes.values()) == 3
+    assert sum(len(one.segment) for one in mapper.map.nodes.values()) == 3

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.drive_statistics import DriveStatistics
 from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.blocked_edges import BlockedEdges
 from mapweave.agent.navigation.navigator import Stage
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.settings import NavigatorSettings
+from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
@@ -118,8 +118,8 @@ def test_endless_parking_is_retried_before_it_is_a_block(home):
 
     trial = Trial(nav, eyes, fleet, held=True)
     trial.run(20.0, lambda: len(routes) == 3)
-    assert [question.blocked for question in routes] == [(), (), ((A, B),)], "nobody is told at first"
-    assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself anew"
+    assert [question.blocked for question in routes] == [(), (), ((A, B),)], "no robot is informed at first"
+    assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself rebuilt"
 
 
 def test_blocks_are_kept_for_a_time_that_doubles():

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.recording import reduced
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.vision.equidistant import Equidistant
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive
 
 KNOWN = COUNT - 1
@@ -114,6 +116,29 @@ def test_kitti_and_euroc_say_what_camera_it_is_but_not_how_high(
     assert recording.camera == drive.camera
 
 
+def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+    euroc(drive, tmp_path)
+    sensor = tmp_path / "mav0" / "cam0" / "sensor.yaml"
+    text = sensor.read_text().replace("radial-tangential", "equidistant")
+    sensor.write_text(text.replace("[0.0, 0.0, 0.0, 0.0]", "[-0.02, 0.004, -0.003, 0.0005]"))
+    options = RecordingOptions(odometry=poses_file, camera_height=0.3)
+    recording = open_recording(tmp_path, options)
+    c = drive.camera
+    lens = Equidistant(c.fx, c.fy, c.cx, c.cy, (-0.02, 0.004, -0.003, 0.0005))
+    assert (recording.camera, recording.distortion) == (lens.ideal(320, 240, 0.3), lens)
+    # Kalibr's camera.toml by hand gives the same.
+    camera = tmp_path / "own" / "camera.toml"
+    camera.parent.mkdir()
+    camera.write_text(CAMERA_TOML + 'lens = "equidistant"\ndistortion = [-0.02, 0.004, -0.003, 0.0005]\n')
+    assert read_camera(camera) == (recording.camera, recording.distortion)
+    sensor.write_text(text.replace("[0.0, 0.0, 0.0, 0.0]", "[-0.9, 0.0, 0.0, 0.0]"))
+    with pytest.raises(DeviceError, match=r"sensor.yaml: camera: an equidistant lens .* folds"):
+        open_recording(tmp_path, options)
+    sensor.write_text(text.replace("equidistant", "omni"))
+    with pytest.raises(DeviceError, match="lens model omni is not supported; radial-tangential and equid"):
+        open_recording(tmp_path, options)
+
+
 def test_without_odometry_nothing_is_guessed(drive: Drive, tmp_path: Path) -> None:
     euroc(drive, tmp_path)
     with pytest.raises(DeviceError, match="EuRoC, 9 images, but no odometry: give --odometry FILE"):
@@ -138,10 +163,31 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
         assert error.mean() < 3.0, "not the same frame"
 
 
+def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+    """The wheels go on for seven seconds. The map is of what was seen."""
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    tum_rgbd(drive, folder)
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    last = poses_file.read_text().splitlines()[-1].split(" ", 1)
+    at = drive.stamps_ns[-1] / 1e9 + 7.0
+    poses_file.write_text(poses_file.read_text() + f"{at:.9f} {last[1]}\n")
+    recording = open_recording(folder, RecordingOptions(camera=tmp_path / "camera.toml", odometry=poses_file))
+    assert len(recording) == COUNT
+    assert recording.notes == ("the camera is silent for 7.0 s, 1.6 s after its first image",)
+
+
 def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
     kitti(drive, tmp_path)
     with pytest.raises(DeviceError, match="do not overlap: they must be of one clock"):
         open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=1.65))
+
+
+def test_a_fisheye_is_reduced_with_its_image() -> None:
+    lens = Equidistant(300.0, 301.0, 400.5, 310.5, (-0.02, 0.004, -0.003, 0.0005))
+    pixels = np.array([[100.0, 80.0], [402.0, 300.0]])
+    rays = lens.rays(pixels)
+    assert np.allclose(lens.reduced(3).project(rays), (pixels + 0.5) / 3 - 0.5, atol=1e-9)
 
 
 def test_a_large_image_is_reduced_with_its_camera(drive: Drive) -> None:
@@ -159,7 +205,7 @@ def test_a_large_image_is_reduced_with_its_camera(drive: Drive) -> None:
     [
         ("1 2 3\n", "line 1: a pose is `stamp x y z qx qy qz qw`"),
         ("", "0 poses; there must be two or more"),
-        ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "all finite"),
+        ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "line 2: all numbers must be finite"),
         ("# only a comment\n1 0 0 0 0 0 0 1\n", "1 poses"),
     ],
 )

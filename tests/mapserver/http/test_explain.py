@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
@@ -19,26 +18,15 @@ from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.desks import Desk, two_maps
+from tests.mapserver.stub_services import StubServices, two_maps
 from tests.waiting import eventually
 
-TOLD = "return document.getElementById('told').textContent"
-LINKS = "return [...document.querySelectorAll('#told a')].map(a => a.textContent)"
+RESULT = "return document.getElementById('result').textContent"
+LINKS = "return [...document.querySelectorAll('#result a')].map(a => a.textContent)"
 
 
 def count(kind: str) -> str:
     return f"return document.querySelectorAll('svg {kind}').length"
-
-
-@pytest.fixture
-def desk() -> Desk:
-    return Desk()
-
-
-@pytest.fixture
-def served(desk: Desk) -> Iterator[Web]:
-    with Web(("127.0.0.1", 0), desk) as served:
-        yield served
 
 
 def ask(served: Web, query: str, of: str = "explain") -> tuple[int, dict]:
@@ -83,8 +71,8 @@ def test_unknown_nodes_are_reported_in_one_line(served: Web, query: str, words: 
     assert status == 400 and words in result["error"] and "\n" not in result["error"]
 
 
-def test_a_busy_server_gives_a_retry_time(served: Web, desk: Desk) -> None:
-    desk.refusal = Busy(0.5)
+def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices) -> None:
+    services.refusal = Busy(0.5)
     status, result = ask(served, "")
     assert status == 503 and result["retry_after"] == 0.5
 
@@ -93,28 +81,28 @@ def test_a_busy_server_gives_a_retry_time(served: Web, desk: Desk) -> None:
 def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: pytest.TempPathFactory) -> None:
     with Browser(tmp_path_factory.mktemp("profile")) as page:
         page.open(f"http://127.0.0.1:{served.port}/why")
-        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(RESULT))
         a, b = (NodeId.parse(word) for word in page.run(LINKS)[0].split(" - "))
-        page.run("document.querySelector('#told a').click()")
-        eventually(lambda: f"{a} and {b}: linked: " in page.run(TOLD))
+        page.run("document.querySelector('#result a').click()")
+        eventually(lambda: f"{a} and {b}: linked: " in page.run(RESULT))
         explanation = explain_nodes(two_maps(), a, b)
         assert page.run(count(".agree")) == len(explanation.shared)
         assert page.run(count(".alike")) == len(explanation.matches) - len(explanation.shared)
         assert page.run(count("circle")) == len(explanation.a.landmarks) + len(explanation.b.landmarks)
-        assert f"{explanation.a_from_b.mean.x:.3f} m ahead" in page.run(TOLD)
+        assert f"{explanation.a_from_b.mean.x:.3f} m ahead" in page.run(RESULT)
         # The address shows the same page at once, and the back button works.
         address = page.run("return location.href")
         assert address.endswith(f"/why?a={a}&b={b}")
         page.run("document.getElementById('all').click()")
-        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(RESULT))
         page.open(address)
-        eventually(lambda: f"{a} and {b}: linked: " in page.run(TOLD))
+        eventually(lambda: f"{a} and {b}: linked: " in page.run(RESULT))
         page.open(f"http://127.0.0.1:{served.port}/why?a=r1.1&b=%20r0.1%20")
-        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(RESULT))
         assert page.run("return [a, b].map(one => one.value)") == ["r1.1", "r0.1"]
         page.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=%3Cb%3Ex")
-        eventually(lambda: "neither a node nor a map" in page.run(TOLD))
-        assert page.run("return document.querySelector('#told b')") is None
+        eventually(lambda: "neither a node nor a map" in page.run(RESULT))
+        assert page.run("return document.querySelector('#result b')") is None
         assert page.run("return document.querySelectorAll('b').length") == 0
 
 
@@ -133,28 +121,28 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(
         page.type("#a", str(start))
         page.type("#b", str(goal))
         page.run("document.querySelector('[name=route]').click()")
-        eventually(lambda: f"{start} to {goal}: the route is: {explanation.reason}" in page.run(TOLD))
+        eventually(lambda: f"{start} to {goal}: the route is: {explanation.reason}" in page.run(RESULT))
         assert page.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in explanation.hops]
         address = page.run("return location.href")
         assert address.endswith(f"/why?a={start}&b={goal}&route=1")
         page.open(f"http://127.0.0.1:{served.port}/why")
         page.open(address)
-        eventually(lambda: f"{start} to {goal}: the route is" in page.run(TOLD))
-        page.run("document.querySelector('#told a').click()")
-        eventually(lambda: f"{explanation.hops[0].a} and {explanation.hops[0].b}: " in page.run(TOLD))
+        eventually(lambda: f"{start} to {goal}: the route is" in page.run(RESULT))
+        page.run("document.querySelector('#result a').click()")
+        eventually(lambda: f"{explanation.hops[0].a} and {explanation.hops[0].b}: " in page.run(RESULT))
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_the_history_is_listed_newest_first(
-    served: Web, desk: Desk, tmp_path_factory: pytest.TempPathFactory
+    served: Web, services: StubServices, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     shown = "return [...document.querySelectorAll('#past li')].map(one => one.textContent)"
     hidden = "return document.getElementById('past').hidden"
     with Browser(tmp_path_factory.mktemp("profile")) as page:
         page.open(f"http://127.0.0.1:{served.port}/why")
-        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(RESULT))
         assert page.run(hidden) and page.run(shown) == []
-        desk.happenings = (
+        services.events = (
             MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now"),
             MapEvent(10**18 + 7 * 10**9, MapEventKind.PARTED, "<b>x"),
         )
@@ -166,11 +154,11 @@ def test_the_history_is_listed_newest_first(
         ]
 
 
-def test_the_history_is_listed_with_times(served: Web, desk: Desk) -> None:
-    desk.happenings = (MapEvent(10**18, MapEventKind.RULED, "no"),)
+def test_the_history_is_listed_with_times(served: Web, services: StubServices) -> None:
+    services.events = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no"),)
     with urlopen(f"http://127.0.0.1:{served.port}/history", timeout=20) as reply:
         (event,) = json.load(reply)["history"]
-    assert event == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "ruled", "words": "no"}
+    assert event == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "constrained", "words": "no"}
 
 
 def test_a_way_leads_from_node_to_node(served: Web) -> None:

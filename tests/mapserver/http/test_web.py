@@ -2,62 +2,25 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import math
 import re
-import resource
 import socket
 import struct
 import time
 import tracemalloc
 import zlib
-from collections.abc import Iterator
-from email.message import Message
 
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.errors import Busy, NotConnected, SettingsError
-from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.mapserver.http import serving, web
-from mapweave.mapserver.http.serving import Limits
-from mapweave.mapserver.http.web import MOST_BYTES, Web, parse_address
-from tests.mapserver.desks import ANSWER, Desk, picture
-from tests.waiting import eventually
+from mapweave.hybridmap.errors import Busy
+from mapweave.mapserver.http.web import Web
+from tests.mapserver.http.client import ask, post
+from tests.mapserver.stub_services import ANSWER, StubServices, picture
 
 
-@pytest.fixture
-def desk() -> Desk:
-    return Desk()
-
-
-@pytest.fixture
-def served(desk: Desk) -> Iterator[Web]:
-    with Web(("127.0.0.1", 0), desk) as served:
-        yield served
-
-
-def ask(
-    served: Web, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
-) -> tuple[int, Message, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
-    connection.request(method, path, body, headers or {})
-    reply = connection.getresponse()
-    content = reply.read()
-    connection.close()
-    return reply.status, reply.headers, content
-
-
-def post(served: Web, query: str = "", body: bytes | None = None, **headers: str) -> tuple[int, dict]:
-    status, got, content = ask(served, "POST", f"/relocalize{query}", body or picture(), headers)
-    assert got["Content-Type"] == "application/json"
-    assert content.endswith(b"\n")
-    assert content.count(b"\n") == 1
-    return status, json.loads(content)
-
-
-def test_an_image_in_and_json_out(served: Web, desk: Desk) -> None:
+def test_an_image_in_and_json_out(served: Web, services: StubServices) -> None:
     for kind in (".png", ".jpg"):
         status, answer = post(served, body=picture(kind=kind))
         assert status == 200
@@ -69,37 +32,37 @@ def test_an_image_in_and_json_out(served: Web, desk: Desk) -> None:
         assert pose["sigma"] == pytest.approx([0.02, 0.02, 0.01])
         assert np.sqrt(np.diag(pose["covariance"])).tolist() == pose["sigma"]
         assert (place["merged_from_robot"], place["inliers"]) == (None, 31)
-    assert all(len(view) > 20 for view in desk.views)
+    assert all(len(view) > 20 for view in services.views)
 
 
-def test_the_camera_as_it_is_given(served: Web, desk: Desk) -> None:
+def test_the_camera_as_it_is_given(served: Web, services: StubServices) -> None:
     assert post(served, "?hfov=90&height_m=0.3&forward_m=0.1")[0] == 200
-    camera = desk.views[-1].camera
+    camera = services.views[-1].camera
     assert (camera.width, camera.height) == (160, 120)
     assert (camera.fx, camera.fy) == pytest.approx((80.0, 80.0))
     assert (camera.cx, camera.cy, camera.mount_height, camera.mount_forward) == (79.5, 59.5, 0.3, 0.1)
     assert post(served, "?fx=100&fy=101&cx=70&cy=60&mount_height=0.5")[0] == 200
-    camera = desk.views[-1].camera
+    camera = services.views[-1].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.mount_height) == (100, 101, 70, 60, 0.5)
     assert post(served)[0] == 200
-    camera = desk.views[-1].camera
+    camera = services.views[-1].camera
     assert camera.mount_height == 1.4
     # The longer side of an image of unknown origin, held upright or not.
     assert math.degrees(2 * math.atan(80 / camera.fx)) == pytest.approx(69.4)
     assert post(served, body=picture(120, 160))[0] == 200
-    assert desk.views[-1].camera.fx == pytest.approx(camera.fx)
+    assert services.views[-1].camera.fx == pytest.approx(camera.fx)
 
 
-def test_a_large_image_is_made_smaller_with_its_camera(served: Web, desk: Desk) -> None:
+def test_a_large_image_is_made_smaller_with_its_camera(served: Web, services: StubServices) -> None:
     assert (
         post(served, "?fx=1000&cx=800&cy=600&width=2048&height=1536", picture(2048, 1536, ".jpg"))[0] == 200
     )
-    camera = desk.views[-1].camera
+    camera = services.views[-1].camera
     assert (camera.width, camera.height) == (1024, 768)
     assert (camera.fx, camera.cx, camera.cy) == pytest.approx((500, 399.75, 299.75))
     # The same camera said for the full size of an image that was sent small.
     assert post(served, "?fx=1000&cx=800&cy=600&width=2048&height=1536", picture(512, 384))[0] == 200
-    assert desk.views[-1].camera.fx == pytest.approx(250)
+    assert services.views[-1].camera.fx == pytest.approx(250)
 
 
 def form(*parts: tuple[str, bytes], boundary: str = "frontier") -> tuple[bytes, dict[str, str]]:
@@ -114,20 +77,20 @@ def form(*parts: tuple[str, bytes], boundary: str = "frontier") -> tuple[bytes, 
     }
 
 
-def test_a_form_with_a_camera_file(served: Web, desk: Desk) -> None:
+def test_a_form_with_a_camera_file(served: Web, services: StubServices) -> None:
     toml = b"width = 160\nheight = 120\nfx = 99.0\nfy = 98.0\ncx = 80\ncy = 60\nheight_m = 0.3\n"
     as_json = json.dumps({"fx": 99.0, "fy": 98.0, "distortion": [0.1, 0, 0, 0, 0]}).encode()
     for camera in (toml, as_json):
         body, headers = form(("image", picture()), ("camera", camera), ("forward_m", b"0.2"))
         assert post(served, body=body, **headers)[0] == 200
-        camera_used = desk.views[-1].camera
+        camera_used = services.views[-1].camera
         assert (camera_used.fx, camera_used.fy, camera_used.mount_forward) == (99.0, 98.0, 0.2)
     # An image that holds the boundary's beginning and bare line ends comes whole.
     odd = picture() + b"\r\n--fro\r\n\n\r--\r\n"
     body, headers = form(("image", odd))
-    plain = desk.views[-1]
+    plain = services.views[-1]
     assert post(served, "?fx=99&fy=98", body=body, **headers)[0] == 200
-    assert np.array_equal(desk.views[-1].codes, plain.codes)
+    assert np.array_equal(services.views[-1].codes, plain.codes)
 
 
 @pytest.mark.parametrize(
@@ -235,11 +198,11 @@ def test_a_camera_is_flat(served: Web, camera: bytes) -> None:
     )
 
 
-def test_a_camera_with_remarks(served: Web, desk: Desk) -> None:
+def test_a_camera_with_remarks(served: Web, services: StubServices) -> None:
     toml = b"# phone\r\nfx = 99.0  # px\n\nfy = 1_00\ndistortion = [0.1, -2e-2, 0, 0, 0,]\n"
     body, headers = form(("image", picture()), ("camera", toml))
     assert post(served, body=body, **headers)[0] == 200
-    assert (desk.views[-1].camera.fx, desk.views[-1].camera.fy) == (99.0, 100.0)
+    assert (services.views[-1].camera.fx, services.views[-1].camera.fy) == (99.0, 100.0)
 
 
 def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
@@ -264,11 +227,11 @@ def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
     ],
 )
 def test_pages_of_other_sites_are_refused(
-    served: Web, desk: Desk, headers: dict[str, str], words: str
+    served: Web, services: StubServices, headers: dict[str, str], words: str
 ) -> None:
     status, answer = post(served, **headers)
     assert status == 403 and words in answer["error"]
-    assert not desk.views
+    assert not services.views
     for path in ("/", "/why", "/status", "/history", "/explain", "/nothing"):
         status, _, content = ask(served, "GET", path, headers=headers)
         assert status == 403 and words in json.loads(content)["error"]
@@ -286,15 +249,17 @@ def test_own_pages_ask_by_any_name_of_this_machine(served: Web, host: str) -> No
         assert post(served, **headers)[0] == 200
 
 
-def test_a_busy_server_gives_a_retry_time(served: Web, desk: Desk) -> None:
-    desk.refusal = Busy(1.26)
+def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices) -> None:
+    services.refusal = Busy(1.26)
     status, headers, content = ask(served, "POST", "/relocalize", picture())
     assert (status, headers["Retry-After"]) == (503, "2")
     assert json.loads(content) == {"error": "busy, retry after 1.3 s", "retry_after": 1.26}
 
 
-def test_a_defect_is_answered_and_logged(served: Web, desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
-    desk.refusal = ZeroDivisionError("a defect")
+def test_a_defect_is_answered_and_logged(
+    served: Web, services: StubServices, caplog: pytest.LogCaptureFixture
+) -> None:
+    services.refusal = ZeroDivisionError("a defect")
     assert post(served) == (500, {"error": "the server failed: a defect"})
     assert "ZeroDivisionError" in caplog.text
 
@@ -337,158 +302,6 @@ def test_missing_pages(served: Web, method: str, path: str, status: int) -> None
     assert json.loads(content)["error"]
 
 
-def raw(served: Web, data: bytes, close: bool = False) -> bytes:
-    """Send bytes as they are and read to the end."""
-    with socket.create_connection(("127.0.0.1", served.port), timeout=20) as connection:
-        connection.sendall(data)
-        if close:
-            connection.shutdown(socket.SHUT_WR)
-        got = b""
-        while piece := connection.recv(65536):
-            got += piece
-    return got
-
-
-@pytest.mark.parametrize(
-    ("head", "status"),
-    [
-        (b"Content-Length: 99999999999\r\n", b"413"),
-        (b"Content-Length: %d\r\nExpect: 100-continue\r\n" % (MOST_BYTES + 1), b"413"),
-        (b"Content-Length: -1\r\n", b"400"),
-        (b"Transfer-Encoding: chunked\r\n", b"411"),
-        (b"", b"411"),
-        (b"Content-Length: 0\r\n", b"400"),
-    ],
-)
-def test_lengths_that_are_refused_before_anything_is_read(served: Web, head: bytes, status: bytes) -> None:
-    got = raw(served, b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\n" + head + b"\r\n")
-    assert got.startswith(b"HTTP/1.1 " + status)
-    assert b'{"error":' in got
-    assert got.count(b"HTTP/1.1") == 1
-
-
-def test_a_too_long_request_gets_an_answer(served: Web) -> None:
-    status, answer = post(served, body=bytes(MOST_BYTES + 1))
-    assert (status, answer) == (413, {"error": "at most 16 MiB are taken"})
-
-
-HALF = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nabc"
-
-
-def test_closed_or_slow_connections_block_no_other(desk: Desk) -> None:
-    with Web(("127.0.0.1", 0), desk, patience=0.5) as served:
-        # No client is left to read an answer.
-        assert raw(served, HALF, close=True) == b""
-        slow = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(web.MOST_AT_ONCE)]
-        for connection in slow:
-            connection.sendall(HALF)
-        begin = time.monotonic()
-        # All places are taken for a moment; the page is there all the same.
-        assert ask(served, "GET", "/")[0] == 200
-        while post(served)[0] != 200:
-            assert time.monotonic() < begin + 15.0
-            time.sleep(0.05)
-        assert slow[0].recv(65536).startswith(b"HTTP/1.1 408")
-        for connection in slow:
-            connection.close()
-
-
-def test_a_byte_now_and_then_takes_no_longer_than_anything_else(desk: Desk) -> None:
-    with (
-        Web(("127.0.0.1", 0), desk, patience=0.5) as served,
-        socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
-    ):
-        slow.sendall(HALF)
-        assert drip(slow, b"x").startswith(b"HTTP/1.1 408")
-
-
-def test_a_head_that_never_ends_is_dropped(desk: Desk) -> None:
-    with (
-        Web(("127.0.0.1", 0), desk, limits=Limits(head=0.5)) as served,
-        socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
-    ):
-        slow.sendall(b"GET /status HTTP/1.1\r\nHost: localhost\r\nX: ")
-        assert drip(slow, b"x") == b""
-
-
-def test_a_client_that_reads_nothing_is_dropped(desk: Desk) -> None:
-    desk.happenings = (MapEvent(10**18, MapEventKind.RULED, "no" * 2000),) * 3000
-    with (
-        Web(("127.0.0.1", 0), desk, limits=Limits(stall=0.5)) as served,
-        socket.socket() as slow,
-    ):
-        slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        slow.connect(("127.0.0.1", served.port))
-        slow.sendall(b"GET /history HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        eventually(lambda: served.connections == 1)
-        eventually(lambda: served.connections == 0)
-        assert len(ask(served, "GET", "/history")[2]) > 10_000_000
-
-
-def drip(connection: socket.socket, piece: bytes) -> bytes:
-    """Send a little now and then until there is an answer, or the end of the connection."""
-    begin = time.monotonic()
-    connection.settimeout(0.1)
-    while time.monotonic() < begin + 5.0:
-        try:
-            connection.sendall(piece)
-            return connection.recv(65536)
-        except TimeoutError:
-            continue
-        except ConnectionError:
-            return b""
-    raise AssertionError("it may go on for ever")
-
-
-def test_thousands_of_half_open_connections_block_no_other(served: Web) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
-    half = []
-    try:
-        for k in range(2000):
-            half.append(socket.create_connection(("127.0.0.1", served.port), timeout=20))
-            half[-1].sendall(
-                (b"", b"G", b"GET / HTTP/1.1\r\n", b"POST /relocalize HTTP/1.1\r\nHost: x")[k % 4]
-            )
-        begin = time.monotonic()
-        assert post(served)[0] == 200
-        assert ask(served, "GET", "/status")[0] == 200
-        assert time.monotonic() < begin + 5.0
-        assert served.connections <= serving.MAX_WAITING + 2
-    finally:
-        for connection in half:
-            connection.close()
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-@pytest.mark.parametrize(
-    ("head", "status"),
-    [
-        (b"Content-Length: 3\r\nTransfer-Encoding: chunked\r\n", b"400"),
-        (b"Content-Length: 3\r\nContent-Length: 4\r\n", b"400"),
-        (b"Transfer-Encoding: chunked\r\nTransfer-Encoding: identity\r\n", b"400"),
-        (b"Content-Length : 3\r\n", b"400"),
-        (b"Content-Length: +3\r\n", b"400"),
-        (b"Content-Length: 3\r\n X: y\r\n", b"400"),
-        (b"X: a\x00b\r\nContent-Length: 3\r\n", b"400"),
-    ],
-)
-def test_ambiguous_requests_are_answered_once(served: Web, head: bytes, status: bytes) -> None:
-    """What stands behind the first request is never taken for a second one."""
-    got = raw(
-        served,
-        b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\n" + head + b"\r\nabc"
-        b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n",
-    )
-    assert got.startswith(b"HTTP/1.1 " + status) and got.count(b"HTTP/1.1 ") == 1
-    assert b'{"error":' in got
-
-
-def test_one_request_a_connection(served: Web) -> None:
-    got = raw(served, b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
-    assert got.count(b"HTTP/1.1 200") == 1 and b"\r\nconnection: close\r\n" in got.lower()
-
-
 def test_pages_load_nothing_but_files_of_this_server(served: Web) -> None:
     for path in ("/", "/why", "/static/why.js", "/static/photo.css", "/status", "/nothing"):
         _, headers, content = ask(served, "GET", path)
@@ -496,48 +309,3 @@ def test_pages_load_nothing_but_files_of_this_server(served: Web) -> None:
         assert (headers["X-Content-Type-Options"], headers["Cache-Control"]) == ("nosniff", "no-store")
         assert headers["Server"] == "Mapweave"
         assert not re.search(rb"<script(?! src=)|<style| on[a-z]+=|javascript:", content)
-
-
-def test_a_server_that_is_closed_leaves_nothing_behind(desk: Desk) -> None:
-    with Web(("127.0.0.1", 0), desk) as served, socket.create_connection(("127.0.0.1", served.port)) as half:
-        half.sendall(HALF)
-        eventually(lambda: served.connections == 1)
-        begin = time.monotonic()
-        served.close()
-        assert time.monotonic() < begin + 5.0
-        served.close()
-        with Web(("127.0.0.1", served.port), desk) as again:
-            assert ask(again, "GET", "/status")[0] == 200
-
-
-def test_noise_instead_of_http(served: Web) -> None:
-    rng = np.random.default_rng(3)
-    for length in (1, 50, 5000):
-        raw(served, rng.bytes(length) + b"\r\n\r\n", close=True)
-    assert post(served)[0] == 200
-
-
-@pytest.mark.parametrize(
-    ("text", "address"),
-    [
-        ("8080", ("127.0.0.1", 8080)),
-        ("0.0.0.0:80", ("0.0.0.0", 80)),
-        ("robot.local:8080", ("robot.local", 8080)),
-        ("[::1]:8080", ("::1", 8080)),
-    ],
-)
-def test_addresses(text: str, address: tuple[str, int]) -> None:
-    assert parse_address(text) == address
-
-
-@pytest.mark.parametrize("text", ["", "x", ":80", "0", "65536", "-1", "a:b", "8080:", "²"])
-def test_addresses_that_are_none(text: str) -> None:
-    with pytest.raises(SettingsError, match=r"write a port, or HOST:PORT"):
-        parse_address(text)
-
-
-def test_a_port_that_is_taken(served: Web, desk: Desk) -> None:
-    with pytest.raises(NotConnected, match=r"cannot listen at http 127.0.0.1:\d+: the port is taken"):
-        Web(("127.0.0.1", served.port), desk)
-    with pytest.raises(NotConnected, match=r"cannot listen at http 192.0.2.1:8080: "):
-        Web(("192.0.2.1", 8080), desk)

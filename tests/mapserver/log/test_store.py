@@ -147,7 +147,7 @@ def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store) -> None
         Refusal(5, "edge r0.1.13 shares landmark 3 of r0.1.1, which has 3"),
         Refusal(6, "edge r0.1.14 shares landmark 5 of r0.1.2, which has 5"),
     )
-    assert [c.sequence for c in applied.changes] == [1, 2, 3, 4], "2 is about a node that nobody knows yet"
+    assert [c.sequence for c in applied.changes] == [1, 2, 3, 4], "2 is about a node that is unknown yet"
 
 
 @settings(max_examples=25, deadline=None)

@@ -70,6 +70,7 @@ def test_a_failure_without_any_map_sets_no_map_apart() -> None:
         leave_out([1, 2], attempt)
 
 
+@pytest.fixture(scope="module")
 def logs() -> dict[MapId, Log]:
     """Two sound robots in one room, and two more of which the second has mapped another one."""
     rng = np.random.default_rng(1)
@@ -80,11 +81,6 @@ def logs() -> dict[MapId, Log]:
         nodes, edges = take_map(world, map_id, tour, rng)
         out[map_id] = [(map_id, change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))]
     return out
-
-
-@pytest.fixture(scope="module")
-def told() -> dict[MapId, Log]:
-    return logs()
 
 
 def merger_of(result: dict[MapId, Log], *maps: MapId) -> Merger:
@@ -129,13 +125,13 @@ def said(merged: MergedMap, *maps: MapId) -> tuple[object, ...]:
 
 
 def test_a_map_with_which_it_fails_is_set_apart_and_the_others_are_as_without_it(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alone = merger_of(told, R0, R1).merged()
+    alone = merger_of(logs, R0, R1).merged()
     assert len(alone.links) > 2
     alone_fails(monkeypatch, BAD)
     for order in ((R0, R1, BAD), (BAD, R0, R1)):
-        merged = merger_of(told, *order).merged()
+        merged = merger_of(logs, *order).merged()
         assert said(merged, R0, R1) == said(alone, R0, R1)
         assert merged.maps.keys() == {R0, R1}
         assert merged.set_apart == {BAD: "the merge fails with it (LinAlgError: Singular matrix)"}
@@ -145,26 +141,26 @@ def test_a_map_with_which_it_fails_is_set_apart_and_the_others_are_as_without_it
 
 
 def test_a_server_that_runs_goes_on_when_a_map_comes_with_which_it_fails(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     alone_fails(monkeypatch, BAD)
-    merger = merger_of(told, R0)
+    merger = merger_of(logs, R0)
     merger.merged()
-    merger.read(told[BAD])
+    merger.read(logs[BAD])
     assert merger.merged().set_apart.keys() == {BAD}
     caplog.clear()
-    merger.read(told[R1])
+    merger.read(logs[R1])
     merged = merger.merged()
-    assert said(merged, R0, R1) == said(merger_of(told, R0, R1).merged(), R0, R1)
+    assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
     assert merged.set_apart.keys() == {BAD} and not caplog.records
 
 
 def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     together_fail(monkeypatch, R1, WORSE)
-    small = {**told, WORSE: told[WORSE][:3]}
-    alone = merger_of(told, R0, R1).merged()
+    small = {**logs, WORSE: logs[WORSE][:3]}
+    alone = merger_of(logs, R0, R1).merged()
     for order in ((R0, R1, WORSE), (WORSE, R1, R0)):
         merged = merger_of(small, *order).merged()
         assert merged.set_apart.keys() == {WORSE}
@@ -176,10 +172,10 @@ def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
 
 
 def test_a_map_set_apart_is_tried_again_after_a_change(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    merger = merger_of(told, R0, R1, WORSE)
-    node = told[WORSE][0][1]
+    merger = merger_of(logs, R0, R1, WORSE)
+    node = logs[WORSE][0][1]
     assert isinstance(node, NodePut)
     tried: list[int] = []
     with monkeypatch.context() as patch:
@@ -196,11 +192,11 @@ def test_a_map_set_apart_is_tried_again_after_a_change(
         merger.merged()
     merged = merger.merged()
     assert not merged.set_apart
-    assert said(merged, R0, R1, WORSE) == said(merger_of(told, R0, R1, WORSE).merged(), R0, R1, WORSE)
+    assert said(merged, R0, R1, WORSE) == said(merger_of(logs, R0, R1, WORSE).merged(), R0, R1, WORSE)
 
 
-def test_a_merged_map_that_breaks_its_users_is_set_apart(told: dict[MapId, Log]) -> None:
-    merger = merger_of(told, R0, R1, BAD)
+def test_a_merged_map_that_breaks_its_users_is_set_apart(logs: dict[MapId, Log]) -> None:
+    merger = merger_of(logs, R0, R1, BAD)
 
     def use(merged: MergedMap) -> None:
         assert BAD not in merged.maps
@@ -210,16 +206,16 @@ def test_a_merged_map_that_breaks_its_users_is_set_apart(told: dict[MapId, Log])
 
 
 def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone_fails(monkeypatch, BAD)
-    merger = merger_of(told, R0, R1, BAD)
+    merger = merger_of(logs, R0, R1, BAD)
     assert merger.merged().set_apart
-    merger.rule(ManualConstraints([ManualConstraint((BAD, BAD), True, "anna", 1)]))
+    merger.constrain(ManualConstraints([ManualConstraint((BAD, BAD), True, "anna", 1)]))
     merged = merger.merged()
     assert not merged.set_apart and BAD in merged.maps
-    assert said(merged, R0, R1) == said(merger_of(told, R0, R1).merged(), R0, R1)
-    merger.rule(
+    assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
+    merger.constrain(
         ManualConstraints(
             [ManualConstraint((BAD, BAD), True, "anna", 1), ManualConstraint((BAD, BAD), False, "anna", 2)]
         )
@@ -228,16 +224,16 @@ def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
 
 
 def test_a_bad_map_is_left_out_before_comparing(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone_fails(monkeypatch, BAD)
-    merger = merger_of(told, BAD, R0, R1)
+    merger = merger_of(logs, BAD, R0, R1)
     apart = merger.apart()
     assert apart.maps.keys() == {R0, R1} and len(apart.components) == 2
 
 
 def test_nodes_that_cannot_be_compared_are_not_linked(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     import mapweave.mapserver.merging.node_comparisons as module
 
@@ -249,17 +245,17 @@ def test_nodes_that_cannot_be_compared_are_not_linked(
         return real(a, b, *more)
 
     monkeypatch.setattr(module, "verify", fails)
-    merged = merger_of(told, R0, R1, WORSE).merged()
-    assert said(merged, R0, R1)[0] == said(merger_of(told, R0, R1).merged(), R0, R1)[0]
+    merged = merger_of(logs, R0, R1, WORSE).merged()
+    assert said(merged, R0, R1)[0] == said(merger_of(logs, R0, R1).merged(), R0, R1)[0]
     assert not merged.set_apart and len(merged.components) == 2
     assert "cannot be compared (IndexError)" in {r.reason for r in merged.refused}
     assert "cannot be compared" in caplog.text and caplog.records[0].levelno == logging.ERROR
 
 
 def test_a_node_whose_search_fails_holds_up_no_other(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    merger = merger_of(told, BAD, R0, R1)
+    merger = merger_of(logs, BAD, R0, R1)
     real = merger.places.overlaps
 
     def fails(node: Any, *more: Any) -> Any:
@@ -270,14 +266,14 @@ def test_a_node_whose_search_fails_holds_up_no_other(
     monkeypatch.setattr(merger.places, "overlaps", fails)
     merged = merger.merged()
     assert merger.uncompared == 0
-    assert said(merged, R0, R1) == said(merger_of(told, R0, R1).merged(), R0, R1)
+    assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
 
 
-def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(told: dict[MapId, Log]) -> None:
+def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(logs: dict[MapId, Log]) -> None:
     """Each edge is within its bounds, and all together they are not."""
     far = PoseGaussian.from_sigmas(Pose2(9.9e4), 0.1, 0.01)
     node, edge = (
-        next(body for _, body in told[BAD] if isinstance(body, kind)) for kind in (NodePut, EdgePut)
+        next(body for _, body in logs[BAD] if isinstance(body, kind)) for kind in (NodePut, EdgePut)
     )
     ids = [NodeId(*BAD, 100 + k) for k in range(12)]
     log: Log = [(BAD, NodePut(replace(node.node, id=node_id))) for node_id in ids]
@@ -285,17 +281,17 @@ def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(told: dict[Ma
         (BAD, EdgePut(replace(edge.edge, id=NodeId(*BAD, 200 + k), a=a, b=b, a_from_b=far)))
         for k, (a, b) in enumerate(pairwise(ids))
     ]
-    merged = merger_of({**told, BAD: log}, R0, R1, BAD).merged()
+    merged = merger_of({**logs, BAD: log}, R0, R1, BAD).merged()
     assert "lie beyond 1e+06 m" in merged.set_apart[BAD]
-    assert said(merged, R0, R1) == said(merger_of(told, R0, R1).merged(), R0, R1)
+    assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
 
 
 def test_files_are_merged_with_all_maps_or_not_at_all(
-    told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else the map would be missing in what is written."""
     alone_fails(monkeypatch, BAD)
-    maps = {item: HybridMap(body for _, body in told[item]) for item in (R0, BAD)}
+    maps = {item: HybridMap(body for _, body in logs[item]) for item in (R0, BAD)}
     with pytest.raises(InvalidValue, match=r"map bad\.1 cannot be merged: the merge fails with it .*retire"):
         merge_parts(maps, ManualConstraints())
     retired = merge_parts(maps, ManualConstraints([ManualConstraint((BAD, BAD), True, "anna", 1)]))

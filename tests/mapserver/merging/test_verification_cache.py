@@ -213,7 +213,7 @@ def test_a_merge_before_the_store_is_read_keeps_earlier_results(logged: Log, tmp
     before = path.read_bytes()
     merger, keeper = Merger(), VerificationCacheKeeper(tmp_path / "store")
     keeper.restore(merger)
-    merger.rule(ManualConstraints())
+    merger.constrain(ManualConstraints())
     assert not merger.merged().maps
     keeper.save(merger, last=True)
     assert path.read_bytes() == before

@@ -49,13 +49,13 @@ with MapServer(MemoryBus(MemoryHub()), Keys(), path, "s0") as server:
     for node, place in merged.poses.items():
         digest.update(place.merged_from_robot.mean.vector.tobytes())
         digest.update(place.merged_from_robot.covariance.tobytes())
-    told = {"digest": digest.hexdigest(), "verified": merger.counters.verified, "map": merged.summary()}
-    print(json.dumps(told), flush=True)
+    report = {"digest": digest.hexdigest(), "verified": merger.counters.verified, "map": merged.summary()}
+    print(json.dumps(report), flush=True)
     time.sleep(600)
 """
 
 
-def told_and_killed(store: Path) -> dict[str, Any]:
+def reported_and_killed(store: Path) -> dict[str, Any]:
     """A server prints its merged map; then it is killed."""
     process = subprocess.Popen([sys.executable, "-c", SERVER, str(store)], stdout=subprocess.PIPE)
     try:
@@ -69,7 +69,7 @@ def told_and_killed(store: Path) -> dict[str, Any]:
 
 
 def test_a_server_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
-    first = told_and_killed(tmp_path / "store")
-    second = told_and_killed(tmp_path / "store")
+    first = reported_and_killed(tmp_path / "store")
+    second = reported_and_killed(tmp_path / "store")
     assert first["digest"] == second["digest"] and "4 maps, 1 component" in first["map"]
     assert first["verified"] > 300 and second["verified"] == 0

@@ -10,15 +10,9 @@ import pytest
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, View
-from mapweave.mapserver.relocalization.aliased_landmarks import AliasedLandmarks, carried, unexplained
-from mapweave.mapserver.relocalization.candidates import Candidates
-from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, hidden, is_lonely
-from mapweave.mapserver.relocalization.relocalizer import Relocalizer
-from mapweave.mapserver.relocalization.view_registration import Registration
-from mapweave.mapserver.retrieval.place_index import PlaceIndex
-from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.relocalization.aliased_landmarks import AliasedLandmarks, unexplained
+from mapweave.mapserver.relocalization.place_hypotheses import hidden, is_lonely
 from mapweave.registration.recognition import Recognition, RecognitionSettings, recognise
 from synthetic.world import CAMERA, Sensing, room, take_node, take_view
 
@@ -32,11 +26,8 @@ def node(number: int, at: Pose2, seed: int):
     return take_node(WORLD, NodeId("r0", 1, number), at, HERE, np.random.default_rng(seed))
 
 
-def test_an_aliased_node_explains_common_landmarks_and_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_comparison_of_nodes_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     first, twin = node(1, AT, 2), node(2, AT @ Pose2(0.1, -0.05, 0.1), 3)
-    view, _ = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.05), np.random.default_rng(4))
-    recognition = recognise(first, view, None, np.random.default_rng(0))
-    assert recognition is not None
     doubles = AliasedLandmarks(RecognitionSettings())
     likeness = doubles.compare(twin, first)
     assert likeness is not None
@@ -49,58 +40,6 @@ def test_an_aliased_node_explains_common_landmarks_and_is_cached(monkeypatch: py
         assert doubles.compare(twin, first) is likeness
         with pytest.raises(AssertionError, match="already"):
             doubles.compare(twin, replace(first, stamp_ns=first.stamp_ns + 1))  # changed
-    settings = RecognitionSettings().matching
-    result = carried(twin, likeness, NodeMatch(first.id, recognition), view, settings, 12.0)
-    assert result.alike == first.id and result.node == twin.id
-    # The twin is mapped 0.1 m aside, and the view is where it would be seen from there.
-    expected = (AT @ Pose2(0.1, -0.05, 0.1)).inverse() @ AT @ Pose2(0.05, 0.0, 0.05)
-    assert result.recognition.node_from_robot.mean.distance(expected) < 0.05
-    direct = recognise(twin, view, None, np.random.default_rng(0))
-    assert direct is not None
-    shared = {tuple(pair) for pair in result.recognition.pairs} & {tuple(pair) for pair in direct.pairs}
-    assert len(shared) > 0.6 * direct.inliers
-    assert len(set(result.recognition.pairs[:, 1])) == result.recognition.inliers
-
-
-def nowhere_joined(places: list) -> MergedMap:
-    """A map of parts that nothing joins, one a node."""
-    poses = {place.id: Placement(k, HERE) for k, place in enumerate(places)}
-    graphs = tuple(solve_graph(place.id, Pose2(), []) for place in places)
-    return MergedMap({}, (), (), tuple(frozenset([place.id]) for place in places), poses, graphs)
-
-
-def test_a_place_whose_twin_was_not_recognised_is_ambiguous() -> None:
-    first, twin = node(1, AT, 2), node(2, AT, 3)
-    view, _ = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.02), np.random.default_rng(4))
-    recognition = recognise(first, view, None, np.random.default_rng(0))
-    assert recognition is not None
-    places = [first, twin]
-    by_id = {place.id: place for place in places}
-
-    class Ranked:
-        def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
-            return [(first.id, 2.0), (twin.id, 1.0)]
-
-    service = Relocalizer(Ranked(), by_id.get, nowhere_joined(places))
-    matches = service.registration.refined(view, [NodeMatch(first.id, recognition)])
-    alone = service.conclude(Registration(Candidates(view, [(first.id, 2.0)]), matches))
-    assert alone.certainty is Certainty.FOUND
-    both = service.conclude(Registration(Candidates(view, Ranked().query(view)), matches))
-    assert both.certainty is Certainty.AMBIGUOUS and "look the same on the map" in both.reason
-    assert {place.node for place in both.candidates} == {first.id, twin.id}
-    assert max(place.probability for place in both.candidates) < 0.9
-
-
-def test_landmarks_at_one_place_are_not_aliased() -> None:
-    first, twin = node(1, AT, 2), node(2, AT, 3)
-    view, _ = take_view(WORLD, AT, np.random.default_rng(4))
-    recognition = recognise(first, view, None, np.random.default_rng(0))
-    assert recognition is not None
-    poses = {item.id: Placement(0, PoseGaussian(AT, HERE.covariance)) for item in (first, twin)}
-    merged = MergedMap({}, (), (), (frozenset(poses),), poses, ())
-    service = Relocalizer(PlaceIndex(), {first.id: first, twin.id: twin}.get, merged)
-    ranked = [(first.id, 2.0), (twin.id, 1.0)]
-    assert not service.aliasing.matches(view, NodeMatch(first.id, recognition), ranked)
 
 
 def test_matches_that_a_pose_explains() -> None:

@@ -34,7 +34,7 @@ def places(seed: int) -> tuple[World, list[Node]]:
     ]
 
 
-def told(nodes: list[Node], view: View) -> RelocalizeAnswer:
+def answered(nodes: list[Node], view: View) -> RelocalizeAnswer:
     hybrid_map = HybridMap(map(NodePut, nodes))
     way = PoseGaussian(NEXT, HERE.covariance)
     hybrid_map.apply(EdgePut(Edge(NodeId("p0", 1, 9), nodes[0].id, nodes[1].id, way, EdgeKind.MAPPED)))
@@ -49,7 +49,7 @@ def test_a_photograph_is_a_place_of_unknown_distance(seed: int) -> None:
     world, nodes = places(seed)
     off = Pose2(-0.4, 0.1, 0.05)
     view, _ = take_view(world, AT @ off, np.random.default_rng(seed + 100), SHARP)
-    answer = told([photograph(node, scale=1.2, pitch=0.015) for node in nodes], view)
+    answer = answered([photograph(node, scale=1.2, pitch=0.015) for node in nodes], view)
     assert answer.certainty is Certainty.PLACE
     best = answer.candidates[0]
     assert not best.distance_known
@@ -58,7 +58,7 @@ def test_a_photograph_is_a_place_of_unknown_distance(seed: int) -> None:
     again = decode(encode(answer), RelocalizeAnswer)
     assert again.certainty is Certainty.PLACE
     assert not again.candidates[0].distance_known
-    measured = told(nodes, view)
+    measured = answered(nodes, view)
     assert measured.certainty is Certainty.FOUND
     assert measured.candidates[0].distance_known
 
@@ -69,6 +69,6 @@ def test_elsewhere_is_no_place(seed: int) -> None:
     held = [photograph(node, scale=0.9, roll=0.02) for node in nodes]
     for heading in (1.7, 3.1, -1.6):
         view, _ = take_view(world, Pose2(2.0, 2.5, heading), np.random.default_rng(seed))
-        assert told(held, view).certainty is Certainty.UNKNOWN
+        assert answered(held, view).certainty is Certainty.UNKNOWN
         stranger, _ = take_view(places(seed + 50)[0], AT, np.random.default_rng(seed))
-        assert told(held, stranger).certainty is Certainty.UNKNOWN
+        assert answered(held, stranger).certainty is Certainty.UNKNOWN

@@ -90,8 +90,8 @@ def test_fewer_landmarks_than_cells() -> None:
     assert ids[:, 0].tolist() == [0, 1, 2] and np.allclose(squared[:, 0], 0.0) and (ids[:, 3] == -1).all()
 
 
-@pytest.mark.parametrize("told", ["all", "others"])
-def test_forgetting_a_row_equals_forgetting_its_node(landmarks: tuple[Codes, Ids], told: str) -> None:
+@pytest.mark.parametrize("named", ["all", "others"])
+def test_forgetting_a_row_equals_forgetting_its_node(landmarks: tuple[Codes, Ids], named: str) -> None:
     codes, ids = landmarks
     ids = np.argsort(np.argsort(ids))
     cells, searched = filled(codes, ids, 64), filled(codes, ids, 64)
@@ -99,7 +99,7 @@ def test_forgetting_a_row_equals_forgetting_its_node(landmarks: tuple[Codes, Ids
     for first in (0, 700, 2900):
         gone = codes[(ids >= first) & (ids < first + 100)]
         # Wrong assumptions about the codes make it slow, not wrong.
-        cells.remove(first, first + 100, gone[::-1] if told == "all" else 63 - gone)
+        cells.remove(first, first + 100, gone[::-1] if named == "all" else 63 - gone)
         searched.remove(first, first + 100)
     assert len(cells) == len(searched) == 2700
     for a, b in zip(contents(cells), contents(searched), strict=True):

@@ -53,7 +53,7 @@ def test_superseded_nodes_of_earlier_drives_are_left_out(epoch: int, later_s: fl
         assert overlaps == places.overlaps(BASE, nodes.get) and newer.id in overlaps
 
 
-def test_a_node_that_comes_anew_is_found_again_and_a_removed_one_is_not() -> None:
+def test_a_node_that_comes_again_is_found_again_and_a_removed_one_is_not() -> None:
     newer = replace(BASE, id=NodeId("a", 2, 1))
     nodes = {node.id: node for node in (BASE, newer)}
     places = filled(*nodes.values())

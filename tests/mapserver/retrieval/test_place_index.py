@@ -13,8 +13,8 @@ from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.mapserver.retrieval.inverted_file import InvertedFile
 from mapweave.mapserver.retrieval.landmark_index import MOST_WITHIN, LandmarkIndexSettings
 from mapweave.mapserver.retrieval.place_index import SLOT_BITS, PlaceIndex, PlaceIndexSettings
-from mapweave.merge.pose_graph.candidates import overlaps
 from synthetic.world import CAMERA, World, random_vectors, room, take_map, take_view
+from tests.merge.pose_graph.all_pairs import overlaps
 
 
 @pytest.fixture(scope="module")
@@ -170,16 +170,16 @@ def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[N
     assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes)
 
 
-@pytest.mark.parametrize("told", ["its own", "some of them", "another's", "none"])
+@pytest.mark.parametrize("named", ["its own", "some of them", "another's", "none"])
 def test_a_removed_node_stays_removed_despite_its_landmarks(
-    building: tuple[World, list[Node], list[Pose2]], told: str
+    building: tuple[World, list[Node], list[Pose2]], named: str
 ) -> None:
     nodes = building[1]
     index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=100, exact=100)))
     index.extend(nodes)
     before, codes = len(index.landmarks), nodes[3].landmarks.codes
     known = {"its own": codes, "some of them": codes[:5], "another's": nodes[4].landmarks.codes, "none": None}
-    index.remove(nodes[3].id, known[told])
+    index.remove(nodes[3].id, known[named])
     assert len(index.landmarks) == before - len(codes)
     left = np.concatenate([block.ids >> SLOT_BITS for block in index.landmarks.blocks()])
     assert set(left.tolist()) == set(index.slots.values())

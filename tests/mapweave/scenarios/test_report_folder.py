@@ -36,7 +36,7 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory):
-    """Folder, recording and figures of a trial. Nobody may change them."""
+    """Folder, recording and figures of a trial. No test may change them."""
     recording = stage_events(stage()).recording()
     figures = score(recording)
     out = tmp_path_factory.mktemp("reported") / "made for" / "it"

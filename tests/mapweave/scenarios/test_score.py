@@ -87,11 +87,11 @@ def test_relative_errors_are_those_of_pairs_a_metre_apart(seed):
             driven = 0.0
     errors = []
     for a, b in itertools.pairwise(ends):
-        told, real = (
+        estimated, real = (
             Pose2.from_vector(poses[a]).inverse() @ Pose2.from_vector(poses[b])
             for poses in (estimate.poses, true)
         )
-        error = real.inverse() @ told
+        error = real.inverse() @ estimated
         errors.append([math.hypot(error.x, error.y), math.degrees(abs(error.heading))])
     outcome = score_trajectory(truth, estimate)
     assert [outcome.rpe_m, outcome.rpe_deg] == pytest.approx(

@@ -159,20 +159,20 @@ def test_other_links_close_loops_as_composed_poses(merged: MergedMap) -> None:
     s = ConsistencySettings()
     by_pair = {other.pair: other for other in merged.links}
     pieces = {node: fragment for fragment in fragments_of(merged.maps) for node in fragment.nodes}
-    assert len(explanation.witnesses) >= 3
-    for witness in explanation.witnesses:
-        if (witness.a, witness.b) not in by_pair:
+    assert len(explanation.other_links) >= 3
+    for other_link in explanation.other_links:
+        if (other_link.a, other_link.b) not in by_pair:
             continue
         # The merge begins each loop at the smaller pair.
-        one, other = sorted([link, by_pair[witness.a, witness.b]], key=lambda x: x.pair)
+        one, other = sorted([link, by_pair[other_link.a, other_link.b]], key=lambda x: x.pair)
         back = pieces[one.b].graph.relative([one.b], [other.b])
         home = pieces[one.a].graph.relative([other.a], [one.a])
         there, here = (PoseGaussian(Pose2.from_vector(r.means[0]), r.covariances[0]) for r in (back, home))
         loop = one.a_from_b @ there @ other.a_from_b.inverse() @ here
         floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
         distance2 = PoseGaussian(loop.mean, loop.covariance + floor).mahalanobis2(Pose2())
-        assert witness.distance2 == pytest.approx(distance2, rel=1e-6)
-        assert witness.agrees == (distance2 < s.gate) and witness.kept
+        assert other_link.distance2 == pytest.approx(distance2, rel=1e-6)
+        assert other_link.agrees == (distance2 < s.gate) and other_link.kept
 
 
 def test_refused_pairs_say_what_they_lack(merged: MergedMap) -> None:
@@ -198,7 +198,9 @@ def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None
     assert len(explanation.shared) == explanation.evidence["inliers"] == len(explanation.residuals_px) >= 10
     assert {(int(shared[i, 0]), int(j)) for i, j in explanation.shared} <= set(map(tuple, shared.tolist()))
     assert explanation.a_from_b.mean.distance(link.a_from_b.mean) < 0.1
-    assert explanation.misfit is not None and explanation.witnesses == () and explanation.probability is None
+    assert (
+        explanation.misfit is not None and explanation.other_links == () and explanation.probability is None
+    )
 
 
 def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap) -> None:
@@ -213,7 +215,7 @@ def test_a_robots_own_edge_is_explained_with_its_pose(merged: MergedMap) -> None
     assert (
         explanation.a_from_b is edge.a_from_b
         and explanation.probability is None
-        and not explanation.witnesses
+        and not explanation.other_links
     )
     assert explanation.misfit is not None and not explanation.claims
     relative = merged.relative(edge.a, edge.b)
@@ -232,12 +234,12 @@ def test_a_robots_own_loop_closure_is_explained_with_its_constraints() -> None:
     explanation = explain_nodes(merger.merged(), first, last)
     assert explanation.standing is Standing.OWN and explanation.probability is not None
     constraint = ManualConstraint((first, last), True, "anna", 0, "no")
-    merger.rule(ManualConstraints([constraint]))
+    merger.constrain(ManualConstraints([constraint]))
     explanation = explain_nodes(merger.merged(), first, last)
     assert explanation.standing is Standing.UNDONE and explanation.reason == reason_of(constraint)
     assert any("(edge a.1.99); refused: undone by anna" in claim for claim in explanation.claims)
     wrong = replace(loop, a_from_b=PoseGaussian(true.mean @ Pose2(2.0, 1.0, 1.0), true.covariance))
-    merger.rule(ManualConstraints())
+    merger.constrain(ManualConstraints())
     merger.apply(A, EdgePut(wrong))
     explanation = explain_nodes(merger.merged(), first, last)
     assert explanation.standing is Standing.REFUSED and "contradicts" in explanation.reason
@@ -274,13 +276,13 @@ def test_manual_constraints_are_listed() -> None:
     merger = fleet()
     link = between(merger.merged())[0]
     constraint = ManualConstraint(link.pair, True, "anna", 0, "no")
-    merger.rule(ManualConstraints([constraint]))
+    merger.constrain(ManualConstraints([constraint]))
     explanation = explain_nodes(merger.merged(), *link.pair)
-    assert explanation.standing is Standing.UNDONE and explanation.rulings == (constraint,)
+    assert explanation.standing is Standing.UNDONE and explanation.constraints == (constraint,)
     assert explanation.probability is not None and explanation.probability > 0.9, (
         "a manual constraint changes no measurement"
     )
-    merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
+    merger.constrain(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
     apart = explain_maps(merger.merged(), A, B)
     assert not apart.joined and "undone" in apart.reason and len(apart.nearest) == 5
 
@@ -294,11 +296,11 @@ def test_a_merge_that_loses_its_support_is_reported() -> None:
     (joined,) = [joining for joining in joinings(joined_maps(alone), before) if "a.1 and b.1" in joining]
     assert joined == f"a.1 and b.1 are one map now, by {len(between(before))} links"
     assert joined in joinings([frozenset([B])], before)  # whichever of the two was heard of first
-    merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
+    merger.constrain(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
     for links in (before.links, None):
         (words,) = partings(parts, links, merger.merged())
         assert words.startswith("a.1 and b.1 are no longer one map: ") and "refused (undone" in words
-    merger.rule(ManualConstraints())
+    merger.constrain(ManualConstraints())
     for node in before.maps[B].nodes:
         merger.apply(B, NodeRetired(node))
     assert partings(parts, before.links, merger.merged()) == ()  # a map without nodes is part of nothing
@@ -350,7 +352,7 @@ def test_a_split_by_a_retired_map_names_the_person() -> None:
     before = merger.merged()
     assert before.joined(A, C)
     constraint = ManualConstraint((B, B), True, "anna", 0, "moved house")
-    merger.rule(ManualConstraints([constraint]))
+    merger.constrain(ManualConstraints([constraint]))
     (words,) = partings(joined_maps(before), before.links, merger.merged())
     assert words.startswith("a.1 and c.1 are no longer one map: ")
     assert words.endswith(f" gone, since {reason_of(constraint)}") and "moved house" in words

@@ -43,12 +43,12 @@ def look(shown: list[bool], result: list[bool], visit: int = 0) -> LandmarkObser
     return LandmarkObservations(NODE, view, link, Pose2(), np.array(shown + rest), np.array(result + half))
 
 
-@pytest.mark.parametrize("story", list(product([None, False, True], repeat=4)))
-def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]) -> None:
+@pytest.mark.parametrize("sequence", list(product([None, False, True], repeat=4)))
+def test_presence_is_that_of_all_sequences_together(sequence: tuple[bool | None, ...]) -> None:
     """Every sequence of there and gone, hidden and not, weighed with it and with what was seen."""
-    views = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(story)]
+    views = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(sequence)]
     weights = {True: 0.0, False: 0.0}
-    collected = [(seen, detection_rate(ALONE, one)) for seen, one in zip(story, views, strict=True)]
+    collected = [(seen, detection_rate(ALONE, one)) for seen, one in zip(sequence, views, strict=True)]
     collected = [(seen, rate) for seen, rate in collected if seen is not None]
     for states in product([True, False], repeat=len(collected) + 1):
         for veils in product([True, False], repeat=len(collected)):
@@ -83,13 +83,13 @@ def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None
     assert after(11, 1)[0] > removal.FAINT, "it is back"
     assert (after(0, 4) > removal.FAINT)[:6].all(), "what is missed beside what is found is not gone"
     one_visit = [look([True] * 6, [False] * 6, 0)] * 9
-    assert presence(together, one_visit)[0] > removal.FAINT, "somebody may have stood before it all the while"
+    assert presence(together, one_visit)[0] > removal.FAINT, "a person may have stood before it all the while"
     lonely = np.eye(26, dtype=np.bool_)
     lonely[6:, 6:] = True
     alone = [after(k, things=lonely)[0] for k in range(14)]
     assert 4 <= next(k for k, there in enumerate(alone) if there < removal.FAINT) <= 12
-    nobody = [look([False] * 6, [False] * 6, k) for k in range(20)]
-    assert presence(together, nobody)[0] == removal.AT_FIRST, "nobody could have seen it"
+    unseen = [look([False] * 6, [False] * 6, k) for k in range(20)]
+    assert presence(together, unseen)[0] == removal.AT_FIRST, "no view could show it"
 
 
 def test_near_landmarks_may_be_of_one_thing() -> None:

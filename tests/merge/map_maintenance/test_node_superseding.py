@@ -70,17 +70,17 @@ def merger(drives: Drives) -> Merger:
     return merger
 
 
-def living(merged: MergedMap) -> set[NodeId]:
+def active(merged: MergedMap) -> set[NodeId]:
     return set(merged.poses) - set(merged.superseded)
 
 
 def test_the_second_drive_supersedes_the_first(drives: Drives, merger: Merger) -> None:
     merged = merger.merged()
     assert len(merged.superseded) >= 3
-    assert {node.map for node in merged.superseded} == {OLD}, "views the other way stand for themselves"
+    assert {node.map for node in merged.superseded} == {OLD}, "views the other way are not superseded"
     assert f"{len(merged.superseded)} superseded" in merged.summary()
     for node, fate in merged.superseded.items():
-        assert fate.by in living(merged) and fate.by.map == NEW
+        assert fate.by in active(merged) and fate.by.map == NEW
         between = drives.truth[node].inverse() @ drives.truth[fate.by]
         assert math.hypot(between.x, between.y) < FARTHEST + 0.1
         assert abs(between.heading) < WIDEST + 0.1
@@ -100,7 +100,7 @@ def test_nothing_that_could_be_reached_is_cut_off(merger: Merger) -> None:
         for e in roads.union.edges.values()
         if e.id not in roads.closed and e.id.agent != "superseded"
     )
-    alive = living(merged)
+    alive = active(merged)
     before = {frozenset(piece & alive) for piece in nx.connected_components(graph)}
     after = {frozenset(piece) for piece in nx.connected_components(graph.subgraph(alive))}
     assert before - {frozenset()} == after
@@ -108,13 +108,13 @@ def test_nothing_that_could_be_reached_is_cut_off(merger: Merger) -> None:
 
 def test_routes_from_and_to_superseded_nodes_are_found(merger: Merger) -> None:
     merged = merger.merged()
-    router, alive = Router(merged), living(merged)
+    router, alive = Router(merged), active(merged)
     old = sorted(merged.superseded)
     far = max(alive, key=lambda n: merged.poses[n].merged_from_robot.mean.x)
     for start, goal in ((old[0], far), (far, old[0]), (old[0], old[-1])):
         legs = [leg.node.id for leg in router.route(start, goal).legs]
         assert legs[0] == start and legs[-1] == goal
-        assert set(legs[1:-1]) <= alive, "on the way there are living nodes only"
+        assert set(legs[1:-1]) <= alive, "on the way there are active nodes only"
 
 
 def test_a_file_has_the_superseded_nodes_with_reasons(merger: Merger) -> None:
@@ -135,7 +135,7 @@ def test_questions_are_answered_by_active_nodes(drives: Drives, merger: Merger) 
         view, _ = take_view(drives.world, drives.truth[node], np.random.default_rng(k))
         answer = relocalizer.answer(view)
         assert answer.certainty is Certainty.FOUND
-        assert answer.candidates[0].node in living(merged)
+        assert answer.candidates[0].node in active(merged)
         there = drives.truth[answer.candidates[0].node] @ answer.candidates[0].node_from_robot.mean
         assert there.distance(drives.truth[node]) < 0.25
 
@@ -148,14 +148,14 @@ def test_removing_a_successor_makes_its_nodes_active(drives: Drives) -> None:
     merger.apply(NEW, NodeRetired(by))
     merged = merger.merged()
     assert by not in merged.poses
-    assert all(fate.by in living(merged) for fate in merged.superseded.values())
-    merger.rule(
+    assert all(fate.by in active(merged) for fate in merged.superseded.values())
+    merger.constrain(
         ManualConstraints(
             [ManualConstraint((OLD, NEW), True, "anna", 1), ManualConstraint((OTHER, NEW), True, "anna", 1)]
         )
     )
     assert not merger.merged().superseded, "nothing joins them now"
-    merger.rule(ManualConstraints())
+    merger.constrain(ManualConstraints())
     assert merger.merged().superseded
 
 
@@ -174,7 +174,7 @@ def test_the_active_nodes_stay_few_over_many_drives(drives: Drives) -> None:
         )
         for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
             merger.on_change(Change(MapId("r0", epoch), k + 1, 0, body))
-        counts.append(len(living(merger.merged())))
+        counts.append(len(active(merger.merged())))
     assert counts[0] == 4 and max(counts) <= 8, counts
 
 
@@ -182,7 +182,7 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
     merger = drives.merger(OLD, NEW, OTHER)
     merged = merger.merged()
     assert merged.superseded
-    assert {node for node in merged.poses if node in merger.places} == living(merged)
+    assert {node for node in merged.poses if node in merger.places} == active(merged)
     # Refined, it is judged again, and superseded again.
     old = next(iter(merged.superseded))
     node = merger.node(old)
@@ -190,9 +190,9 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
     before = {link.pair for link in merged.links}
     merger.apply(OLD, NodePut(node))
     merged = merger.merged()
-    assert {node_id for node_id in merged.poses if node_id in merger.places} == living(merged)
+    assert {node_id for node_id in merged.poses if node_id in merger.places} == active(merged)
     assert {link.pair for link in merged.links} == before, "what tied it ties it still"
-    merger.rule(
+    merger.constrain(
         ManualConstraints(
             [ManualConstraint((OLD, NEW), True, "anna", 1), ManualConstraint((OTHER, NEW), True, "anna", 1)]
         )
@@ -218,13 +218,13 @@ def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(
         for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
             merger.on_change(Change(MapId("r0", epoch), k + 1, 0, body))
         merged = merger.merged()
-        alive, stood_for = living(merged), dict[NodeId, list[NodeId]]()
+        alive, replaced = active(merged), dict[NodeId, list[NodeId]]()
         for node, fate in merged.superseded.items():
             assert covers(merged, node, fate.by)
-            stood_for.setdefault(fate.by, []).append(node)
+            replaced.setdefault(fate.by, []).append(node)
         for item in alive:
-            whom = [item, *stood_for.get(item, [])]
-            spare = all(any(covers(merged, node, by) for by in alive - {item}) for node in whom)
+            nodes = [item, *replaced.get(item, [])]
+            spare = all(any(covers(merged, node, by) for by in alive - {item}) for node in nodes)
             assert not spare, f"{item} could be spared"
     assert len(alive) < 18
 

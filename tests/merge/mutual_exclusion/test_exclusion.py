@@ -15,7 +15,7 @@ from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import MOST, TrajectorySegment
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import chances_clear, clash_of
-from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, trajectories_of
+from mapweave.merge.mutual_exclusion.trajectories import RobotTrajectory, trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ExclusionSettings
 
@@ -41,7 +41,7 @@ class Walk:
         self.truth = way[leg] + share[:, None] * (way[leg + 1] - way[leg])
         self.way = way
 
-    def wake(self, node: int) -> TrajectorySegment:
+    def segment(self, node: int) -> TrajectorySegment:
         """Where it was each second until the next node, beside a node that looks east."""
         end = self.times[node + 1] if node + 1 < len(self.times) else self.times[node]
         times = np.arange(self.times[node] + 1.0, end, 1.0)[:MOST]
@@ -70,16 +70,16 @@ def apart(a: Walk, b: Walk) -> Array:
     return np.hypot(*(a.truth[:n] - b.truth[:n]).T)
 
 
-def trails(
+def trajectories(
     a: Walk, b: Walk, clocks: tuple[str, str] = ("net", "net"), agents: str = "ab",
     radii: tuple[float, float] = (0.0, 0.0), segments: bool = False,
-) -> list[BodyTrajectory]:  # fmt: skip
+) -> list[RobotTrajectory]:  # fmt: skip
     collected = []
     for k, walk in enumerate((a, b)):
         nodes = [
             Node(NodeId(agents[k], k, i), round(time * 1e9), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
                  Landmarks.empty(), clocks[k], radii[k], Ranges(),
-                 walk.wake(i) if segments else TrajectorySegment())
+                 walk.segment(i) if segments else TrajectorySegment())
             for i, time in enumerate(walk.times)
         ]  # fmt: skip
         collected += trajectories_of(nodes)
@@ -108,7 +108,7 @@ def twins(seed: int) -> tuple[Walk, Walk, np.random.Generator]:
 
 
 def clash(a: Walk, b: Walk, rng: np.random.Generator, **how: tuple[str, str]) -> Collision | None:
-    first, second = trails(a, b, **how)
+    first, second = trajectories(a, b, **how)
     return clash_of(graph(a, b, rng), first, second)
 
 
@@ -123,7 +123,7 @@ def test_twins_clash_and_the_reason_has_numbers(seed: int) -> None:
 
 def test_it_is_the_same_from_either_side() -> None:
     a, b, rng = twins(4)
-    first, second = trails(a, b)
+    first, second = trajectories(a, b)
     whole = graph(a, b, rng)
     forth, back = clash_of(whole, first, second), clash_of(whole, second, first)
     assert forth is not None and back is not None
@@ -148,9 +148,9 @@ def test_trajectory_segments_fill_gaps_between_nodes(seed: int) -> None:
     """Between nodes the robots' poses are unknown, without trajectory segments."""
     a, b, rng = scarce(seed, 0.7)
     whole = graph(a, b, rng)
-    collision = clash_of(whole, *trails(a, b, segments=True))
+    collision = clash_of(whole, *trajectories(a, b, segments=True))
     assert collision is not None and collision.evidence > 10 and collision.nearest < 0.15
-    bare = clash_of(whole, *trails(a, b))
+    bare = clash_of(whole, *trajectories(a, b))
     assert bare is None or bare.evidence < collision.evidence / 2
 
 
@@ -170,7 +170,10 @@ def test_moments_of_segments_move_with_their_nodes() -> None:
     expected = [
         (10.0 * (k + 1) + age, k, (Pose2(*means[k]) @ Pose2(*beside)).vector)
         for k, node in enumerate(nodes)
-        for age, beside in [(0.0, np.zeros(3)), *zip(node.wake.ages, node.wake.node_from_robot, strict=True)]
+        for age, beside in [
+            (0.0, np.zeros(3)),
+            *zip(node.segment.ages, node.segment.node_from_robot, strict=True),
+        ]
     ]
     expected.sort(key=lambda row: row[0])
     assert trajectory.times == pytest.approx([time for time, _, _ in expected])
@@ -182,7 +185,7 @@ def test_moments_of_segments_move_with_their_nodes() -> None:
 def test_no_evidence_without_a_common_clock() -> None:
     a, b, rng = twins(0)
     assert clash(a, b, rng, clocks=("net", "own")) is None
-    assert trails(a, b, clocks=("", "")) == []
+    assert trajectories(a, b, clocks=("", "")) == []
     late = Walk(np.random.default_rng(1), way=b.way)
     late.times = late.times + 1000.0
     assert clash(a, late, rng) is None
@@ -190,7 +193,7 @@ def test_no_evidence_without_a_common_clock() -> None:
 
 def test_a_robot_does_not_clash_with_itself() -> None:
     a, b, rng = twins(0)
-    first, second = trails(a, b, agents="aa")
+    first, second = trajectories(a, b, agents="aa")
     assert clash_of(graph(a, b, rng, agents="aa"), first, second) is None
 
 
@@ -215,7 +218,9 @@ def test_unknown_poses_are_no_evidence() -> None:
     st.integers(0, 10**6), st.sampled_from(["follows", "wanders"]), st.sampled_from([0.005, 0.02, 0.04]),
     st.booleans(),
 )  # fmt: skip
-def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma: float, wakes: bool) -> None:
+def test_robots_that_meet_closely_are_not_refused(
+    seed: int, manner: str, sigma: float, segments: bool
+) -> None:
     """They come as near as 0.35 m, centre to centre, repeatedly: footprints of 0.3 m and a hand between."""
     rng = np.random.default_rng(seed)
     a = Walk(rng)
@@ -225,14 +230,14 @@ def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma:
     step = 0.02 * np.array([np.cos(angle), np.sin(angle)])
     while apart(a, b).min() < 0.35:
         b.moved(step)
-    first, second = trails(a, b, segments=wakes)
+    first, second = trajectories(a, b, segments=segments)
     assert clash_of(graph(a, b, rng, sigma=sigma), first, second) is None
 
 
-@pytest.mark.parametrize("wakes", [False, True])
-def test_robots_that_nearly_touch_rarely_count_as_collisions(wakes: bool) -> None:
+@pytest.mark.parametrize("segments", [False, True])
+def test_robots_that_nearly_touch_rarely_count_as_collisions(segments: bool) -> None:
     """The bound holds even for footprints exactly as small as supposed: here at 0.2 m, with loose doubt."""
-    s = ExclusionSettings(doubt=0.1, least_witnesses=1)
+    s = ExclusionSettings(doubt=0.1, least_moments=1)
     refused = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
@@ -240,7 +245,7 @@ def test_robots_that_nearly_touch_rarely_count_as_collisions(wakes: bool) -> Non
         b = Walk(rng, way=a.way + rng.normal(0, 0.1, a.way.shape))
         while apart(a, b).min() < 0.2:
             b.moved(np.array([0.02, 0.0]))
-        refused += clash_of(graph(a, b, rng), *trails(a, b, segments=wakes), s) is not None
+        refused += clash_of(graph(a, b, rng), *trajectories(a, b, segments=segments), s) is not None
     assert refused <= 10
 
 
@@ -251,13 +256,13 @@ def test_known_radii_decide_the_least_distance() -> None:
     b = Walk(rng, way=a.way + np.array([0.25, 0.0]) + rng.normal(0, 0.03, a.way.shape))
     b.times = a.times
     whole = graph(a, b, rng)
-    collision = clash_of(whole, *trails(a, b, radii=(0.2, 0.2)))
+    collision = clash_of(whole, *trajectories(a, b, radii=(0.2, 0.2)))
     assert collision is not None and collision.nearest > 0.15
     for radii in ((0.04, 0.04), (0.0, 0.0), (0.4, 0.0)):
-        assert clash_of(whole, *trails(a, b, radii=radii)) is None
+        assert clash_of(whole, *trajectories(a, b, radii=radii)) is None
     tiny = ExclusionSettings(least_apart=0.4)
-    assert clash_of(whole, *trails(a, b, radii=(0.04, 0.04)), tiny) is None
-    assert clash_of(whole, *trails(a, b), tiny) is not None
+    assert clash_of(whole, *trajectories(a, b, radii=(0.04, 0.04)), tiny) is None
+    assert clash_of(whole, *trajectories(a, b), tiny) is not None
 
 
 def test_probabilities_agree_with_monte_carlo() -> None:

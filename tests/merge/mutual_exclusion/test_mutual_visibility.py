@@ -190,8 +190,8 @@ def test_errors_between_maps_have_opposite_signs() -> None:
     assert 0.25 < furthest < 0.31
 
 
-@pytest.mark.parametrize(("wake", "most"), [(0, 0.05), (4, 0.25)], ids=["nodes", "wakes"])
-def test_looking_at_a_thousand_nodes_takes_no_time(wake: int, most: float) -> None:
+@pytest.mark.parametrize(("segment", "most"), [(0, 0.05), (4, 0.25)], ids=["nodes", "segments"])
+def test_looking_at_a_thousand_nodes_takes_no_time(segment: int, most: float) -> None:
     """Four robots, each in a room of its own with thin walls: all are in reach, none is in sight."""
     rng = np.random.default_rng(1)
     bearings, pose = np.arange(16) * np.pi / 8, PoseGaussian(Pose2(), np.zeros((3, 3)))
@@ -209,7 +209,8 @@ def test_looking_at_a_thousand_nodes_takes_no_time(wake: int, most: float) -> No
             Node(NodeId(agent, 1, k), round(1e9 * (4 * k + rng.uniform(0, 2))), pose, CAMERA,
                  Landmarks.empty(), "net", RADIUS, Ranges(bearings, lengths[k], 3.16),
                  TrajectorySegment(
-                     0.3 + 0.3 * np.arange(wake), np.zeros((wake, 3)), np.tile(lengths[k], (wake, 1))))
+                     0.3 + 0.3 * np.arange(segment), np.zeros((segment, 3)),
+                     np.tile(lengths[k], (segment, 1))))
             for k in range(250)
         ]  # fmt: skip
         ids += [node.id for node in nodes]

@@ -114,7 +114,7 @@ def test_twins_should_have_seen_each_other(seed: int) -> None:
     assert f"its sensors saw nothing there, {collision.moments} such moments" in collision.reason
 
 
-def with_wakes(walks: Walks, every: int = 5) -> None:
+def with_segments(walks: Walks, every: int = 5) -> None:
     """Of each robot's nodes one in five stays; the others become moments of its trajectory segment."""
     kept = []
     for name in ("r0", "r1"):
@@ -127,7 +127,7 @@ def with_wakes(walks: Walks, every: int = 5) -> None:
                 np.array(beside).reshape(-1, 3),
                 np.array([item.ranges.distances for item in after]).reshape(-1, len(node.ranges)),
             )
-            kept.append(replace(node, wake=segment))
+            kept.append(replace(node, segment=segment))
     walks.nodes = kept
 
 
@@ -136,9 +136,9 @@ def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
     """Nodes alone do not refute the merge, or hardly, segments do; the same scans of another robot."""
     walks = Walks("twins", seed, (0, 1), 150)
     all_nodes = walks.clash(between_twins(seed))
-    with_wakes(walks)
+    with_segments(walks)
     collision = walks.clash(between_twins(seed))
-    walks.nodes = [replace(node, wake=TrajectorySegment()) for node in walks.nodes]
+    walks.nodes = [replace(node, segment=TrajectorySegment()) for node in walks.nodes]
     bare = walks.clash(between_twins(seed))
     assert all_nodes is not None and collision is not None and collision.evidence > 6.9
     assert bare is None or bare.moments < collision.moments / 2
@@ -148,8 +148,8 @@ def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
 def test_robots_in_one_room_are_not_refused_by_views_on_the_way(seed: int) -> None:
     """Neither where they meet, nor where the second is taken to be elsewhere by a few centimetres."""
     walks = Walks("arena", seed, (0, 0), 100, length=4.0, width=3.0)
-    with_wakes(walks)
-    assert walks.clash(settings=ExclusionSettings(doubt=0.9, least_witnesses=1)) is None
+    with_segments(walks)
+    assert walks.clash(settings=ExclusionSettings(doubt=0.9, least_moments=1)) is None
     assert walks.clash(moved=0.05) is None
 
 
@@ -160,7 +160,7 @@ def test_robots_that_are_in_one_room_are_not_refused(kind: str, seed: int) -> No
     walks = Walks(kind, seed, (0, 0))
     assert walks.clash() is None
     # Not even nearly: the scans are evidence for the merge. There is no evidence where no robots meet.
-    loose = ExclusionSettings(doubt=0.9, least_witnesses=1)
+    loose = ExclusionSettings(doubt=0.9, least_moments=1)
     assert walks.clash(settings=loose) is None
     assert walks.clash(moved=20.0, settings=loose) is None
 

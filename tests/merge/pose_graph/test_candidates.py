@@ -5,8 +5,9 @@ import numpy as np
 from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.merge.pose_graph.candidates import choose_pairs, overlap, overlaps
+from mapweave.merge.pose_graph.candidates import overlap
 from synthetic.world import room, take_map, take_node
+from tests.merge.pose_graph.all_pairs import choose_pairs, overlaps
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 

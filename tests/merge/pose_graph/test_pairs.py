@@ -5,8 +5,9 @@ import pytest
 
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.merge.pose_graph.candidates import Pair, choose_pairs
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.pairs import PairTable
+from tests.merge.pose_graph.all_pairs import choose_pairs
 
 STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
 

@@ -1,0 +1,187 @@
+"""Which mission holds: orders in, from any sender and in any order; what the pipeline shall do out.
+
+Orders may come twice, late, or never. The same id is the same mission; of two the newer holds; what is over
+stays over. All of it is on the disk before it is acknowledged, so a robot that was switched off goes on.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+from mapweave.agent.mission import Carried, Explore, GoTo, Idle, Mission
+from mapweave.agent.settings import WithoutServer
+from mapweave.hybridmap.agent_status import Status, one_line
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.mission_order import (
+    MAX_KEPT,
+    MissionKind,
+    MissionOrder,
+    MissionReport,
+    MissionState,
+)
+from mapweave.hybridmap.node import NodeId
+
+log = logging.getLogger(__name__)
+
+GONE = 10.0
+"""A server that is out of reach for so long is gone, s: a router that is started again is back by then."""
+FIRST = "start"
+"""Gives the mission that the agent begins with."""
+MAPPING = (MissionKind.EXPLORE, MissionKind.CARRIED)
+
+Keep = Callable[[Sequence[MissionReport]], None]
+
+
+def as_mission(order: MissionOrder) -> Mission:
+    """What the pipeline shall do."""
+    if order.node is not None:
+        return GoTo(order.node)
+    plain: dict[MissionKind, Mission] = {MissionKind.EXPLORE: Explore(), MissionKind.CARRIED: Carried()}
+    return plain.get(order.kind, Idle())
+
+
+class MissionControl:
+    """Missions of one robot. Orders come from any thread; the robot's loop calls `next` and `follow`.
+
+    Attributes:
+        unknown_goal: says of a node why the robot knows that there is none; empty if there may be. Called
+            from any thread.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        kept: Iterable[MissionReport] = (),
+        keep: Keep = lambda reports: None,
+        alone: WithoutServer = WithoutServer.GO_ON,
+    ) -> None:
+        """Go on with what was kept.
+
+        Args:
+            robot: its name.
+            kept: reports from the disk.
+            keep: puts reports on the disk.
+            alone: what the robot does while no server is in reach.
+        """
+        self.unknown_goal: Callable[[NodeId], str] = lambda node: ""
+        self._robot = robot
+        self._keep = keep
+        self._alone = alone
+        self._lock = threading.Lock()
+        self._reports = {report.order.id: report for report in kept}
+        ranked = sorted(self._reports.values(), key=lambda report: report.order.rank)
+        held = [report for report in ranked if report.state is not MissionState.REFUSED]
+        self._current: str | None = held[-1].order.id if held else None
+        if held and held[-1].order.kind in MAPPING:
+            # There may be more to map.
+            self._reports[held[-1].order.id] = replace(held[-1], state=MissionState.RUNNING)
+        self._applied: tuple[str, Mission] | None = None
+        self._linked_at: float | None = None
+        self._interruption = ""
+
+    @property
+    def report(self) -> MissionReport | None:
+        """On the mission that holds."""
+        with self._lock:
+            return None if self._current is None else self._reports[self._current]
+
+    def begin(self, kind: MissionKind) -> None:
+        """Take the mission with which the agent is started: it is newer than what was kept."""
+        report = self.report
+        newest = 0 if report is None else report.order.stamp_ns
+        self.take(MissionOrder.new(self._robot, kind, FIRST, after_ns=newest))
+
+    def take(self, order: MissionOrder) -> MissionReport:
+        """Take an order; returns what has become of it.
+
+        Raises:
+            InvalidValue: it is another robot's.
+        """
+        if order.robot != self._robot:
+            raise InvalidValue(f"a mission of {order.robot} came to {self._robot}")
+        with self._lock:
+            known = self._reports.get(order.id)
+            if known is not None:
+                return known
+            current = None if self._current is None else self._reports[self._current]
+            if current is not None and order.rank < current.order.rank:
+                newer = f"mission {current.order.id} by {current.order.by} is newer"
+                return self._note(MissionReport(order, MissionState.REPLACED, 0.0, newer))
+            if order.node is not None and (reason := self.unknown_goal(order.node)):
+                return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reason))
+            report = MissionReport(order, MissionState.RUNNING)
+            replaced = []
+            if current is not None and current.open:
+                by = f"by mission {order.id} of {order.by}"
+                replaced = [replace(current, state=MissionState.REPLACED, reason=by)]
+            self._current = order.id
+            return self._note(*replaced, report)
+
+    def next(self, linked: bool, now: float, home: NodeId | None) -> Mission | None:
+        """What the pipeline shall do from now on; None if it goes on.
+
+        Args:
+            linked: whether the server is in reach.
+            now: s.
+            home: where the robot goes home to, if it has a home yet.
+        """
+        if linked or self._linked_at is None:
+            self._linked_at = now
+        with self._lock:
+            order = None if self._current is None else self._reports[self._current].order
+            if order is None:
+                return None
+            wanted = as_mission(order) if self._active(order) else Idle()
+            gone = now - self._linked_at > GONE and not isinstance(wanted, Carried)
+            self._interruption = ""
+            if gone and self._alone is WithoutServer.HOME and home is not None:
+                wanted, self._interruption = GoTo(home), f"goes home: no map server for {GONE:g} s"
+            elif gone and self._alone is not WithoutServer.GO_ON:
+                wanted, self._interruption = Idle(), f"stands: no map server for {GONE:g} s"
+            if (order.id, wanted) == self._applied:
+                return None
+            self._applied = order.id, wanted
+            return wanted
+
+    def follow(self, status: Status) -> bool:
+        """Take note of how far the pipeline is with what `next` gave; returns whether that ended it."""
+        with self._lock:
+            report = None if self._current is None else self._reports[self._current]
+            if report is None or report.state is not MissionState.RUNNING:
+                return False
+            if self._applied != (report.order.id, as_mission(report.order)):
+                self._reports[report.order.id] = replace(report, reason=self._interruption)
+                return False
+            report = replace(report, progress=status.progress, reason="")
+            if status.given_up:
+                report = replace(report, state=MissionState.FAILED, reason=one_line(status.detail))
+            elif status.finished or report.order.kind is MissionKind.STOP:
+                report = replace(
+                    report, state=MissionState.DONE, progress=1.0, reason=one_line(status.detail)
+                )
+            if report.state is MissionState.RUNNING:
+                self._reports[report.order.id] = report
+                return False
+            self._note(report)
+            return True
+
+    def _active(self, order: MissionOrder) -> bool:
+        """Whether the pipeline is still to do it. A goal that was reached is held, and not sought again."""
+        applied = self._applied == (order.id, as_mission(order))
+        return self._reports[order.id].open or order.kind in MAPPING or applied
+
+    def _note(self, *reports: MissionReport) -> MissionReport:
+        """Keep reports; returns the last."""
+        self._reports.update({report.order.id: report for report in reports})
+        while len(self._reports) > MAX_KEPT:
+            others = (report.order for report in self._reports.values() if report.order.id != self._current)
+            del self._reports[min(others, key=lambda order: order.rank).id]
+        try:
+            self._keep(reports)
+        except InvalidFile as error:
+            # A robot must obey a stop, also with a full disk.
+            log.warning("mission %s is not on the disk: %s", reports[-1].order.id, error)
+        return reports[-1]

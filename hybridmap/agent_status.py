@@ -1,0 +1,139 @@
+"""What a robot is doing: for people, for the map server, and for scenarios."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from msgspec import Meta
+
+from mapweave.hybridmap.drive_statistics import DriveStatistics
+from mapweave.hybridmap.limits import Amount, Name, Number, Share, Stamp
+from mapweave.hybridmap.mission_order import MissionReport
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+
+MAX_STATUS_WORDS = 500
+MAX_ROBOTS = 1024
+Line = Annotated[str, Meta(max_length=MAX_STATUS_WORDS)]
+
+IDENTITY = Pose2()
+NOTHING_DRIVEN = DriveStatistics()
+NO_COMPONENT = -1
+
+
+def one_line(text: str) -> str:
+    """Text as a message can hold it: a status may quote the text of a server or a driver."""
+    return "".join(c if c.isprintable() else " " for c in text)[:MAX_STATUS_WORDS]
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the robot's pipeline is doing.
+
+    Attributes:
+        doing: in words.
+        detail: why, or how far.
+        nodes: nodes of the own map.
+        tracked: features tracked in the image.
+        map_from_robot: estimated pose in its own map while mapping.
+        finished: whether the mission is complete.
+        mission: what the pipeline does.
+        fix_node: the node by which the robot is localized while navigating.
+        node_from_robot: pose in that node's frame.
+        legs: nodes on the first route of the drive, beginning and goal included.
+        lost: whether it has given up localizing on its own map: a new map must be begun.
+        astray: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
+        located: whether `map_from_robot` comes from this observation.
+        given_up: whether it stands, since the goal cannot be reached; `detail` is the reason.
+        progress: share of the present route that is driven.
+        tally: statistics of the drive so far.
+    """
+
+    doing: Line
+    detail: Line
+    nodes: Number
+    tracked: Number
+    map_from_robot: Pose2
+    finished: bool
+    mission: Line = "idle"
+    fix_node: NodeId | None = None
+    node_from_robot: Pose2 = IDENTITY
+    legs: Number = 0
+    lost: bool = False
+    astray: bool = False
+    located: bool = False
+    given_up: bool = False
+    progress: Share = 0.0
+    tally: DriveStatistics = NOTHING_DRIVEN
+
+
+@dataclass(frozen=True)
+class AgentStatus:
+    """A status as others receive it.
+
+    Attributes:
+        status: of the pipeline.
+        stamp_ns: time of the observation that it describes.
+        robot: its name; empty before it has one.
+        epoch: of the map that it makes.
+        unsent: changes that no server has on its disk yet.
+        traffic: bytes that it has sent and received over the fleet's network since it began.
+        linked: whether it sees its map server.
+        placed: nodes of its map of which it knows where they lie in the merged map.
+        mission: the mission that holds, and what has become of it.
+        battery: charge, if the driver tells it.
+        last_error: the newest trouble with the fleet, in words; empty without any.
+        error_age: how long ago that was, s.
+    """
+
+    status: Status
+    stamp_ns: Stamp
+    robot: Annotated[str, Meta(max_length=32)] = ""
+    epoch: Number = 0
+    unsent: Number = 0
+    traffic: Number = 0
+    linked: bool = False
+    placed: Number = 0
+    mission: MissionReport | None = None
+    battery: Share | None = None
+    last_error: Line = ""
+    error_age: Amount = 0.0
+
+    @property
+    def fix_node(self) -> NodeId | None:
+        """The node that the robot knows itself by, if it navigates and knows."""
+        return self.status.fix_node
+
+    @property
+    def map(self) -> MapId:
+        """The map that it makes."""
+        return MapId(self.robot, self.epoch)
+
+
+@dataclass(frozen=True)
+class RobotEntry:
+    """One robot, as a map server sees it.
+
+    Attributes:
+        robot: its name.
+        alive: whether its agent is there.
+        age: since its last status, s.
+        status: the last one; None if none has come.
+        merged_from_robot: where it is in the merged map, if that is known.
+        component: number of that map's component; -1 if it is not known.
+    """
+
+    robot: Name
+    alive: bool
+    age: Amount = 0.0
+    status: AgentStatus | None = None
+    merged_from_robot: Pose2 | None = None
+    component: Annotated[int, Meta(ge=-1)] = NO_COMPONENT
+
+
+@dataclass(frozen=True)
+class FleetStatus:
+    """All robots that a map server knows of, by name."""
+
+    robots: Annotated[tuple[RobotEntry, ...], Meta(max_length=MAX_ROBOTS)] = field(default=())

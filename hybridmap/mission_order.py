@@ -1,0 +1,164 @@
+"""Missions as values: what one robot shall do, who said so and when, and what has become of it."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+from msgspec import Meta
+
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import Name, Share, Stamp, Words
+from mapweave.hybridmap.node import NodeId
+
+MAX_KEPT = 200
+"""Missions in a history; older ones are dropped."""
+
+Text = Annotated[str, Meta(max_length=64)]
+"""A goal as it was written, or a person's name."""
+
+
+class MissionKind(StrEnum):
+    """What a robot shall do."""
+
+    EXPLORE = "explore"
+    CARRIED = "carried"
+    """Map while a person moves the robot."""
+    GO = "go"
+    """Park at a node."""
+    STOP = "stop"
+
+
+class MissionState(StrEnum):
+    """What has become of a mission."""
+
+    SENT = "sent"
+    """The server keeps it; the robot does not know of it yet."""
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    """The robot gave it up."""
+    REFUSED = "refused"
+    """It was never begun."""
+    REPLACED = "replaced"
+    """A newer one came first, or meanwhile."""
+
+
+OPEN = (MissionState.SENT, MissionState.RUNNING)
+"""States that are not final."""
+
+
+def new_id() -> str:
+    """For a new mission, drawn by chance."""
+    return secrets.token_hex(6)
+
+
+@dataclass(frozen=True, slots=True)
+class MissionRequest:
+    """A person's wish, as a map server takes it: the goal is in the person's words.
+
+    Attributes:
+        id: drawn by who gives it. The same id is the same mission, however often it comes.
+        robot: which robot.
+        kind: what it shall do.
+        stamp_ns: when it was given; of two missions of a robot the newer one holds.
+        by: who gave it.
+        goal: where to: a node (`r0.1.17`), `x,y` in the merged map, m, or `home`; empty without one.
+    """
+
+    id: Name
+    robot: Name
+    kind: MissionKind
+    stamp_ns: Stamp
+    by: Text
+    goal: Text = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a goal too many or too few (InvalidValue)."""
+        if (self.kind is MissionKind.GO) != bool(self.goal):
+            raise InvalidValue(f"mission {self.kind}: {'give' if not self.goal else 'takes no'} goal")
+
+
+@dataclass(frozen=True, slots=True)
+class MissionOrder:
+    """A mission as a robot takes it.
+
+    Attributes:
+        id: see MissionRequest; likewise robot, kind, stamp_ns, by and goal.
+        node: where to park; None without a goal.
+    """
+
+    id: Name
+    robot: Name
+    kind: MissionKind
+    stamp_ns: Stamp
+    by: Text
+    node: NodeId | None = None
+    goal: Text = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a node too many or too few (InvalidValue)."""
+        if (self.kind is MissionKind.GO) != (self.node is not None):
+            raise InvalidValue(f"mission {self.kind}: {'give' if self.node is None else 'takes no'} node")
+
+    @staticmethod
+    def new(
+        robot: str, kind: MissionKind, by: str, node: NodeId | None = None, after_ns: int = 0
+    ) -> MissionOrder:
+        """A mission that is given now, and later than `after_ns`."""
+        return MissionOrder(new_id(), robot, kind, max(time.time_ns(), after_ns + 1), by, node)
+
+    @property
+    def rank(self) -> tuple[int, str]:
+        """Of two missions of one robot the one of higher rank holds, in whatever order they come."""
+        return self.stamp_ns, self.id
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        if self.node is None:
+            return str(self.kind)
+        return f"{self.kind} to {self.node}" + (
+            f" ({self.goal})" if self.goal not in ("", str(self.node)) else ""
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MissionReport:
+    """What has become of a mission.
+
+    Attributes:
+        order: the mission.
+        state: the last states are final.
+        progress: share of the way to the goal; 1 when it is done.
+        reason: why, in words.
+    """
+
+    order: MissionOrder
+    state: MissionState
+    progress: Share = 0.0
+    reason: Words = ""
+
+    @property
+    def open(self) -> bool:
+        """Whether it may still change."""
+        return self.state in OPEN
+
+    def supersedes(self, other: MissionReport) -> bool:
+        """Whether it says more than another report on the same mission: a final state stays."""
+        return other.state is MissionState.SENT or (other.open and self.state is not MissionState.SENT)
+
+
+@dataclass(frozen=True, slots=True)
+class Missions:
+    """Missions, oldest first."""
+
+    reports: Annotated[tuple[MissionReport, ...], Meta(max_length=MAX_KEPT)] = ()
+
+    @staticmethod
+    def newest(reports: list[MissionReport]) -> Missions:
+        """The newest of all."""
+        return Missions(tuple(sorted(reports, key=lambda report: report.order.rank)[-MAX_KEPT:]))

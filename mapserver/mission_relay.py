@@ -1,0 +1,192 @@
+"""Missions from people to robots, and what has become of them: a relay with a record on the disk.
+
+Robots work without it: an order may also go to an agent directly. A robot that is away gets its newest
+mission when it is back.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
+from mapweave.hybridmap.agent_status import AgentStatus
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.mission_order import (
+    MAX_KEPT,
+    OPEN,
+    MissionKind,
+    MissionOrder,
+    MissionReport,
+    MissionRequest,
+    Missions,
+    MissionState,
+    new_id,
+)
+from mapweave.hybridmap.node import MapId, check_name
+from mapweave.mapserver.goals import node_of_goal
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.roster import Roster
+from mapweave.mapserver.routes import Router
+from mapweave.wire.bus import Bus
+from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode, encode
+
+log = logging.getLogger(__name__)
+
+KEPT = "missions"
+"""Among the results of the store."""
+ANSWER = 2.0
+"""How long a robot may take to acknowledge, s."""
+EXPIRY = 600.0
+"""A robot that is away for longer does not get a mission of before, s: it would drive off unexpectedly."""
+EVERY = 1.0
+"""Time between two attempts, s."""
+
+
+class MissionRelay:
+    """Takes missions from any thread. `hear` and `retry` are called by the server."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        store: Store,
+        router: Callable[[], Router],
+        time_ns: Callable[[], int],
+    ) -> None:
+        """Go on with the record of the store.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            store: keeps the record.
+            router: of the newest merged map.
+            time_ns: the present time.
+        """
+        self._bus, self._keys, self._store, self._router, self._time_ns = bus, keys, store, router, time_ns
+        self.roster: Roster | None = None
+        self._turn = threading.RLock()
+        self._reports: dict[str, MissionReport] = {}
+        try:
+            kept = store.result(KEPT)
+            missions = Missions() if kept is None else decode(kept, Missions)
+            self._reports = {report.order.id: report for report in missions.reports}
+        except InvalidMessage as error:
+            log.warning("the record of missions is lost: %s", error)
+
+    def missions(self) -> Missions:
+        """All that are known, oldest first."""
+        with self._turn:
+            return Missions.newest(list(self._reports.values()))
+
+    def command(self, request: MissionRequest) -> MissionReport:
+        """Hand a mission on to its robot; returns what has become of it. It waits for the robot's answer.
+
+        Raises:
+            InvalidValue: there is no such robot.
+        """
+        with self._turn:
+            known = self._reports.get(request.id)
+        if known is not None and known.state is not MissionState.SENT:
+            return known
+        if known is None:
+            known = self._note(self._resolved(request))
+            self._replace_older(known.order, MissionState.SENT)
+        return self._hand_on(known.order) if known.open else known
+
+    def request(
+        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = ""
+    ) -> MissionRequest:
+        """A mission that is given now, and is newer than the one that holds the robot.
+
+        Raises:
+            InvalidValue: the goal is missing, or there is one too many; a name is none.
+        """
+        status = None if self.roster is None else self.roster.status(robot)
+        report = None if status is None else status.mission
+        stamp_ns = max(self._time_ns(), 0 if report is None else report.order.stamp_ns + 1)
+        mission_id = check_name(mission_id) if mission_id else new_id()
+        return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal[:64])
+
+    def hear(self, status: AgentStatus) -> None:
+        """Take note of what a robot reports of its mission."""
+        report = status.mission
+        if report is None:
+            return
+        self._note(report)
+        self._replace_older(report.order)
+
+    def retry(self) -> None:
+        """Try to hand on what robots could not be reached for."""
+        with self._turn:
+            waiting = [report for report in self._reports.values() if report.state is MissionState.SENT]
+        for report in waiting:
+            robot, age = report.order.robot, (self._time_ns() - report.order.stamp_ns) * 1e-9
+            if age > EXPIRY:
+                reason = f"{robot} did not answer within {EXPIRY:g} s"
+                self._note(replace(report, state=MissionState.FAILED, reason=reason))
+            elif self.roster is not None and self.roster.alive(robot):
+                self._hand_on(report.order)
+
+    def _resolved(self, request: MissionRequest) -> MissionReport:
+        """The mission as the robot gets it, or refused."""
+        robot, node = request.robot, None
+        status = None if self.roster is None else self.roster.status(robot)
+        if status is None and not (self.roster is not None and self.roster.alive(robot)):
+            raise InvalidValue(f"no robot {robot} has been heard of")
+        if request.goal:
+            map_id = MapId(robot, 0 if status is None else status.epoch)
+            node = node_of_goal(request.goal, map_id, self._router())
+        order = MissionOrder(
+            request.id, robot, request.kind, request.stamp_ns, request.by, node, request.goal
+        )
+        return MissionReport(order, MissionState.SENT)
+
+    def _replace_older(self, order: MissionOrder, *states: MissionState) -> None:
+        """A robot's newer mission ends its older ones, of these states or of all that are open."""
+        with self._turn:
+            older = [
+                report
+                for report in self._reports.values()
+                if report.state in (states or OPEN)
+                and report.order.robot == order.robot
+                and report.order.rank < order.rank
+            ]
+        for report in older:
+            reason = f"by mission {order.id} of {order.by}"
+            self._note(replace(report, state=MissionState.REPLACED, reason=reason))
+
+    def _hand_on(self, order: MissionOrder) -> MissionReport:
+        replies = self._bus.ask(self._keys.mission(order.robot), encode(order), ANSWER)
+        for reply in replies:
+            if reply.error:
+                return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reply.error))
+            try:
+                report = self._note(decode(reply.payload, MissionReport))
+            except InvalidMessage as error:
+                return self._note(MissionReport(order, MissionState.REFUSED, 0.0, str(error)))
+            if report.state is MissionState.RUNNING:
+                self._replace_older(order)
+            return report
+        reason = f"{order.robot} does not answer: it gets the mission when it is back within {EXPIRY:g} s"
+        return self._note(MissionReport(order, MissionState.SENT, 0.0, reason))
+
+    def _note(self, report: MissionReport) -> MissionReport:
+        """Keep a report, on the disk if the state is new; returns what holds."""
+        with self._turn:
+            before = self._reports.get(report.order.id)
+            if before is not None and not report.supersedes(before):
+                return before
+            self._reports[report.order.id] = report
+            if before is not None and before.state is report.state:
+                return report
+            kept = Missions.newest(list(self._reports.values()))
+            if len(self._reports) > MAX_KEPT:
+                self._reports = {report.order.id: report for report in kept.reports}
+            try:
+                self._store.put_result(KEPT, encode(kept))
+            except InvalidFile as error:
+                log.warning("mission %s is not on the disk: %s", report.order.id, error)
+            return report

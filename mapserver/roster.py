@@ -1,0 +1,113 @@
+"""The robots that the server hears of: their last status, whether they are alive, where they are."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from mapweave.hybridmap.agent_status import (
+    MAX_ROBOTS,
+    NO_COMPONENT,
+    AgentStatus,
+    FleetStatus,
+    RobotEntry,
+)
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.bus import Bus, Sample
+from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode
+
+
+class Roster:
+    """Listens until closed. Thread-safe."""
+
+    def __init__(
+        self, bus: Bus, keys: Keys, clock: Callable[[], float], hear: Callable[[AgentStatus], None]
+    ) -> None:
+        """Begin to listen.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            clock: only grows, s.
+            hear: called with each status.
+        """
+        self._keys, self._clock, self._hear = keys, clock, hear
+        self._turn = threading.Lock()
+        self._alive: dict[str, set[MapId]] = {}
+        self._heard: dict[str, tuple[AgentStatus, float]] = {}
+        self._closing = [
+            bus.subscribe(keys.agent_statuses(), self._take),
+            bus.watch(keys.agents_alive(), self._see),
+        ]
+
+    def close(self) -> None:
+        """Stop listening."""
+        for closing in self._closing:
+            closing.close()
+
+    def alive(self, robot: str) -> bool:
+        """Whether an agent of this name is there."""
+        with self._turn:
+            return bool(self._alive.get(robot))
+
+    def status(self, robot: str) -> AgentStatus | None:
+        """The last status of a robot; None if none has come."""
+        with self._turn:
+            return self._heard[robot][0] if robot in self._heard else None
+
+    def robots(self, merged: MergedMap) -> FleetStatus:
+        """All robots, with where they are in a merged map."""
+        now = self._clock()
+        with self._turn:
+            names = sorted({name for name, maps in self._alive.items() if maps} | self._heard.keys())
+            heard, alive = dict(self._heard), {name for name, maps in self._alive.items() if maps}
+        entries = []
+        for name in names[:MAX_ROBOTS]:
+            status, at = heard.get(name, (None, now))
+            pose, component = (None, NO_COMPONENT) if status is None else whereabouts(status, merged)
+            entries.append(RobotEntry(name, name in alive, max(now - at, 0.0), status, pose, component))
+        return FleetStatus(tuple(entries))
+
+    def _take(self, sample: Sample) -> None:
+        robot = self._keys.parse_agent_status(sample.key)
+        status = decode(sample.payload, AgentStatus)
+        with self._turn:
+            if robot in self._heard or len(self._heard) < MAX_ROBOTS:
+                self._heard[robot] = status, self._clock()
+        self._hear(status)
+
+    def _see(self, key: str, alive: bool) -> None:
+        map_id = self._keys.parse_agent_alive(key)
+        with self._turn:
+            maps = self._alive.setdefault(map_id.agent, set())
+            (maps.add if alive else maps.discard)(map_id)
+            if not maps:
+                del self._alive[map_id.agent]
+
+
+def whereabouts(status: AgentStatus, merged: MergedMap) -> tuple[Pose2 | None, int]:
+    """`merged_from_robot` and its component; None if the robot, or its map, is not placed."""
+    reported = status.status
+    if reported.fix_node is not None and reported.mission == "goto":
+        node, node_from_robot = reported.fix_node, reported.node_from_robot
+    elif reported.located and (nearest := _nearest(status.map, reported.map_from_robot, merged)) is not None:
+        node, node_from_robot = nearest
+    else:
+        return None, NO_COMPONENT
+    component = merged.component_of(node)
+    if component is None or node not in merged.poses:
+        return None, NO_COMPONENT
+    return merged.pose(node) @ node_from_robot, component
+
+
+def _nearest(map_id: MapId, map_from_robot: Pose2, merged: MergedMap) -> tuple[NodeId, Pose2] | None:
+    """The nearest node of the robot's own map that has a merged pose, and the robot's pose from there."""
+    own = merged.maps.get(map_id)
+    placed = [] if own is None else [node for node in own.nodes.values() if node.id in merged.poses]
+    if not placed:
+        return None
+    near = min(placed, key=lambda node: map_from_robot.distance(node.map_from_robot.mean))
+    return near.id, near.map_from_robot.mean.inverse() @ map_from_robot

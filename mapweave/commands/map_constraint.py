@@ -1,0 +1,104 @@
+"""Manual constraints on the command line: their options, and how they reach a server or a file."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapweave.commands.network import add_network
+
+if TYPE_CHECKING:
+    from mapweave.hybridmap.manual_constraint import Ends, ManualConstraint
+
+
+def add_constraint_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of every manual constraint."""
+    parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
+    parser.add_argument("--by", metavar="NAME", help="your name (default: the login name)")
+    parser.add_argument("--undo", action="store_true", help="take it back")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="in this map file; no server is asked")
+    parser.add_argument("-o", "--out", type=Path, metavar="OUT", help="with --map: write there instead")
+    parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
+    add_network(parser)
+
+
+def constrain(arguments: argparse.Namespace, ends: Ends) -> None:
+    """Set the constraint, and print its effect; afterwards `arguments.map` is the file that holds it.
+
+    Raises:
+        MapweaveError: the constraint has no effect, or there is no place to keep it.
+    """
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.manual_constraint import ManualConstraint
+
+    if arguments.out is not None and arguments.map is None:
+        raise InvalidValue("--out goes with --map: a server keeps its own record")
+    constraint = ManualConstraint(
+        ends, not arguments.undo, arguments.by or _login(), time.time_ns(), arguments.because
+    )
+    if arguments.map is None:
+        _send_to_server(arguments, constraint)
+    else:
+        _rewrite(arguments, constraint)
+        arguments.map = arguments.out or arguments.map
+
+
+def _login() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # no user of that number
+        return "a person"
+
+
+def _send_to_server(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
+    from mapweave.commands.map_ends import ask
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.log_messages import decode_record
+    from mapweave.wire.messages import encode
+
+    for reply in ask(arguments, Keys.any_constrain, encode(constraint)):
+        print(decode_record(reply.payload)["said"])
+    _settled(arguments)
+
+
+def _settled(arguments: argparse.Namespace) -> None:
+    """Wait until the server has merged with it, or the time is over."""
+    from mapweave.commands.map_ends import ask
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.log_messages import decode_record
+
+    end = time.monotonic() + arguments.timeout
+    while time.monotonic() < end:
+        if all(
+            decode_record(reply.payload)["settled"] for reply in ask(arguments, Keys.server_statuses, b"")
+        ):
+            return
+        time.sleep(0.1)
+    print("it is kept; the server is still merging, ask `mapweave map explain` later")
+
+
+def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
+    from mapweave.commands.map_merge import merged_with_progress
+    from mapweave.commands.network import settings_of
+    from mapweave.hybridmap.manual_constraint import ManualConstraints
+    from mapweave.mapserver.map_files import map_file_of, merged_of
+    from mapweave.mapserver.map_history import between
+    from mapweave.merge.manual_constraints import check_manual_constraint
+    from mapweave.offline_merge import parts_of
+    from mapweave.storage.atomic_file import check_place
+    from mapweave.storage.map_file import read_map_file, write_map_file
+
+    check_place(arguments.out or arguments.map)
+    settings = settings_of(arguments).merge
+    content = read_map_file(arguments.map, "merged")
+    before = merged_of(content, settings)
+    check_manual_constraint(before, ManualConstraints(content.constraints), constraint)
+    parts = parts_of({arguments.map: content})
+    merged = merged_with_progress(parts.maps, parts.constraints + ManualConstraints([constraint]), settings)
+    out = arguments.out or arguments.map
+    history = (*parts.history, *between(before, merged, constraint.stamp_ns))
+    write_map_file(out, map_file_of(merged, history))
+    print(f"{out}: {merged.summary()}")

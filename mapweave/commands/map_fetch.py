@@ -1,0 +1,36 @@
+"""`mapweave map fetch`: the merged map of a running server into a map file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mapweave.commands.missions import fleet_of
+from mapweave.commands.network import add_network
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "fetch",
+        help="the merged map of a running server into a file",
+        description="Write the merged map that a running server has now into a map file: "
+        "`mapweave map fetch office.mapweave`. The fleet goes on; `mapweave map show` shows the file.",
+    )
+    parser.add_argument("out", type=Path, metavar="OUT", help="the map file")
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fetch and write."""
+    from mapweave.storage.atomic_file import check_place, write_whole
+    from mapweave.storage.map_file import unpack_map_file
+
+    check_place(arguments.out)
+    with fleet_of(arguments) as fleet:
+        data = fleet.map_bytes()
+    write_whole(arguments.out, data)
+    print(f"{arguments.out}: {unpack_map_file(data).title}, {len(data) / 1e6:.1f} MB")
+    return 0

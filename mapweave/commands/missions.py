@@ -1,0 +1,147 @@
+"""`mapweave go`, `explore` and `stop`: missions for robots of a running fleet."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.network import add_network, network_of, settings_of
+
+if TYPE_CHECKING:
+    from mapweave.fleet import Fleet
+    from mapweave.hybridmap.agent_status import AgentStatus
+    from mapweave.hybridmap.mission_order import MissionReport
+
+NOT_DONE = 2
+"""Exit status: the robot has refused the mission, given it up, or got a newer one."""
+STATUS = (
+    "Exit status: 0 if the robot took the mission (with --wait: has done it), 2 if it did not, 1 if it "
+    "cannot be asked."
+)
+
+
+def add_to(commands: Any) -> None:
+    """Declare the commands."""
+    go: argparse.ArgumentParser = commands.add_parser(
+        "go",
+        help="send a robot to a node, a position or home",
+        description="Send a robot to a place of the merged map, where it parks: `mapweave go r0 r1.1.17` to "
+        "a node, `mapweave go r0 3.1,-2.0` to the node nearest to a position (m, in the frame of the robot's "
+        "component), `mapweave go r0 home` to the first node of its map. A goal that does not exist is "
+        f"refused; one that cannot be reached is given up, with the reason. {STATUS}",
+    )
+    go.add_argument("robot", help="the robot's name, for example r0")
+    go.add_argument("goal", metavar="GOAL", help="a node (r0.1.17), a position (3.1,-2.0) or home")
+    _add_common(go, 600.0)
+    go.set_defaults(run=lambda arguments: run(arguments, lambda f: f.go(arguments.robot, arguments.goal)))
+
+    explore: argparse.ArgumentParser = commands.add_parser(
+        "explore",
+        help="let a robot explore",
+        description="Let a robot map all floor that it can reach: `mapweave explore r0`. " + STATUS,
+    )
+    explore.add_argument("robot", help="the robot's name, for example r0")
+    _add_common(explore, 3600.0)
+    explore.set_defaults(run=lambda arguments: run(arguments, lambda f: f.explore(arguments.robot)))
+
+    stop: argparse.ArgumentParser = commands.add_parser(
+        "stop",
+        help="stop a robot, or all",
+        description="Stop a robot, `mapweave stop r0`, or all, `mapweave stop --all`. The order goes to the "
+        f"robots directly, and works without a map server. {STATUS}",
+    )
+    which = stop.add_mutually_exclusive_group(required=True)
+    which.add_argument("robot", nargs="?", help="the robot's name, for example r0")
+    which.add_argument("--all", action="store_true", help="every robot of the fleet")
+    _add_common(stop, None)
+    stop.set_defaults(run=run_stop)
+
+
+def _add_common(parser: argparse.ArgumentParser, patience: float | None) -> None:
+    if patience is not None:
+        parser.add_argument("--wait", action="store_true", help="wait until it is over, and say how it ended")
+        parser.add_argument(
+            "--timeout", type=float, default=patience, metavar="S",
+            help=f"with --wait: at most so long (default: {patience:g})",
+        )  # fmt: skip
+    parser.add_argument("--by", default="", metavar="NAME", help="your name (default: the login name)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_network(parser)
+
+
+def fleet_of(arguments: argparse.Namespace) -> Fleet:
+    """The fleet that the command line names; raises NotConnected."""
+    from mapweave.fleet import Fleet
+
+    network = network_of(arguments, settings_of(arguments))
+    return Fleet(network.endpoints, network.fleet, getattr(arguments, "by", ""))
+
+
+def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -> int:
+    """Give a mission, and wait for its end if that is wanted."""
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.node import check_name
+
+    if arguments.wait and not arguments.timeout > 0.0:
+        raise InvalidValue(f"--timeout {arguments.timeout:g}: give seconds")
+    check_name(arguments.robot)
+    with fleet_of(arguments) as fleet:
+        report = give(fleet)
+        if arguments.wait and report.open:
+            print(words(report), file=sys.stderr)
+            report = fleet.wait(report, arguments.timeout, _progress())
+    _print([report], arguments.json)
+    return _exit_status([report], arguments.wait)
+
+
+def run_stop(arguments: argparse.Namespace) -> int:
+    """Stop robots."""
+    from mapweave.hybridmap.node import check_name
+
+    robot = check_name(arguments.robot) if arguments.robot else ""
+    with fleet_of(arguments) as fleet:
+        reports = list(fleet.stop(robot))
+    if not reports and not arguments.json:
+        print("no robot is there")
+    _print(reports, arguments.json)
+    return _exit_status(reports, False)
+
+
+def words(report: MissionReport) -> str:
+    """One line."""
+    order = report.order
+    reason = f": {report.reason}" if report.reason else ""
+    return f"{order.robot}: {order.words}, mission {order.id}, {report.state}{reason}"
+
+
+def _progress() -> Callable[[MissionReport, AgentStatus], None]:
+    """Prints a line when the robot does something else."""
+    last = [""]
+
+    def show(report: MissionReport, status: AgentStatus) -> None:
+        if status.status.doing != last[0] and report.open:
+            last[0] = status.status.doing
+            print(f"{status.robot}: {last[0]} ({report.progress:.0%})", file=sys.stderr, flush=True)
+
+    return show
+
+
+def _print(reports: list[MissionReport], as_json: bool) -> None:
+    if not as_json:
+        for report in reports:
+            print(words(report))
+        return
+    import json
+
+    from mapweave.mapserver.http.json_values import json_values
+
+    print(json.dumps({"missions": [json_values(report) for report in reports]}))
+
+
+def _exit_status(reports: list[MissionReport], waited: bool) -> int:
+    from mapweave.hybridmap.mission_order import MissionState
+
+    good = {MissionState.DONE} if waited else {MissionState.DONE, MissionState.RUNNING, MissionState.SENT}
+    return 0 if all(report.state in good for report in reports) else NOT_DONE

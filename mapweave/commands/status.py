@@ -1,0 +1,141 @@
+"""`mapweave status`: what every robot of a running fleet is doing."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.missions import fleet_of
+from mapweave.commands.network import add_network
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
+
+SILENT = 5.0
+"""A robot that has sent nothing for longer is shown as silent, s; it sends twice a second."""
+WIDE = 400
+"""Characters of a line that no terminal shows."""
+COLUMNS = ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "last trouble")
+LEAST = 12
+"""Characters that a column of words keeps on a narrow terminal."""
+EVERY = 0.5
+"""Time between two looks, s."""
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "status",
+        help="what every robot is doing",
+        description="List the robots of a running fleet: mission and how far it is, what each is doing, "
+        "where it is in the merged map, battery (if its driver tells it), changes that no server has yet, "
+        "the age of its last message, its last trouble. Example: `mapweave status --watch`. Without a map "
+        "server the robots are asked themselves; their places in the merged map are then unknown.",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object; with --watch one a line")
+    parser.add_argument("--watch", action="store_true", help="go on until interrupted")
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Ask and print."""
+    from rich.console import Console
+    from rich.live import Live
+
+    with fleet_of(arguments) as fleet:
+        if arguments.json:
+            while True:
+                _print_json(fleet.status())
+                if not arguments.watch:
+                    return 0
+                time.sleep(EVERY)
+        # A line a robot where another program reads.
+        console = Console(width=None if sys.stdout.isatty() else WIDE)
+        if not arguments.watch:
+            status = fleet.status()
+            console.print(table(status, console.width) if status.robots else "no robot is there")
+            return 0
+        with Live(table(fleet.status(), console.width), console=console, auto_refresh=False) as live:
+            while True:
+                time.sleep(EVERY)
+                live.update(table(fleet.status(), console.width), refresh=True)
+
+
+def table(status: FleetStatus, width: int) -> Table:
+    """One line a robot.
+
+    Args:
+        status: of the fleet.
+        width: characters of a line; what is long is cut, and nothing else.
+    """
+    from rich.markup import escape
+    from rich.table import Table
+
+    rows = [cells(robot) for robot in status.robots]
+    widest = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
+    doing, trouble = COLUMNS.index("doing"), COLUMNS.index("last trouble")
+    over = sum(widest) + len(COLUMNS) - 1 - width
+    for column in (trouble, doing):
+        cut = min(max(over, 0), max(widest[column] - LEAST, 0))
+        widest[column], over = widest[column] - cut, over - cut
+    lines = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for column, name in enumerate(COLUMNS):
+        number = name in ("nodes", "battery", "unsent")
+        lines.add_column(
+            name,
+            justify="right" if number else "left",
+            no_wrap=True,
+            width=widest[column],
+            overflow="ellipsis",
+        )
+    for row in rows:
+        lines.add_row(*map(escape, row))
+    return lines
+
+
+def cells(robot: RobotEntry) -> tuple[str, ...]:
+    """A robot's line: name, mission, doing, place, nodes, battery, unsent changes, age, trouble."""
+    status = robot.status
+    age = "gone" if not robot.alive else f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
+    if status is None:
+        return robot.robot, "", "", "", "", "", "", age, ""
+    doing = status.status
+    mission = ""
+    if (report := status.mission) is not None:
+        percent = f" {report.progress:.0%}" if report.order.node is not None and report.open else ""
+        mission = f"{report.order.words} {report.state}{percent}"
+    return (
+        robot.robot,
+        mission,
+        f"{doing.doing}: {doing.detail}" if doing.detail else doing.doing,
+        _place(robot),
+        str(doing.nodes),
+        "" if status.battery is None else f"{status.battery:.0%}",
+        str(status.unsent),
+        age,
+        f"{status.last_error} ({status.error_age:.0f} s ago)" if status.last_error else "",
+    )
+
+
+def _place(robot: RobotEntry) -> str:
+    pose, status = robot.merged_from_robot, robot.status
+    if pose is not None:
+        part = f" in part {robot.component}" if robot.component > 0 else ""
+        return f"{pose.x:.2f},{pose.y:.2f} {math.degrees(pose.heading):.0f}°{part}"
+    if status is not None and status.status.fix_node is not None:
+        return f"near {status.status.fix_node}"
+    return "unknown"
+
+
+def _print_json(status: FleetStatus) -> None:
+    import json
+
+    from mapweave.mapserver.http.json_values import json_values
+
+    print(json.dumps(json_values(status)), flush=True)

@@ -1,0 +1,278 @@
+"""A running fleet, from Python: who is doing what, missions, the merged map.
+
+with mapweave.Fleet() as fleet:
+    for robot in fleet.status().robots:
+        print(robot.robot, robot.status.status.doing)
+    fleet.go("r0", "r1.1.5", wait=120.0)
+"""
+
+from __future__ import annotations
+
+import getpass
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import TracebackType
+
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
+from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.mission_order import (
+    MissionKind,
+    MissionOrder,
+    MissionReport,
+    MissionRequest,
+    Missions,
+    MissionState,
+    new_id,
+)
+from mapweave.hybridmap.node import NodeId, check_name
+from mapweave.storage.map_file import MapFile, unpack_map_file
+from mapweave.wire.bus import Bus, Reply, Sample
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode, encode
+from mapweave.wire.zenoh_bus import ZenohBus
+
+SOON = 2.0
+"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
+PACKING = 120.0
+"""How long a server may take to pack a large map, s."""
+TRIES = 3
+"""A mission given by a clock that is behind is given again, later than the robot's present one."""
+
+
+def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0) -> MissionReport:
+    """Give a robot an order directly; returns what has become of it.
+
+    Raises:
+        NotConnected: the robot does not answer, or does not take it.
+    """
+    replies = bus.ask(keys.mission(order.robot), encode(order), timeout)
+    if not replies or replies[0].error:
+        why = replies[0].error if replies else "no answer"
+        raise NotConnected(f"robot {order.robot} did not take its mission: {why}")
+    return decode(replies[0].payload, MissionReport)
+
+
+def login() -> str:
+    """Name of the person, for records."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # no user of that number
+        return "a person"
+
+
+class Fleet:
+    """A connection to a fleet. A context manager; its methods may be called from any thread."""
+
+    def __init__(
+        self,
+        connect: str | Sequence[str] = "tcp/127.0.0.1:7447",
+        fleet: str = "demo",
+        by: str = "",
+        bus: Bus | None = None,
+    ) -> None:
+        """Connect.
+
+        Args:
+            connect: Zenoh endpoint of the router, or several, of which the first in reach is taken.
+            fleet: its name.
+            by: gives the missions; the login name by default.
+            bus: a connection to use instead; it stays the caller's.
+
+        Raises:
+            NotConnected: there is no router.
+        """
+        self._keys = Keys(check_name(fleet))
+        self._by = (by or login())[:64]
+        self._own: ZenohBus | None = None
+        if bus is None:
+            endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
+            bus = self._own = ZenohBus(BusSettings(mode="client", endpoints=endpoints))
+            if not self._own.wait_connected(SOON):
+                self._own.close()
+                raise NotConnected(
+                    f"no router at {', '.join(endpoints)}: start `mapweave server`, or give --connect"
+                )
+        self._bus = bus
+
+    def __enter__(self) -> Fleet:
+        """Nothing more to do."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Disconnect."""
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect. Idempotent."""
+        if self._own is not None:
+            self._own.close()
+
+    def status(self) -> FleetStatus:
+        """All robots, as the map server sees them; without one, those that answer themselves."""
+        for reply in self._ask(self._keys.any_robots(), b"", SOON):
+            return decode(reply.payload, FleetStatus)
+        robots = []
+        for reply in self._ask(self._keys.agent_statuses(), b"", SOON):
+            status = decode(reply.payload, AgentStatus)
+            robots.append(RobotEntry(status.robot, True, 0.0, status))
+        return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
+
+    def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
+        """The missions that the map server knows of, oldest first.
+
+        Args:
+            robot: of this robot alone.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        replies = self._ask(self._keys.any_missions(), b"", SOON)
+        if not replies:
+            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+        reports = decode(replies[0].payload, Missions).reports
+        return tuple(report for report in reports if robot in ("", report.order.robot))
+
+    def go(self, robot: str, goal: str, wait: float = 0.0) -> MissionReport:
+        """Send a robot to a node (`r0.1.17`), a position in the merged map (`3.1,-2.0`) or `home`.
+
+        Args:
+            robot: which.
+            goal: where to.
+            wait: until it is there or has given up, s at most.
+
+        Raises:
+            MapweaveError: the robot or the goal does not exist, or the robot does not answer.
+        """
+        return self._give(robot, MissionKind.GO, goal, wait)
+
+    def explore(self, robot: str, wait: float = 0.0) -> MissionReport:
+        """Let a robot map all floor that it can reach; see `go`."""
+        return self._give(robot, MissionKind.EXPLORE, "", wait)
+
+    def carried(self, robot: str) -> MissionReport:
+        """Let a robot map while a person moves it; see `go`."""
+        return self._give(robot, MissionKind.CARRIED, "", 0.0)
+
+    def stop(self, robot: str = "") -> tuple[MissionReport, ...]:
+        """Stop a robot, or all of them; the orders go to the robots directly, and at once.
+
+        Raises:
+            NotConnected: one does not answer; the others are stopped.
+        """
+        names = [robot] if robot else [entry.robot for entry in self.status().robots if entry.alive]
+        reports, silent = [], []
+        for name in names:
+            try:
+                reports.append(self._direct(check_name(name), MissionKind.STOP, None, ""))
+            except NotConnected as error:
+                silent.append(str(error))
+        if silent:
+            raise NotConnected("; ".join(silent))
+        return tuple(reports)
+
+    def wait(
+        self,
+        mission: MissionReport,
+        seconds: float,
+        on_report: Callable[[MissionReport, AgentStatus], None] = lambda report, status: None,
+    ) -> MissionReport:
+        """Wait until a mission is over; returns its last report, which is open if the time is over first.
+
+        Args:
+            mission: as it was given.
+            seconds: at most.
+            on_report: called with each status of the robot.
+        """
+        order, over = mission.order, threading.Event()
+        last = [mission]
+
+        def hear(sample: Sample) -> None:
+            status = decode(sample.payload, AgentStatus)
+            report = status.mission
+            if report is None:
+                return
+            if report.order.id == order.id:
+                last[0] = report
+                on_report(report, status)
+            elif report.order.rank > order.rank:
+                reason = f"by mission {report.order.id} of {report.order.by}"
+                last[0] = replace(last[0], state=MissionState.REPLACED, reason=reason)
+            if not last[0].open:
+                over.set()
+
+        listening = self._bus.subscribe(self._keys.agent_status(order.robot), hear)
+        try:
+            if mission.open:
+                over.wait(seconds)
+        finally:
+            listening.close()
+        return last[0]
+
+    def map_bytes(self) -> bytes:
+        """The merged map as the bytes of a map file.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        replies = self._ask(self._keys.any_server_map(), b"", PACKING)
+        if not replies:
+            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+        unpack_map_file(replies[0].payload)
+        return replies[0].payload
+
+    def map(self) -> MapFile:
+        """The merged map; see `map_bytes`."""
+        return unpack_map_file(self.map_bytes())
+
+    def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
+        """By way of the map server; without one directly."""
+        check_name(robot)
+        report, after_ns = None, 0
+        for _ in range(TRIES):
+            stamp_ns = max(time.time_ns(), after_ns + 1)
+            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal)
+            replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * SOON)
+            taken = [reply for reply in replies if not reply.error]
+            if not taken and replies:
+                raise InvalidValue(replies[0].error.removeprefix("refused: "))
+            if not taken:
+                report = self._direct(robot, kind, _node(goal), goal)
+                break
+            report = decode(taken[0].payload, MissionReport)
+            if report.state is not MissionState.REPLACED:
+                break
+            after_ns = self._newest(robot)
+        assert report is not None, "it was tried"
+        return self.wait(report, wait) if wait > 0.0 else report
+
+    def _direct(self, robot: str, kind: MissionKind, node: NodeId | None, goal: str) -> MissionReport:
+        after_ns = 0
+        for _ in range(TRIES):
+            order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal)
+            report = send_order(self._bus, self._keys, order, SOON)
+            if report.state is not MissionState.REPLACED:
+                break
+            after_ns = self._newest(robot)
+        return report
+
+    def _newest(self, robot: str) -> int:
+        """Stamp of the mission that holds a robot."""
+        for reply in self._ask(self._keys.agent_status(robot), b"", SOON):
+            report = decode(reply.payload, AgentStatus).mission
+            return 0 if report is None else report.order.stamp_ns
+        return 0
+
+    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
+        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
+
+
+def _node(goal: str) -> NodeId | None:
+    try:
+        return NodeId.parse(goal) if goal else None
+    except InvalidValue:
+        raise InvalidValue(f"goal {goal!r}: without a map server give a node, r0.1.17 for example") from None

@@ -1,0 +1,206 @@
+"""Which mission holds: orders that come twice, late or never, robots switched off, servers that go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.agent.mission import Explore, GoTo, Idle
+from mapweave.agent.mission_control import GONE, MissionControl, as_mission
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.settings import WithoutServer
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.mission_order import (
+    MAX_KEPT,
+    MissionKind,
+    MissionOrder,
+    MissionReport,
+    MissionState,
+)
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+
+GOAL, HOME, NOWHERE = NodeId("r1", 1, 5), NodeId("r0", 1, 1), NodeId("r0", 1, 999)
+
+
+def order(
+    stamp_ns: int, kind: MissionKind = MissionKind.GO, name: str = "", node: NodeId = GOAL
+) -> MissionOrder:
+    return MissionOrder(
+        name or f"m{stamp_ns}", "r0", kind, stamp_ns, "anna", node if kind is MissionKind.GO else None
+    )
+
+
+def status(*, finished: bool = False, given_up: bool = False, progress: float = 0.0, why: str = "") -> Status:
+    return Status("x", why, 0, 0, Pose2(), finished, given_up=given_up, progress=progress)
+
+
+class Disk:
+    """Keeps reports as the journal does."""
+
+    def __init__(self) -> None:
+        self.rows: dict[str, MissionReport] = {}
+
+    def keep(self, reports) -> None:
+        self.rows.update({report.order.id: report for report in reports})
+
+    def robot(self, without_server: WithoutServer = WithoutServer.GO_ON) -> MissionControl:
+        control = MissionControl("r0", self.rows.values(), self.keep, without_server)
+        control.unknown_goal = lambda node: "no such node" if node == NOWHERE else ""
+        return control
+
+
+kinds = st.sampled_from([MissionKind.GO, MissionKind.STOP, MissionKind.EXPLORE])
+given_orders = st.lists(
+    st.builds(order, st.integers(0, 6), kinds, st.sampled_from("abcdefgh"), st.sampled_from([GOAL, NOWHERE])),
+    min_size=1, max_size=12, unique_by=lambda one: one.id,
+)  # fmt: skip
+
+
+@given(given_orders, st.data())
+def test_the_newest_order_holds_however_they_come(orders: list[MissionOrder], data: st.DataObject) -> None:
+    """Lost, doubled, out of order, with steps of the robot and power failures in between."""
+    disk = Disk()
+    control, over, arrived = disk.robot(), {}, set()
+    comings = data.draw(st.lists(st.sampled_from(orders), max_size=24))
+    for coming in comings:
+        report = control.take(coming)
+        arrived.add(coming)
+        assert report.order == coming
+        assert control.take(coming) == report, "twice is once"
+        applied = control.next(True, 0.0, HOME)
+        holds = max((o for o in arrived if o.node != NOWHERE), key=lambda o: o.rank, default=None)
+        held = control.report
+        assert (held.order if held else None) == holds
+        if applied is not None:
+            assert holds is not None and held is not None
+            assert applied == as_mission(holds) if held.open else applied in (as_mission(holds), Idle())
+        if data.draw(st.booleans()):
+            control.follow(status(finished=data.draw(st.booleans()), given_up=data.draw(st.booleans())))
+        for one in arrived:
+            known = control.take(one)
+            if one.id in over and one.kind is not MissionKind.EXPLORE:
+                assert known == over[one.id], "what is over stays over"
+            if not known.open:
+                over[one.id] = known
+        if data.draw(st.booleans()):
+            before = {one.id: control.take(one) for one in arrived}
+            control = disk.robot()
+            assert (control.report.order if control.report else None) == holds
+            for one in arrived:
+                if one.kind is not MissionKind.EXPLORE and before[one.id].state is not MissionState.RUNNING:
+                    assert control.take(one) == before[one.id]
+
+
+def test_a_goal_that_is_known_not_to_exist_is_refused_and_the_mission_goes_on() -> None:
+    control = Disk().robot()
+    control.take(order(1))
+    assert control.take(order(2, node=NOWHERE)) == MissionReport(
+        order(2, node=NOWHERE), MissionState.REFUSED, 0.0, "no such node"
+    )
+    assert control.report == MissionReport(order(1), MissionState.RUNNING)
+
+
+def test_the_end_is_reported_with_its_reason() -> None:
+    for end, state in (
+        (status(finished=True), MissionState.DONE),
+        (status(given_up=True), MissionState.FAILED),
+    ):
+        control = Disk().robot()
+        control.take(order(1))
+        assert control.next(True, 0.0, None) == GoTo(GOAL)
+        assert not control.follow(status(progress=0.5, why="0.4 m to node r1.1.5"))
+        assert control.report == MissionReport(order(1), MissionState.RUNNING, 0.5)
+        assert control.follow(end)
+        assert control.report is not None and control.report.state is state
+        assert control.next(True, 1.0, None) is None, "it holds its place"
+
+
+def test_an_order_that_comes_during_a_tick_is_not_ended_by_what_the_one_before_has_reached() -> None:
+    control = Disk().robot()
+    control.take(order(1))
+    control.next(True, 0.0, None)
+    control.take(order(2, node=HOME))
+    assert not control.follow(status(finished=True))
+    assert control.report == MissionReport(order(2, node=HOME), MissionState.RUNNING)
+
+
+def test_a_robot_that_is_switched_on_again_goes_on(tmp_path: Path) -> None:
+    """By the real journal: it seeks the goal that it had, and not one that it has reached."""
+
+    def restarted(*ends: Status) -> MissionControl:
+        journal = Journal(tmp_path / "r0.sqlite", "r0")
+        control = MissionControl("r0", journal.missions(), journal.keep_missions)
+        control.next(True, 0.0, None)
+        for end in ends:
+            control.follow(end)
+        journal.close()
+        return control
+
+    journal = Journal(tmp_path / "r0.sqlite", "r0")
+    control = MissionControl("r0", journal.missions(), journal.keep_missions)
+    control.begin(MissionKind.EXPLORE)
+    explored = control.report
+    assert explored is not None
+    control.take(order(explored.order.stamp_ns + 1))
+    journal.close()
+    control = restarted()
+    assert control.report is not None and control.report.order.node == GOAL and control.report.open
+    assert restarted(status(finished=True)).report == control.report.__class__(
+        control.report.order, MissionState.DONE, 1.0
+    )
+    again = restarted()
+    assert again.report is not None and again.report.state is MissionState.DONE
+    assert again._applied == (again.report.order.id, Idle()), "it is there already, and stays"
+    assert again.take(explored.order).state is MissionState.REPLACED
+
+
+def test_a_full_disk_does_not_keep_a_robot_from_stopping() -> None:
+    def full(reports) -> None:
+        raise InvalidFile("no space left")
+
+    control = MissionControl("r0", keep=full)
+    control.take(order(1))
+    assert control.take(order(2, MissionKind.STOP)).state is MissionState.RUNNING
+    assert control.next(True, 0.0, None) == Idle()
+
+
+def test_an_order_for_another_robot_is_refused() -> None:
+    with pytest.raises(InvalidValue, match="a mission of r0 came to r1"):
+        MissionControl("r1").take(order(1))
+
+
+def test_many_missions_do_not_fill_the_disk() -> None:
+    control = MissionControl("r0")
+    for stamp in range(MAX_KEPT + 20):
+        control.take(order(stamp))
+    for stamp in range(MAX_KEPT + 20, 3 * MAX_KEPT):
+        control.take(order(stamp, node=NOWHERE))
+    assert len(control._reports) == MAX_KEPT and control.report is not None
+
+
+@pytest.mark.parametrize(
+    ("setting", "home", "does", "reason"),
+    [
+        (WithoutServer.GO_ON, HOME, None, ""),
+        (WithoutServer.STAND, HOME, Idle(), "stands: no map server for 10 s"),
+        (WithoutServer.HOME, HOME, GoTo(HOME), "goes home: no map server for 10 s"),
+        (WithoutServer.HOME, None, Idle(), "stands: no map server for 10 s"),
+    ],
+)
+def test_a_robot_whose_server_is_gone_does_as_it_is_set(setting, home, does, reason) -> None:
+    control = Disk().robot(setting)
+    control.take(order(1, MissionKind.EXPLORE))
+    assert control.next(True, 0.0, home) == Explore()
+    assert control.next(False, GONE, home) is None, "a router that is started again takes a moment"
+    assert control.next(False, GONE + 0.1, home) == does
+    control.follow(status(finished=does is not None))
+    assert control.report is not None and control.report.state is MissionState.RUNNING
+    assert control.report.reason == reason
+    assert control.next(True, 60.0, home) == (None if does is None else Explore()), "and goes on"
+    control.follow(status())
+    assert control.report.reason == ""

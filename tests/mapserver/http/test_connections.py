@@ -1,0 +1,207 @@
+"""Connections of real clients: slow, broken, ambiguous or hostile ones block no other."""
+
+from __future__ import annotations
+
+import resource
+import socket
+import time
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.errors import NotConnected, SettingsError
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.mapserver.http import serving, web
+from mapweave.mapserver.http.serving import Limits
+from mapweave.mapserver.http.web import MOST_BYTES, Web, parse_address
+from tests.mapserver.http.client import ask, post, raw
+from tests.mapserver.stub_services import StubServices
+from tests.waiting import eventually
+
+
+@pytest.mark.parametrize(
+    ("head", "status"),
+    [
+        (b"Content-Length: 99999999999\r\n", b"413"),
+        (b"Content-Length: %d\r\nExpect: 100-continue\r\n" % (MOST_BYTES + 1), b"413"),
+        (b"Content-Length: -1\r\n", b"400"),
+        (b"Transfer-Encoding: chunked\r\n", b"411"),
+        (b"", b"411"),
+        (b"Content-Length: 0\r\n", b"400"),
+    ],
+)
+def test_lengths_that_are_refused_before_anything_is_read(served: Web, head: bytes, status: bytes) -> None:
+    got = raw(served, b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\n" + head + b"\r\n")
+    assert got.startswith(b"HTTP/1.1 " + status)
+    assert b'{"error":' in got
+    assert got.count(b"HTTP/1.1") == 1
+
+
+def test_a_too_long_request_gets_an_answer(served: Web) -> None:
+    status, answer = post(served, body=bytes(MOST_BYTES + 1))
+    assert (status, answer) == (413, {"error": "at most 16 MiB are taken"})
+
+
+HALF = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nabc"
+
+
+def test_closed_or_slow_connections_block_no_other(services: StubServices) -> None:
+    with Web(("127.0.0.1", 0), services, patience=0.5) as served:
+        # No client is left to read an answer.
+        assert raw(served, HALF, close=True) == b""
+        slow = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(web.MOST_AT_ONCE)]
+        for connection in slow:
+            connection.sendall(HALF)
+        begin = time.monotonic()
+        # All places are taken for a moment; the page is there all the same.
+        assert ask(served, "GET", "/")[0] == 200
+        while post(served)[0] != 200:
+            assert time.monotonic() < begin + 15.0
+            time.sleep(0.05)
+        assert slow[0].recv(65536).startswith(b"HTTP/1.1 408")
+        for connection in slow:
+            connection.close()
+
+
+def test_a_byte_now_and_then_takes_no_longer_than_anything_else(services: StubServices) -> None:
+    with (
+        Web(("127.0.0.1", 0), services, patience=0.5) as served,
+        socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
+    ):
+        slow.sendall(HALF)
+        assert drip(slow, b"x").startswith(b"HTTP/1.1 408")
+
+
+def test_a_head_that_never_ends_is_dropped(services: StubServices) -> None:
+    with (
+        Web(("127.0.0.1", 0), services, limits=Limits(head=0.5)) as served,
+        socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
+    ):
+        slow.sendall(b"GET /status HTTP/1.1\r\nHost: localhost\r\nX: ")
+        assert drip(slow, b"x") == b""
+
+
+def test_a_client_that_reads_nothing_is_dropped(services: StubServices) -> None:
+    services.events = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no" * 2000),) * 3000
+    with (
+        Web(("127.0.0.1", 0), services, limits=Limits(stall=0.5)) as served,
+        socket.socket() as slow,
+    ):
+        slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        slow.connect(("127.0.0.1", served.port))
+        slow.sendall(b"GET /history HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        eventually(lambda: served.connections == 1)
+        eventually(lambda: served.connections == 0)
+        assert len(ask(served, "GET", "/history")[2]) > 10_000_000
+
+
+def drip(connection: socket.socket, piece: bytes) -> bytes:
+    """Send a little now and then until there is an answer, or the end of the connection."""
+    begin = time.monotonic()
+    connection.settimeout(0.1)
+    while time.monotonic() < begin + 5.0:
+        try:
+            connection.sendall(piece)
+            return connection.recv(65536)
+        except TimeoutError:
+            continue
+        except ConnectionError:
+            return b""
+    raise AssertionError("it may go on for ever")
+
+
+def test_thousands_of_half_open_connections_block_no_other(served: Web) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
+    half = []
+    try:
+        for k in range(2000):
+            half.append(socket.create_connection(("127.0.0.1", served.port), timeout=20))
+            half[-1].sendall(
+                (b"", b"G", b"GET / HTTP/1.1\r\n", b"POST /relocalize HTTP/1.1\r\nHost: x")[k % 4]
+            )
+        begin = time.monotonic()
+        assert post(served)[0] == 200
+        assert ask(served, "GET", "/status")[0] == 200
+        assert time.monotonic() < begin + 5.0
+        assert served.connections <= serving.MAX_WAITING + 2
+    finally:
+        for connection in half:
+            connection.close()
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.parametrize(
+    ("head", "status"),
+    [
+        (b"Content-Length: 3\r\nTransfer-Encoding: chunked\r\n", b"400"),
+        (b"Content-Length: 3\r\nContent-Length: 4\r\n", b"400"),
+        (b"Transfer-Encoding: chunked\r\nTransfer-Encoding: identity\r\n", b"400"),
+        (b"Content-Length : 3\r\n", b"400"),
+        (b"Content-Length: +3\r\n", b"400"),
+        (b"Content-Length: 3\r\n X: y\r\n", b"400"),
+        (b"X: a\x00b\r\nContent-Length: 3\r\n", b"400"),
+    ],
+)
+def test_ambiguous_requests_are_answered_once(served: Web, head: bytes, status: bytes) -> None:
+    """What stands behind the first request is never taken for a second one."""
+    got = raw(
+        served,
+        b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\n" + head + b"\r\nabc"
+        b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n",
+    )
+    assert got.startswith(b"HTTP/1.1 " + status) and got.count(b"HTTP/1.1 ") == 1
+    assert b'{"error":' in got
+
+
+def test_one_request_a_connection(served: Web) -> None:
+    got = raw(served, b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
+    assert got.count(b"HTTP/1.1 200") == 1 and b"\r\nconnection: close\r\n" in got.lower()
+
+
+def test_a_server_that_is_closed_leaves_nothing_behind(services: StubServices) -> None:
+    with (
+        Web(("127.0.0.1", 0), services) as served,
+        socket.create_connection(("127.0.0.1", served.port)) as half,
+    ):
+        half.sendall(HALF)
+        eventually(lambda: served.connections == 1)
+        begin = time.monotonic()
+        served.close()
+        assert time.monotonic() < begin + 5.0
+        served.close()
+        with Web(("127.0.0.1", served.port), services) as again:
+            assert ask(again, "GET", "/status")[0] == 200
+
+
+def test_noise_instead_of_http(served: Web) -> None:
+    rng = np.random.default_rng(3)
+    for length in (1, 50, 5000):
+        raw(served, rng.bytes(length) + b"\r\n\r\n", close=True)
+    assert post(served)[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("8080", ("127.0.0.1", 8080)),
+        ("0.0.0.0:80", ("0.0.0.0", 80)),
+        ("robot.local:8080", ("robot.local", 8080)),
+        ("[::1]:8080", ("::1", 8080)),
+    ],
+)
+def test_addresses(text: str, address: tuple[str, int]) -> None:
+    assert parse_address(text) == address
+
+
+@pytest.mark.parametrize("text", ["", "x", ":80", "0", "65536", "-1", "a:b", "8080:", "²"])
+def test_addresses_that_are_none(text: str) -> None:
+    with pytest.raises(SettingsError, match=r"write a port, or HOST:PORT"):
+        parse_address(text)
+
+
+def test_a_port_that_is_taken(served: Web, services: StubServices) -> None:
+    with pytest.raises(NotConnected, match=r"cannot listen at http 127.0.0.1:\d+: the port is taken"):
+        Web(("127.0.0.1", served.port), services)
+    with pytest.raises(NotConnected, match=r"cannot listen at http 192.0.2.1:8080: "):
+        Web(("192.0.2.1", 8080), services)

@@ -1,0 +1,282 @@
+"""Missions by way of the map server: goals in words, robots that are away, a server that is started again."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+
+import pytest
+
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mission_control import MissionControl
+from mapweave.fleet import Fleet
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver import mission_relay
+from mapweave.mapserver.http import web as web_module
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.server import MapServer
+from mapweave.storage.map_file import unpack_map_file
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.mapserver.conftest import ROBOT, MappedRoom
+from tests.waiting import eventually
+
+KEYS = Keys("fleet")
+THERE = NodeId("r0", 1, 3)
+
+
+class House:
+    """A map server with a mapped room, robots that do nothing but say so, and a person."""
+
+    def __init__(self, mapped: MappedRoom) -> None:
+        self.mapped, self.hub = mapped, MemoryHub()
+        self.stack = ExitStack()
+        self.buses: list[MemoryBus] = []
+        self.start_server()
+        self.person = Fleet(fleet="fleet", by="anna", bus=self.bus())
+
+    def bus(self) -> MemoryBus:
+        self.buses.append(MemoryBus(self.hub))
+        return self.buses[-1]
+
+    def start_server(self) -> None:
+        self.server: MapServer = self.stack.enter_context(MapServer(self.bus(), KEYS, self.mapped.path, "s0"))
+        eventually(lambda: self.server.status()["nodes"] == 7)
+
+    def stop_server(self) -> None:
+        self.stack.close()
+
+    def robot(self, name: str = "r0") -> tuple[FleetClient, MissionControl]:
+        control = MissionControl(name)
+        link = FleetClient(self.bus(), KEYS, replace_agent(name), control)
+        link.report(Status("standing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "explore", located=True), 1)
+        eventually(lambda: self.entry(name).status is not None)
+        return link, control
+
+    def entry(self, name: str):
+        entries = {entry.robot: entry for entry in self.person.status().robots}
+        return entries.get(name, type("Nothing", (), {"status": None, "alive": False}))
+
+    def close(self) -> None:
+        self.stop_server()
+        for bus in self.buses:
+            bus.close()
+
+
+def replace_agent(name: str):
+    return ROBOT._replace(agent=name)
+
+
+@pytest.fixture
+def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
+    house = House(mapped_room())
+    yield house
+    house.close()
+
+
+def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
+    link, control = house.robot()
+    entry = house.entry("r0")
+    assert entry.alive and entry.component == 0
+    begin = min(house.mapped.truth)
+    assert entry.merged_from_robot is not None
+    assert entry.merged_from_robot.distance(Pose2(0.0, 0.1)) < 0.1, "the room lies in r0's own frame"
+    report = house.person.go("r0", str(THERE))
+    assert report == control.report and report.state is MissionState.RUNNING
+    assert (report.order.node, report.order.by) == (THERE, "anna")
+    assert house.person.go("r0", "home").order.node == begin
+    (first, second) = house.person.missions()
+    assert (first.state, second.state) == (MissionState.REPLACED, MissionState.RUNNING)
+    control.next(True, 0.0, None)
+    control.follow(Status("gave up", "a wall", 7, 0, Pose2(), False, given_up=True))
+    waited = house.person.wait(second, 0.0)
+    assert waited.open, "nothing has been heard yet"
+    link.report(Status("gave up", "a wall", 7, 0, Pose2(), False), 2)
+    eventually(lambda: house.person.missions()[-1].state is MissionState.FAILED)
+    assert house.person.missions("r0")[-1].reason == "a wall" and house.person.missions("r9") == ()
+    assert house.entry("r0").status.mission.reason == "a wall"
+    link.close()
+
+
+@pytest.mark.parametrize(
+    ("goal", "reason"),
+    [
+        ("r9.1.1", "goal r9.1.1 is not in the merged map"),
+        ("kitchen", "goal 'kitchen': give a node"),
+        ("1,2,3", "give a node"),
+        ("1e400,0", "give a node"),
+        ("50,50", "nothing is mapped within 2 m of 50,50: the nearest node is r0.1"),
+    ],
+)
+def test_a_goal_that_does_not_exist_is_refused_at_once(house: House, goal: str, reason: str) -> None:
+    link, control = house.robot()
+    with pytest.raises(InvalidValue, match=reason):
+        house.person.go("r0", goal)
+    assert control.report is None and house.person.missions() == ()
+    link.close()
+
+
+def test_a_position_leads_to_the_nearest_node(house: House) -> None:
+    link, _ = house.robot()
+    merged = house.server._worker.current().merged
+    place = merged.pose(THERE)
+    report = house.person.go("r0", f"{place.x + 0.01:.3f}, {place.y - 0.01:.3f}")
+    assert report.order.node is not None
+    assert merged.pose(report.order.node).distance(place) < 0.05
+    link.close()
+
+
+def test_a_robot_that_is_away_gets_its_newest_mission_when_it_is_back(house: House) -> None:
+    link, _ = house.robot()
+    link.close()
+    eventually(lambda: not house.entry("r0").alive)
+    first = house.person.go("r0", str(THERE))
+    assert first.state is MissionState.SENT and "when it is back" in first.reason
+    second = house.person.explore("r0")
+    house.stop_server()
+    house.start_server()
+    states = [report.state for report in house.person.missions()]
+    assert states == [MissionState.REPLACED, MissionState.SENT], "the record outlasts the server"
+    link, control = house.robot()
+    eventually(lambda: control.report is not None)
+    assert control.report == MissionReport(second.order, MissionState.RUNNING)
+    eventually(lambda: house.person.missions()[-1].state is MissionState.RUNNING)
+    link.close()
+
+
+def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    link, _ = house.robot()
+    link.close()
+    eventually(lambda: not house.entry("r0").alive)
+    monkeypatch.setattr(mission_relay, "EXPIRY", 0.0)
+    house.person.explore("r0")
+    eventually(lambda: house.person.missions()[-1].state is MissionState.FAILED)
+    assert "did not answer within 0 s" in house.person.missions()[-1].reason
+
+
+def test_a_robot_that_was_never_heard_of_gets_no_mission(house: House) -> None:
+    with pytest.raises(InvalidValue, match="no robot r7 has been heard of"):
+        house.person.explore("r7")
+
+
+def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
+    link, control = house.robot()
+    other, _ = house.robot("r1")
+    house.stop_server()
+    assert house.person.go("r0", "r1.1.5").state is MissionState.RUNNING
+    with pytest.raises(InvalidValue, match="without a map server give a node"):
+        house.person.go("r0", "1,2")
+    assert {report.order.robot for report in house.person.stop()} == {"r0", "r1"}
+    assert control.report is not None and control.report.order.kind is MissionKind.STOP
+    assert [entry.robot for entry in house.person.status().robots] == ["r0", "r1"]
+    for call in (house.person.missions, house.person.map_bytes):
+        with pytest.raises(NotConnected, match="no map server of fleet fleet answers"):
+            call()
+    link.close()
+    other.close()
+    with pytest.raises(NotConnected, match="robot r0 did not take its mission: no answer"):
+        house.person.stop("r0")
+
+
+@pytest.mark.parametrize("with_server", [True, False])
+def test_a_person_whose_clock_is_behind_can_still_stop_a_robot(house: House, with_server: bool) -> None:
+    link, control = house.robot()
+    ahead = MissionOrder("late", "r0", MissionKind.EXPLORE, 2**62, "bob")
+    control.take(ahead)
+    if not with_server:
+        house.stop_server()
+    (report,) = house.person.stop("r0")
+    assert report.state is MissionState.RUNNING and report.order.rank > ahead.rank
+    again = house.person.go("r0", "r1.1.1" if not with_server else str(THERE))
+    assert again.state is MissionState.RUNNING and control.report == replace(again, reason="")
+    link.close()
+
+
+def test_the_map_comes_as_a_map_file(house: House) -> None:
+    assert len(house.person.map().poses) == 7
+
+
+# Over HTTP
+
+
+def ask(web: Web, method: str, path: str, **headers: str) -> tuple[int, dict]:
+    connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=20)
+    connection.request(method, path, b"", headers)
+    reply = connection.getresponse()
+    content = reply.read()
+    connection.close()
+    return reply.status, json.loads(content)
+
+
+def test_over_http_robots_are_sent_stopped_and_seen(house: House) -> None:
+    link, control = house.robot()
+    with Web(("127.0.0.1", 0), house.server) as web:
+        (robot,) = ask(web, "GET", "/robots")[1]["robots"]
+        assert (robot["robot"], robot["alive"], robot["status"]["status"]["doing"]) == (
+            "r0",
+            True,
+            "standing",
+        )
+        assert robot["merged_from_robot"] == pytest.approx([0.0, 0.1, 0.0], abs=0.1)
+        status, report = ask(web, "POST", f"/robots/r0/go?goal={THERE}&by=anna&id=first")
+        assert (status, report["state"]) == (200, "running")
+        assert (report["order"]["node"], report["order"]["by"]) == (str(THERE), "anna")
+        assert ask(web, "POST", f"/robots/r0/go?goal={THERE}&id=first")[1] == report, "twice is once"
+        assert ask(web, "POST", "/robots/r0/explore")[1]["order"]["kind"] == "explore"
+        (stopped,) = ask(web, "POST", "/stop")[1]["reports"]
+        assert control.report is not None and control.report.order.id == stopped["order"]["id"]
+        kinds = [report["order"]["kind"] for report in ask(web, "GET", "/missions")[1]["reports"]]
+        assert kinds == ["go", "explore", "stop"]
+        connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=20)
+        connection.request("GET", "/map")
+        assert len(unpack_map_file(connection.getresponse().read()).poses) == 7
+        connection.close()
+    link.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "reason"),
+    [
+        ("/robots/r0/go?goal=r9.1.1", 400, "goal r9.1.1 is not in the merged map"),
+        ("/robots/r0/go", 400, "give goal"),
+        ("/robots/r0/stop?goal=r0.1.1", 400, "takes no goal"),
+        ("/robots/r7/explore", 400, "no robot r7"),
+        ("/robots/R%200/stop", 400, "name"),
+        ("/robots/r0/fly", 404, "there is no mission 'fly'"),
+        ("/robots/r0/stop?id=No%20Name", 400, "name"),
+    ],
+)
+def test_over_http_nonsense_is_refused(house: House, path: str, status: int, reason: str) -> None:
+    link, control = house.robot()
+    with Web(("127.0.0.1", 0), house.server) as web:
+        got, answer = ask(web, "POST", path)
+        assert got == status and reason in answer["error"]
+        assert ask(web, "GET", "/robots/r0/stop")[0] == 405
+    assert control.report is None
+    link.close()
+
+
+def test_robots_are_moved_from_this_machine_and_its_own_pages_alone(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, control = house.robot()
+    with Web(("127.0.0.1", 0), house.server) as web:
+        assert ask(web, "POST", "/robots/r0/stop", Origin="http://evil.example")[0] == 403
+        monkeypatch.setattr(web_module, "is_loopback", lambda host: False)
+        for path in ("/robots/r0/stop", "/stop"):
+            status, answer = ask(web, "POST", path)
+            assert status == 403 and "--http-commands" in answer["error"]
+        assert control.report is None and ask(web, "GET", "/robots")[0] == 200
+    with Web(("127.0.0.1", 0), house.server, commands=True) as web:
+        assert ask(web, "POST", "/robots/r0/stop")[0] == 200
+    link.close()
+    monkeypatch.undo()
+    hosts = ("127.0.0.1", "::1", "10.0.0.1", "localhost", "")
+    assert [web_module.is_loopback(host) for host in hosts] == [True, True, False, False, False]

@@ -1,0 +1,134 @@
+"""Robots are commanded from the shell: real processes, of which some are killed."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from mapweave.cli import main
+from mapweave.commands.missions import NOT_DONE
+from mapweave.commands.status import cells, table
+from mapweave.fleet import Fleet
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.children import Children, free_port
+from mapweave.storage.map_file import read_map_file
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
+from tests.mapweave.command_line import complaint
+from tests.mapweave.test_kept_maps import PATIENCE, Body
+from tests.waiting import eventually
+
+FLEET = "kept"
+
+
+@pytest.mark.timeout(600)
+def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_killed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    network = ["--fleet", FLEET, "--connect", endpoint]
+    bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
+
+    def shell(*words: str) -> tuple[int, str]:
+        code = main([*words, *network])
+        return code, capfd.readouterr().out
+
+    try:
+        with Children(tmp_path / "logs") as children:
+
+            def start_server() -> None:
+                data = str(tmp_path / "server")
+                children.start("server", ["server", "--fleet", FLEET, "--listen", endpoint, "--data", data])
+                eventually(lambda: bus.ask(Keys(FLEET).any_robots(), b"", 1.0), PATIENCE)
+
+            def start_robot(*more: str) -> None:
+                data = str(tmp_path / "agents")
+                children.start("r0", ["agent", "r0", "--data", data, *network, *more])
+
+            def robot(alive: bool = True) -> dict:
+                """The robot's line; waits until it is there, or gone."""
+                found: list[dict] = []
+
+                def look() -> bool:
+                    children.check()
+                    robots = json.loads(shell("status", "--json")[1])["robots"]
+                    found[:] = [one for one in robots if one["alive"] is alive and one["status"]]
+                    return bool(found)
+
+                eventually(look, PATIENCE)
+                return found[0]
+
+            start_server()
+            Body(bus)
+            start_robot("--mission", "carried")
+            eventually(lambda: robot()["status"]["status"]["nodes"] >= 2, PATIENCE)
+            eventually(lambda: robot()["merged_from_robot"] is not None, PATIENCE)
+            assert robot()["status"]["mission"]["order"]["kind"] == "carried"
+
+            assert shell("stop", "r0")[0] == 0
+            eventually(lambda: robot()["status"]["mission"]["state"] == "done", PATIENCE)
+            code, printed = shell("go", "r0", "home", "--json")
+            (mission,) = json.loads(printed)["missions"]
+            assert (code, mission["state"], mission["order"]["node"]) == (0, "running", "r0.1.1")
+            children.kill("r0")
+            robot(alive=False)
+            start_robot()
+            kept = robot()["status"]["mission"]
+            assert (kept["order"], kept["state"]) == (mission["order"], "running"), "killed, and it goes on"
+
+            children.kill("server")
+            start_server()
+            assert robot()["status"]["mission"]["order"] == mission["order"]
+            with Fleet(endpoint, FLEET) as fleet:
+                kinds = [report.order.kind for report in fleet.missions("r0")]
+                assert kinds == ["carried", "stop", "go"], "the record outlasts the server"
+
+            assert main(["map", "fetch", str(tmp_path / "m.mapweave"), *network]) == 0
+            assert len(read_map_file(tmp_path / "m.mapweave", "merged").poses) >= 2
+            assert "r0.7.1 is not in the merged map" in complaint(capfd, "go", "r0", "r0.7.1", *network)
+            code, printed = shell("go", "r0", "r0.1.999")
+            assert code == NOT_DONE and "refused: there is no node r0.1.999" in printed
+            code, printed = shell("status")
+            assert code == 0 and "r0" in printed and "go to r0.1.1" in printed
+            code, printed = shell("stop", "--all")
+            assert code == 0 and "r0: stop" in printed
+            for name in ("r0", "server"):
+                children.end(name)
+    finally:
+        bus.close()
+
+
+def test_without_a_router_one_line_says_what_to_do(capfd: pytest.CaptureFixture[str]) -> None:
+    closed = f"tcp/127.0.0.1:{free_port()}"
+    for words in (["status"], ["map", "fetch", "out.mapweave"]):
+        output = complaint(capfd, *words, "--connect", closed)
+        assert f"no router at {closed}: start `mapweave server`" in output
+
+
+def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
+    order = MissionOrder("a1", "r0", MissionKind.GO, 1, "anna", NodeId("r1", 1, 5), "kitchen")
+    doing = Status("driving along the route", "0.4 m to node r1.1.5", 12, 40, Pose2(), False)
+    status = AgentStatus(
+        doing, 1, "r0", 1, 3, mission=MissionReport(order, MissionState.RUNNING, 0.25), battery=0.5,
+        last_error="no map server answered", error_age=61.2,
+    )  # fmt: skip
+    entry = RobotEntry("r0", True, 7.04, status, Pose2(1.234, -5.0, 3.14159265), 2)
+    assert cells(entry) == (
+        "r0", "go to r1.1.5 (kitchen) running 25%", "driving along the route: 0.4 m to node r1.1.5",
+        "1.23,-5.00 180° in part 2", "12", "50%", "3", "7.0 s silent", "no map server answered (61 s ago)",
+    )  # fmt: skip
+    assert cells(RobotEntry("r1", False))[0] == "r1" and "gone" in cells(RobotEntry("r1", False))
+    for width in (150, 240):
+        lines = Console(width=width, file=(printed := io.StringIO()))
+        lines.print(table(FleetStatus((entry,)), width))
+        _, line = printed.getvalue().splitlines()
+        assert len(line) <= width and "go to r1.1.5 (kitchen) running 25%" in line and "7.0 s silent" in line
+        assert ("0.4 m to node r1.1.5" in line) is (width == 240)
