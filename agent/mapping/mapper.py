@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.edge_measurement.traverse import Traverse
+from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.mapping.anchored_keyframe import HERE
 from mapweave.agent.mapping.episode import EpisodeRequest
@@ -165,6 +166,11 @@ class Mapper:
     def converged_share(self) -> float:
         """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
         return self._tracking.converged_share
+
+    @property
+    def landmarks(self) -> LandmarkEstimates:
+        """The filter's landmarks, in robot."""
+        return self._tracking.landmarks()
 
     def take_changes(self) -> tuple[ChangeBody, ...]:
         """What was changed in the map since the last call; the only way by which nodes and edges leave."""

@@ -41,6 +41,10 @@ def add_to(commands: Any) -> None:
         "--mission", choices=["idle", "explore", "carried"],
         help="what to do now (default: go on with the last mission; a robot without one explores)",
     )  # fmt: skip
+    parser.add_argument(
+        "--without-rangers", action="store_true",
+        help="a robot without proximity sensors may explore, slowly, by its camera and by touch",
+    )  # fmt: skip
     parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
     parser.add_argument(
         "--epoch", type=int, help="least number of a new map (default: the next one, as the server knows it)"
@@ -129,7 +133,10 @@ def run(arguments: argparse.Namespace) -> int:
             calibration=calibration_of(arguments, name),
             ros2=None if arguments.ros2 is None else ros2_link(arguments, settings.robot),
         )
-        run_agent(CheckedRobot(robot), bus, keys, settings.agent, options, stop)
+        agent = settings.agent
+        if arguments.without_rangers:
+            agent = replace(agent, exploration=replace(agent.exploration, without_rangers=True))
+        run_agent(CheckedRobot(robot), bus, keys, agent, options, stop)
     finally:
         if robot is not None:
             robot.close()

@@ -21,6 +21,7 @@ from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.ranger_monitor import announcement
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile
 from mapweave.agent.replication.epochs import newest_on_server, next_epoch
@@ -31,6 +32,7 @@ from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
+from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NUMBER, MapId, NodeId
@@ -137,6 +139,7 @@ class Agent:
         self._bus = TrafficMeter(bus)
         self._keys = keys
         self._settings = replace(settings, seed=options.seed)
+        self._teleoperation = Teleoperation()
         self._options = options
         self._on_step = on_step
         self._causes = 0
@@ -153,6 +156,9 @@ class Agent:
                 self.missions.begin(options.mission or options.otherwise)
             self.missions.unknown_goal = self._unknown_goal
             self._description = measured(describe(), options.calibration)
+            explores = settings.exploration.without_rangers
+            for line in announcement(self._description, options.name, explores):
+                print_line(f"{options.name}: {line}")
             maps = self.journal.maps()
             if options.resume is not None or (maps and not options.fresh):
                 self._resume(self._chosen(maps))
@@ -211,7 +217,8 @@ class Agent:
         self.merged_poses = MergedPoses(self._bus, self._keys, options.name, options.server)
         self._fleet = FleetClient(
             self._bus, self._keys, map_id, self.missions, options.synchronization.answer_timeout,
-            options.server, self.replicator.unacknowledged, self._placed,
+            options.server, self.replicator.unacknowledged, self._placed, self._teleoperation,
+            (self._description.max_forward, self._description.max_turn),
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)
         self._trajectory = TrajectoryFile(path) if options.trajectories else None
