@@ -154,7 +154,7 @@ def _touches(part: Points, here: Points, tree: cKDTree, other: _Lease, width: fl
 def _place_aside(
     request: ReserveRequest, lease: _Lease, other: _Lease, router: Router
 ) -> tuple[NodeId | None, Points]:
-    """The nearest node off another's way that is reached without passing it, and the points on the way there."""
+    """The nearest node off another's way that is reached without passing it, and the points up to it."""
     poses, tree = router.roads.active_poses, cKDTree(other.way)
     members = [node for node in router.merged.components[lease.component] if node in poses]
     places = np.array([[poses[node].x, poses[node].y] for node in members])

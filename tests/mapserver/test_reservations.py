@@ -114,13 +114,18 @@ def test_of_two_head_on_the_later_one_steps_aside_into_the_niche(router: Router)
     traffic.ask("r1", 7, 6, 5)
     first = traffic.ask("r0", 3, 4, 5, 6, 7, 8)
     second = traffic.ask("r1", 5, 4, 3, 2, 1)
-    assert first.granted == 0 or first.holder == "r1"
-    assert second.holder == "r0" and second.aside == node(9), "the niche is nearer than the corridor's end"
-    assert traffic.ask("r0", 3, 4, 5, 6, 7, 8).aside is None, "the first one only waits"
-    # The second drives into the niche; then the first may pass.
-    traffic.ask("r1", 9, 4, 3, 2, 1)
-    assert traffic.ask("r0", 3, 4, 5, 6, 7, 8).holder == ""
-    assert traffic.ask("r1", 9, 4, 3, 2, 1).aside is None, "and the second waits there"
+    assert first.granted == 1 and first.holder == "r1"
+    assert second.holder == "r0" and second.aside is None, "the first one may be on the way to the niche"
+    first = traffic.ask("r0", 3, 4, 5, 6, 7, 8)
+    assert (first.granted, first.holder, first.aside) == (0, "r1", None), "it waits, and now leaves it free"
+    second = traffic.ask("r1", 5, 4, 3, 2, 1)
+    assert second.aside == node(9), "the niche is nearer than the corridor's end"
+    assert traffic.ask("r1", 5, 4, 9).granted == 2
+    assert traffic.ask("r0", 3, 4, 5, 6, 7, 8).holder == "r1"
+    traffic.ask("r1", 9, 9)
+    assert traffic.ask("r0", 3, 4, 5, 6, 7, 8).holder == "", "the second is in the niche: the first may pass"
+    waits = traffic.ask("r1", 9, 4, 3, 2, 1)
+    assert (waits.granted, waits.holder, waits.aside) == (0, "r0", None), "and the second waits there"
 
 
 def test_robots_side_by_side_may_part(router: Router) -> None:

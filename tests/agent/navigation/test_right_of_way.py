@@ -75,13 +75,18 @@ def test_a_robot_that_waits_too_long_looks_for_another_way(home):
     ]
 
 
-def test_a_robot_steps_aside_where_it_is_told_and_asks_for_its_way_again(home):
+def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
     trial = trial_to(home)
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(0, "r7", C, ""))
+    free = ReserveAnswer(2, "", None, "")
+
+    def traffic(question: MayIDrive) -> Answer:
+        return Answer(question.number, free if question.route[-1] == C else ReserveAnswer(0, "r7", C, ""))
+
+    trial.traffic = traffic
     trial.run(4.0)
     goals = [question.goal for question in trial.asked if not isinstance(question, WhereAmI)]
     assert goals[:2] == [B, C] and trial.navigator.stage == Stage.ASIDE
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(9, "", None, ""))
+    trial.traffic = lambda question: Answer(question.number, free)
     trial.run(20.0, lambda: len(trial.asked) > 3)
     assert trial.asked[-1].goal == B
 
