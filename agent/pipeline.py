@@ -3,7 +3,7 @@ r"""One robot's whole pipeline: observation in, command and map changes out. Rea
     image, odometry, proximity -> mapper (tracks, EKF, nodes) -> changes
                                -> floor                        \
     lost on the own map ------> global localization -> mapper   |
-    mission ------------------> explorer | passenger | navigator -> guard -> command
+    mission ------------------> explorer | carried   | navigator -> guard -> command
 
 It knows no network, no disk and no clock: live robots, recordings, simulation and tests run this very code.
 """

@@ -41,7 +41,7 @@ class Standing(StrEnum):
     """Other pairs are more similar; the numbers come from a comparison made for the explanation."""
 
 
-DOUBLES = "doubles"
+ALIASED = "aliased"
 """Name among a link's evidence: of its inliers, landmarks that are found at other places too; absent if none
 is known (see mapweave.merge.outlier_rejection.distinctness)."""
 

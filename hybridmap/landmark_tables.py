@@ -27,8 +27,8 @@ SYMBOLS = 64
 TOTAL_BITS = 12
 """Frequencies of a column's symbols sum to 2^TOTAL_BITS."""
 
-VERSION = 2
-FILE = "landmarks_v2.npz"
+VERSION = 1
+FILE = "landmarks.npz"
 
 
 @dataclass(frozen=True, eq=False)

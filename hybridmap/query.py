@@ -91,7 +91,11 @@ class Whereabouts:
 
 @dataclass(frozen=True, eq=False)
 class RelocalizeAnswer:
-    """Where a view was taken: candidates best first, and the reason of the outcome, in words."""
+    """Where a view was taken: candidates best first, and the reason of the outcome, in words.
+
+    An unknown place may have one candidate: then too few landmarks agree for this view to be certain alone,
+    and another view that gives the same place is enough.
+    """
 
     certainty: Certainty
     candidates: Annotated[tuple[Whereabouts, ...], Meta(max_length=MAX_CANDIDATES)]

@@ -83,7 +83,7 @@ class AdmissionControl:
         self._appointment = -math.inf
         self._booked: dict[int, float] = {}
         workers = self._settings.threads
-        self._pool = executor or ThreadPoolExecutor(workers, thread_name_prefix="desk")
+        self._pool = executor or ThreadPoolExecutor(workers, thread_name_prefix="admission")
 
     def submit(self, work: Callable[[], _T], ticket: int | None = None, usual: bool = True) -> Future[_T]:
         """Submit a job.

@@ -8,13 +8,13 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 
 
-def with_constraints(happenings: Iterable[MapEvent], constraints: ManualConstraints) -> tuple[MapEvent, ...]:
+def with_constraints(events: Iterable[MapEvent], constraints: ManualConstraints) -> tuple[MapEvent, ...]:
     """Events of the merge and manual constraints, in order."""
     constrained = [
         MapEvent(constraint.stamp_ns, MapEventKind.CONSTRAINED, said_of(constraint))
         for constraint in constraints.made
     ]
-    return tuple(sorted([*constrained, *happenings], key=lambda one: one.stamp_ns))
+    return tuple(sorted([*constrained, *events], key=lambda one: one.stamp_ns))
 
 
 def said_of(constraint: ManualConstraint) -> str:

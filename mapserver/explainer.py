@@ -85,12 +85,12 @@ class Explainer:
         name: str,
         answers: Callable[[], Answers],
         admission: AdmissionControl,
-        book: ConstraintRecord,
+        record: ConstraintRecord,
         constrain: Callable[[ManualConstraints], None],
         settled: Callable[[], bool],
         consistency: ConsistencySettings,
         wary: Callable[[], Collection[tuple[NodeId, NodeId]]],
-        happenings: Callable[[], Iterable[MapEvent]],
+        events: Callable[[], Iterable[MapEvent]],
     ) -> None:
         """Begin to answer.
 
@@ -100,21 +100,21 @@ class Explainer:
             name: of the server in the fleet.
             answers: the newest ones. May wait for them.
             admission: admission control; explanations compare nodes, which takes long.
-            book: record of manual constraints.
+            record: of manual constraints.
             constrain: called with all constraints whenever there is a new one.
             settled: whether the newest answers know all that has come.
             consistency: as in the merge.
             wary: pairs of nodes between which robots of late did not get through.
-            happenings: what has become of the maps.
+            events: what has become of the maps.
         """
         self._answers = answers
         self._admission = admission
-        self._book = book
+        self._record = record
         self._constrain = constrain
         self._settled = settled
         self._consistency = consistency
         self._wary = wary
-        self._happenings = happenings
+        self._events = events
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
@@ -158,16 +158,16 @@ class Explainer:
 
     def history(self) -> tuple[MapEvent, ...]:
         """The history of the maps and the manual constraints, in order."""
-        return with_constraints(self._happenings(), self._book.constraints)
+        return with_constraints(self._events(), self._record.constraints)
 
     def _apply_constraint(self, payload: bytes) -> bytes:
         constraint = decode(payload, ManualConstraint)
         with self._turn:
             check_manual_constraint(
-                self._answers().merged, self._book.constraints, constraint, self._book.maps()
+                self._answers().merged, self._record.constraints, constraint, self._record.maps()
             )
-            self._book.add(constraint)
-            self._constrain(self._book.constraints)
+            self._record.add(constraint)
+            self._constrain(self._record.constraints)
         event = said_of(constraint)
         log.warning("%s", event)
         return encode_record({"said": event})

@@ -23,11 +23,11 @@ log = logging.getLogger(__name__)
 NAME = "history"
 """In the store."""
 MOST = 500
-"""Happenings that are kept: the newest."""
+"""Events that are kept: the newest."""
 MOST_APART = 2000
 """Pairs of maps that are remembered as kept apart, so that it is reported once."""
 MOST_AT_ONCE = 50
-"""Happenings of one sort that one merge adds one by one: a thousand maps may join at once."""
+"""Events of one sort that one merge adds one by one: a thousand maps may join at once."""
 Pair = tuple[MapId, MapId]
 EXCLUSION_WORDS = (
     "would have seen",
@@ -47,7 +47,7 @@ class MapHistory:
 
         Args:
             store: where it is kept; None: it ends with the process.
-            most: happenings that are kept.
+            most: events that are kept.
             clock: wall time, ns.
         """
         self._store, self._most, self._clock = store, most, clock
@@ -62,16 +62,16 @@ class MapHistory:
                 self.failed(f"the record of what happened before was damaged ({error}); a new one begins")
 
     @property
-    def happenings(self) -> tuple[MapEvent, ...]:
+    def events(self) -> tuple[MapEvent, ...]:
         """In order; for any thread."""
         with self._lock:
-            return self._kept.happenings
+            return self._kept.events
 
     @property
     def newest(self) -> str:
         """Words of what last became of the maps; empty if nothing has."""
         return next(
-            (event.words for event in reversed(self.happenings) if event.kind is not MapEventKind.FAILED), ""
+            (event.words for event in reversed(self.events) if event.kind is not MapEventKind.FAILED), ""
         )
 
     @property
@@ -116,7 +116,7 @@ class MapHistory:
 
     def failed(self, words: str) -> None:
         """Record that something could not be done; the same twice is reported once."""
-        if not self._kept.happenings or self._kept.happenings[-1].words != words:
+        if not self._kept.events or self._kept.events[-1].words != words:
             self._keep(
                 [(MapEventKind.FAILED, words)], self._kept.parts, self._kept.apart, self._kept.set_apart
             )
@@ -131,7 +131,7 @@ class MapHistory:
         """Add to the record; it is on the disk when this returns, unless the disk does not take it."""
         now = self._clock()
         more = [MapEvent(now, kind, _one_line(words)) for kind, words in fresh]
-        kept = KeptHistory((*self._kept.happenings, *more)[-self._most :], parts, apart, set_apart)
+        kept = KeptHistory((*self._kept.events, *more)[-self._most :], parts, apart, set_apart)
         with self._lock:
             self._kept = kept
         if self._store is None:

@@ -24,15 +24,15 @@ Faded = Mapping[NodeId, NDArray[np.bool_]]
 class ClosedEdges(Collection[EdgeId]):
     """Edges of a map that the servo could not drive; each is evaluated on demand."""
 
-    def __init__(self, union: HybridMap, faded: Faded, book: ReachabilityCache) -> None:
+    def __init__(self, union: HybridMap, faded: Faded, cache: ReachabilityCache) -> None:
         """Take a map.
 
         Args:
             union: nodes and edges.
             faded: faded landmarks.
-            book: cache of reachability.
+            cache: of reachability.
         """
-        self._union, self._faded, self._book = union, faded, book
+        self._union, self._faded, self._cache = union, faded, cache
 
     def __contains__(self, edge_id: object) -> bool:
         """Whether the servo could not drive an edge of the map."""
@@ -43,7 +43,7 @@ class ClosedEdges(Collection[EdgeId]):
         if edge.a not in nodes or edge.b not in nodes:
             return False
         faded = self._faded.get(edge.a), self._faded.get(edge.b)
-        return not self._book.reach(edge, nodes[edge.a], nodes[edge.b], faded).drivable
+        return not self._cache.reach(edge, nodes[edge.a], nodes[edge.b], faded).drivable
 
     def __iter__(self) -> Iterator[EdgeId]:
         """All of them: evaluates every edge."""

@@ -118,13 +118,13 @@ class MapServer:
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
-            lambda: self._history.happenings, self._missions, self._roster,
+            lambda: self._history.events, self._missions, self._roster,
             clock.executor(RELAYS), clock.monotonic, clock.executor(1),
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,
             worker.constrain, lambda: worker.settled, self._settings.merge.consistency,
-            lambda: self._blockages.known(clock.monotonic()), lambda: self._history.happenings,
+            lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
         )  # fmt: skip
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._publish)

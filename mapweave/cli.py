@@ -9,6 +9,7 @@ from typing import Any
 
 from mapweave.commands import (
     agent,
+    calibrate,
     demo,
     evaluate,
     info,
@@ -63,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
         demo, server, router, sim, agent, status, missions, robots, map_file, record, replay, info,
-        relocalize, evaluate, settings,
+        calibrate, relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)
     return top

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from mapweave.hybridmap.explanation import (
-    DOUBLES,
+    ALIASED,
     Hop,
     LinkAgreement,
     MapsExplanation,
@@ -141,7 +141,7 @@ def _vector(vector: Array) -> str:
 
 
 def _aliased(explanation: PairExplanation) -> str:
-    count = int(explanation.evidence.get(DOUBLES, 0.0))
+    count = int(explanation.evidence.get(ALIASED, 0.0))
     return f", {count} of these are found at other places too" if count else ""
 
 

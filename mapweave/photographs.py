@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +25,10 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
+from mapweave.hybridmap.query import View
 from mapweave.registration.selection import choose, worth
 from mapweave.storage.image_file import read_grey
-from mapweave.structure_from_motion import PIXEL_SIGMA, Structure, reconstruct
+from mapweave.structure_from_motion import PIXEL_SIGMA, STEP_SHARE, Structure, reconstruct
 from mapweave.vision.lens import Distortion, Lens
 from mapweave.vision.sift import Sift
 from mapweave.wire.bus import Bus
@@ -40,6 +42,23 @@ LEAST_LANDMARKS = 12
 
 FLOOR = (0.01, 0.01)
 """What a pose is never better than, m and rad: the camera is not quite level."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """What a stretch of K photographs shows, and where they were taken, up to scale.
+
+    Attributes:
+        poses: of the robot, in the first one's frame, m.
+        landmarks: of each.
+        features: of each, (N,) which feature of the photograph each landmark is.
+        matches: for each but the last, (M, 2) features of it and of the next that show the same point.
+    """
+
+    poses: list[Pose2]
+    landmarks: list[Landmarks]
+    features: list[NDArray[np.int64]]
+    matches: list[NDArray[np.int64]]
 
 
 def map_of_photographs(
@@ -66,25 +85,62 @@ def map_of_photographs(
         raise InvalidValue(f"spacing {spacing:g}: give the metres between photographs")
     sift = Sift(Lens(camera, distortion))
     features = [sift.extract(read_grey(image, camera)) for image in images]
-    views = [extracted.view(camera) for extracted in features]
-    structure = reconstruct(views, spacing)
-    levels = [_level(structure, k) for k in range(len(views))]
-    changes: list[ChangeBody] = []
-    seats: list[NDArray[np.int64]] = []
-    ids = [NodeId(map_id.agent, map_id.epoch, number) for number in range(1, 2 * len(images))]
-    for k, image in enumerate(images):
-        landmarks, points = _landmarks(structure, k, levels[k], camera, views[k].codes)
+    stretch = stretch_of([extracted.view(camera) for extracted in features], spacing)
+    for image, landmarks in zip(images, stretch.landmarks, strict=True):
         if len(landmarks) < LEAST_LANDMARKS:
             raise InvalidValue(f"{image}: only {len(landmarks)} points of it are in its neighbours too")
-        seats.append(points)
-        map_from_robot = _uncertain(levels[0].inverse() @ levels[k])
-        changes.append(NodePut(Node(ids[k], k, map_from_robot, camera, landmarks)))
-    for k in range(len(images) - 1):
-        _, a, b = np.intersect1d(seats[k], seats[k + 1], return_indices=True)
-        shared = np.stack([a, b], axis=1).astype(np.int64)
-        a_from_b = _uncertain(levels[k].inverse() @ levels[k + 1])
+    return changes_of(stretch, range(len(images)), camera, map_id)
+
+
+def stretch_of(views: Sequence[View], spacing: float, step_share: float = STEP_SHARE) -> Stretch:
+    """Where photographs were taken, and what they show.
+
+    Args:
+        views: of one camera, in the order in which they were taken.
+        spacing: how far apart, on average, m.
+        step_share: by how much one step differs from that, as a share of it.
+
+    Raises:
+        InvalidValue: they are not one stretch.
+    """
+    structure, camera = reconstruct(views, spacing, step_share), views[0].camera
+    levels = [_level(structure, k) for k in range(len(views))]
+    seen = [_landmarks(structure, k, levels[k], camera, view.codes) for k, view in enumerate(views)]
+    both = [(structure.features[[k, k + 1]] >= 0).all(axis=0) for k in range(len(views) - 1)]
+    return Stretch(
+        [levels[0].inverse() @ level for level in levels],
+        [landmarks for landmarks, _ in seen],
+        [structure.features[k, points] for k, (_, points) in enumerate(seen)],
+        [structure.features[[k, k + 1]][:, shown].T for k, shown in enumerate(both)],
+    )
+
+
+def changes_of(stretch: Stretch, stamps_ns: Sequence[int], camera: Camera, map_id: MapId) -> list[ChangeBody]:
+    """A map of a stretch: a node a photograph, with an edge to the next.
+
+    Args:
+        stretch: what was found.
+        stamps_ns: of the photographs.
+        camera: that took them.
+        map_id: whose nodes they become; the k-th photograph is node k.
+    """
+    count = len(stretch.poses)
+    ids = [NodeId(map_id.agent, map_id.epoch, number) for number in range(1, 2 * count)]
+    changes: list[ChangeBody] = [
+        NodePut(Node(ids[k], stamps_ns[k], _uncertain(stretch.poses[k]), camera, stretch.landmarks[k]))
+        for k in range(count)
+    ]
+    for k, matches in enumerate(stretch.matches):
+        here, there = (
+            {int(feature): n for n, feature in enumerate(stretch.features[side])} for side in (k, k + 1)
+        )
+        shared = np.array(
+            [(here[a], there[b]) for a, b in matches.tolist() if a in here and b in there], np.int64
+        ).reshape(-1, 2)
+        shared = shared[shared[:, 0].argsort()]
+        a_from_b = _uncertain(stretch.poses[k].inverse() @ stretch.poses[k + 1])
         evidence = {"shared": float(len(shared))}
-        edge_id = ids[len(images) + k]
+        edge_id = ids[count + k]
         changes.append(
             EdgePut(Edge(edge_id, ids[k], ids[k + 1], a_from_b, EdgeKind.MAPPED, shared, evidence))
         )

@@ -82,12 +82,13 @@ class Structure:
         return np.isfinite(self.centres[:, 0])
 
 
-def reconstruct(views: Sequence[View], spacing: float) -> Structure:
+def reconstruct(views: Sequence[View], spacing: float, step_share: float = STEP_SHARE) -> Structure:
     """Find where photographs were taken: from the pair that fixes most points on, one photograph at a time.
 
     Args:
         views: of one camera, in the order in which they were taken.
         spacing: how far apart, on average, m: the scale, which photographs do not have.
+        step_share: standard deviation of one step, as a share of it.
 
     Returns:
         All cameras, and the points that are determined.
@@ -111,23 +112,26 @@ def reconstruct(views: Sequence[View], spacing: float) -> Structure:
     starts.sort(key=lambda start: -int(np.isfinite(start.points[:, 0]).sum()))
     # What two photographs show of one wall has two explanations (Longuet-Higgins 1986); only the right one
     # goes with the others.
-    whole = [_grown(views, start, relations, spacing) for start in starts[:BEGINNINGS]]
+    whole = [_grown(views, start, relations, (spacing, step_share)) for start in starts[:BEGINNINGS]]
     best = max(whole, key=lambda structure: int((_misses(views, structure) < GATE_PX).sum()))
     determined = np.isfinite(best.points[:, 0])
     return replace(best, points=best.points[determined], features=best.features[:, determined])
 
 
 def _grown(
-    views: Sequence[View], start: Structure, relations: dict[tuple[int, int], _Relation], spacing: float
+    views: Sequence[View],
+    start: Structure,
+    relations: dict[tuple[int, int], _Relation],
+    steps: tuple[float, float],
 ) -> Structure:
     """All cameras, one after the other, from two on."""
     structure = start
     while not structure.placed.all():
         structure = _triangulated(views, _extended(views, structure, relations))
-        structure = _triangulated(views, _bundled(views, structure, spacing, True))
+        structure = _triangulated(views, _bundled(views, structure, steps, True))
     refuted = ~(_misses(views, structure) < GATE_PX)
     structure = replace(structure, features=np.where(refuted, -1, structure.features))
-    return _triangulated(views, _bundled(views, _triangulated(views, structure), spacing, False))
+    return _triangulated(views, _bundled(views, _triangulated(views, structure), steps, False))
 
 
 def _start(
@@ -296,7 +300,10 @@ def _misses(views: Sequence[View], structure: Structure) -> Array:
     return misses
 
 
-def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust: bool) -> Structure:
+def _bundled(
+    views: Sequence[View], structure: Structure, steps: tuple[float, float], robust: bool
+) -> Structure:
+    """All cameras and points at their best; of steps, the length, m, and its share of uncertainty."""
     camera: Camera = views[0].camera
     lens = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
     pixel: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(2, PIXEL_SIGMA)
@@ -321,8 +328,8 @@ def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust
             )
         )
         if before is not None:
-            way = (k - before) * spacing
-            step = gtsam.noiseModel.Isotropic.Sigma(1, STEP_SHARE * way)
+            way = (k - before) * steps[0]
+            step = gtsam.noiseModel.Isotropic.Sigma(1, steps[1] * way)
             graph.add(gtsam.RangeFactorPose3(pose(before), pose(k), way, step))
     determined = np.flatnonzero(np.isfinite(structure.points[:, 0])).tolist()
     for n in determined:

@@ -186,6 +186,6 @@ def _weighed(
         some, cache.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
     ):
         # Known aliased landmarks stay aliased.
-        if link.key not in out or out[link.key].doubles < weighed_link.doubles:
+        if link.key not in out or out[link.key].aliased < weighed_link.aliased:
             out[link.key] = weighed_link
     return out

@@ -70,7 +70,7 @@ class Simulation:
             setup.name: SimulatedRobot(setup, self._stage, place, (seed, k))
             for k, (setup, place) in enumerate(zip(setups, places, strict=True))
         }
-        self._happening = EventExecutor(self._stage, self._robots, seed)
+        self._events = EventExecutor(self._stage, self._robots, seed)
         self._clock = re.sub(r"[^a-z0-9-]", "-", f"sim-{world.name}-{seed}".lower())[:32]
         self._wall = {"physics": 0.0, "rangers": 0.0}
         self._log: dict[str, list[Array]] = {name: [] for name in self.robots}
@@ -125,7 +125,7 @@ class Simulation:
             self._robot(name)
         start = time.perf_counter()
         bodies = [robot.body for robot in self._robots.values()]
-        self._stage.pass_time(self.tick + 1, TICK, self._happening.places())
+        self._stage.pass_time(self.tick + 1, TICK, self._events.places())
         for name, robot in self._robots.items():
             robot.body.drive(commands.get(name, Command()))
         for _ in range(SUBSTEPS):
@@ -149,7 +149,7 @@ class Simulation:
         Raises:
             InvalidValue: a robot or a place that is not there.
         """
-        line = self._happening.apply(event, self.tick)
+        line = self._events.apply(event, self.tick)
         self._sense()
         return line
 

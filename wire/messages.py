@@ -44,13 +44,13 @@ class KeptHistory:
     """What a server keeps on its disk of what has happened.
 
     Attributes:
-        happenings: in order.
+        events: in order.
         parts: maps that were one when it was written, each in one set.
         apart: pairs of maps that are reported as kept apart.
         set_apart: maps that are reported as set apart.
     """
 
-    happenings: tuple[MapEvent, ...] = ()
+    events: tuple[MapEvent, ...] = ()
     parts: tuple[frozenset[MapId], ...] = ()
     apart: frozenset[tuple[MapId, MapId]] = frozenset()
     set_apart: frozenset[MapId] = frozenset()

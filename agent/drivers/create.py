@@ -51,7 +51,7 @@ class CreateBase(GuardedBase):
     def open(self) -> None:
         """Enter Safe mode, in which the robot stops at cliffs and when it is lifted."""
         self._port = SerialPort(self._path, 115200)
-        # An incomplete command of before takes up to four bytes; opcode 0 is ignored.
+        # An earlier incomplete command takes up to four bytes; opcode 0 is ignored.
         self._port.write(bytes(4) + bytes([START, SAFE]))
         # An incomplete command takes up to four bytes of the first stop; the second is complete.
         self._guard = WheelGuard(self._port.descriptor, STOP * 2)

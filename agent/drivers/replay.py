@@ -48,6 +48,8 @@ class Replay:
         if not 0 <= self._frames[0] <= self._frames[-1] < len(self.recording):
             raise DeviceError(f"{path}: {self._frames} is not within the {len(self.recording)} images")
         self._position = 0
+        self._before: int | None = None
+        self._unreadable: list[str] = []
 
     def __len__(self) -> int:
         """How many observations there are."""
@@ -66,20 +68,36 @@ class Replay:
             tick=tick,
         )
 
+    @property
+    def damage(self) -> list[str]:
+        """What of the recording could not be read so far, a line each."""
+        lines = list(self.recording.damage)
+        if self._unreadable:
+            count = len(self._unreadable)
+            lines.append(f"{self._unreadable[0]} (left out, {count} of {len(self)} images)")
+        return lines
+
     def sense(self) -> Observation | None:
-        """The next frame with the odometry since the one before; None at the end.
+        """The next frame that can be read, with the odometry since the one before; None at the end.
 
         Raises:
-            DeviceError: an image cannot be read.
+            DeviceError: no image of the recording can be read.
         """
-        if self._position >= len(self._frames):
-            return None
-        frame = self._frames[self._position]
-        before = self._frames[self._position - 1] if self._position else frame
-        self._position += 1
-        image = self.recording.read(frame)
-        forward, turn = self.recording.increments[before + 1 : frame + 1].sum(axis=0)
-        return Observation(int(self.recording.stamps_ns[frame]), Odometry(float(forward), float(turn)), image)
+        while self._position < len(self._frames):
+            frame = self._frames[self._position]
+            self._position += 1
+            try:
+                image = self.recording.read(frame)
+            except DeviceError as error:
+                self._unreadable.append(str(error))
+                continue
+            before, self._before = frame if self._before is None else self._before, frame
+            forward, turn = self.recording.increments[before + 1 : frame + 1].sum(axis=0)
+            stamp_ns = int(self.recording.stamps_ns[frame])
+            return Observation(stamp_ns, Odometry(float(forward), float(turn)), image)
+        if self._before is None:
+            raise DeviceError(self._unreadable[0])
+        return None
 
     def act(self, command: Command) -> Command:
         """Nothing moves: what is applied is always standing still."""

@@ -226,5 +226,5 @@ class WheeledRobot:
         if self._opened and not self._failure:
             log.warning("%s; the robot stands until it answers again", failure)
         self._failure = failure
-        # A command of before must not be driven after the reconnection.
+        # An earlier command must not be driven after the reconnection.
         self._command = None

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.localization.place_recognition import lookalikes, recognise_places
+from mapweave.agent.global_localization.view_agreement import ViewAgreement
+from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.agent.mission import WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Command
@@ -83,7 +84,7 @@ class OwnMap:
         recalled = recognise_places(self.map, view, self._rng)
         if not recalled:
             return Candidates((), "", f"none of {len(self.map.nodes)} nodes is recognised")
-        alike = lookalikes(recalled, RIVAL, APART)
+        alike = aliased_places(recalled, RIVAL, APART)
         ambiguous = "" if alike is None else f"nodes {alike[0].id} and {alike[1].id} look the same"
         places = tuple(
             Candidate(
@@ -102,9 +103,13 @@ class FleetMap:
         """Take the motion primitives, which ask and stand still until the answer comes."""
         self._motion = motion
         self._silent_until = 0.0
+        self._agreement = ViewAgreement()
 
     def candidates(self, view: View) -> Generator[Command, None, Candidates]:
-        """Where a view was taken, by the fleet's map; a silent fleet is not asked at each view."""
+        """Where a view was taken, by the fleet's map; a silent fleet is not asked at each view.
+
+        A view that is no proof alone counts together with an earlier one, see `ViewAgreement`.
+        """
         if self._motion.now < self._silent_until:
             return Candidates((), "", NO_ANSWER)
         answer = yield from self._motion.ask(WhereAmI(self._motion.number(), view))
@@ -112,11 +117,13 @@ class FleetMap:
             self._silent_until = self._motion.now + (answer.retry_after or SILENCE)
         if not isinstance(answer.content, RelocalizeAnswer):
             return Candidates((), "", answer.error or "no answer")
-        content = answer.content
+        content, motion = answer.content, self._motion
         ambiguous = content.reason if content.certainty is Certainty.AMBIGUOUS else ""
-        accepted = content.candidates if content.certainty in (Certainty.FOUND, Certainty.PLACE) else ()
-        places = tuple(
-            Candidate(place.node, place.node_from_robot, distance_known=place.distance_known)
-            for place in accepted
-        )
-        return Candidates(places, ambiguous, content.reason)
+        place = self._agreement.take(content, motion.odom_from_robot, motion.way, motion.turned)
+        if place is None:
+            return Candidates((), ambiguous, content.reason)
+        reason = content.reason
+        if content.certainty is Certainty.UNKNOWN:
+            reason = f"{place.inliers} landmarks of {place.node} agree, and so does an earlier view"
+        candidate = Candidate(place.node, place.node_from_robot, distance_known=place.distance_known)
+        return Candidates((candidate,), ambiguous, reason)

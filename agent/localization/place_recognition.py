@@ -54,7 +54,7 @@ def recognise_places(
     return sorted(recalled, key=lambda pair: -pair[1].inliers)
 
 
-def lookalikes(
+def aliased_places(
     recalled: list[tuple[Node, Recognition]], rival: float, apart: float
 ) -> tuple[Node, Node] | None:
     """The node that a view shows best, and another one, elsewhere, that it shows about as well; or None.

@@ -13,9 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.recordings.bag_images import grey_of
+from mapweave.agent.recordings.damaged_bag import DamagedBag
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import heading_of, read_poses
-from mapweave.agent.recordings.recording import Images, Recording, StampedPoses, assembled
+from mapweave.agent.recordings.recording import (
+    Images,
+    Recording,
+    StampedPoses,
+    assembled,
+    without_odometry,
+)
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
 from mapweave.hybridmap.pose import Array
@@ -61,63 +68,130 @@ class Topic:
 
 
 class Bag:
-    """A bag that is open for reading."""
+    """A bag that is open for reading.
+
+    Attributes:
+        path: of it.
+        topics: of all its parts.
+        damage: what cannot be read of it, a line each.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Open it.
+        """Open it. Of a file without an index, or that was cut off, what stands before the damage is read.
 
         Raises:
-            DeviceError: it cannot be read.
+            DeviceError: nothing of it can be read.
         """
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-
-        self.path = path
-        try:
-            self._reader = AnyReader(parts_of(path), default_typestore=get_typestore(Stores.ROS2_JAZZY))
-            self._reader.open()
-        except Exception as error:  # noqa: BLE001  # parsers raise whatever a damaged file leads them to
-            raise DeviceError(f"{path}: not a bag that can be read ({_line(error)})") from None
-        # The file stays open as long as the recording is referenced.
-        weakref.finalize(self, self._reader.close)
-        self.topics = tuple(
-            sorted(
-                (Topic(c.topic, c.msgtype, c.msgcount) for c in self._reader.connections),
-                key=lambda topic: topic.name,
-            )
-        )
+        self.path, self.damage = path, list[str]()
+        self._parts = [part for each in parts_of(path) for part in self._opened(each)]
+        if not self._parts:
+            raise DeviceError((self.damage or [f"{path}: no bag in it"])[0])
+        counts: dict[tuple[str, str], int] = {}
+        for part in self._parts:
+            for name, (kind, count) in part.topics.items():
+                counts[name, kind] = counts.get((name, kind), 0) + count
+        self.topics = tuple(Topic(name, kind, counts[name, kind]) for name, kind in sorted(counts))
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Stamps, ns, and messages of a topic, in the order in which they were recorded.
 
-        The stamp is the header's where it is set: when it was measured, not when it arrived.
+        The stamp is the header's where it is set: when it was measured, not when it arrived. A message that
+        cannot be decoded ends the topic, and is noted as damage.
+        """
+        count = 0
+        for part in self._parts:
+            try:
+                for arrived, message in part.messages(topic):
+                    count += 1
+                    header = getattr(message, "header", None)
+                    stamp = 0 if header is None else header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+                    yield stamp or arrived, message
+            except Exception as error:  # noqa: BLE001  # parsers raise whatever a damaged file leads them to
+                self.damaged(f"{self.path}: {topic} ends after {count} messages ({_line(error)})")
+                return
+
+    def damaged(self, line: str) -> None:
+        """Note damage, once."""
+        if line not in self.damage:
+            self.damage.append(line)
+
+    def _opened(self, path: Path) -> list[WholeBag | DamagedBag]:
+        try:
+            return [WholeBag(self, path)]
+        except Exception as error:  # noqa: BLE001  # as above
+            reason = _line(error)
+        parts: list[WholeBag | DamagedBag] = []
+        for file in files_of(path):
+            try:
+                parts.append(DamagedBag(file))
+            except (DeviceError, OSError) as error:
+                self.damaged(f"{file}: not a bag that can be read ({_line(error)})")
+        if parts:
+            self.damaged(f"{path}: damaged or cut off ({reason}); what comes before is used")
+        elif not self.damage:
+            self.damaged(f"{path}: not a bag that can be read ({reason})")
+        return parts
+
+
+class WholeBag:
+    """A bag as it should be, read by `rosbags`.
+
+    Attributes:
+        topics: by name: the type of its messages, and how many there are.
+    """
+
+    def __init__(self, owner: Bag, path: Path) -> None:
+        """Open it; the file stays open as long as its owner is referenced.
 
         Raises:
-            DeviceError: the bag ends in the middle of a message, or one cannot be decoded.
+            Exception: whatever a damaged file leads to.
+        """
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        self._reader.open()
+        weakref.finalize(owner, self._reader.close)
+        self.topics: dict[str, tuple[str, int]] = {}
+        for connection in self._reader.connections:
+            _, count = self.topics.get(connection.topic, ("", 0))
+            self.topics[connection.topic] = connection.msgtype, count + connection.msgcount
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Stamps, ns, and messages of a topic, in the order in which they were recorded.
+
+        Raises:
+            Exception: whatever a damaged file leads to.
         """
         connections = [c for c in self._reader.connections if c.topic == topic]
-        messages = self._reader.messages(connections)
-        count = 0
-        while True:
-            try:
-                connection, arrived, data = next(messages)
-                message = self._reader.deserialize(data, connection.msgtype)
-            except StopIteration:
-                return
-            except Exception as error:  # noqa: BLE001
-                raise DeviceError(
-                    f"{self.path}: {topic} ends after {count} messages ({_line(error)})"
-                ) from None
-            count += 1
-            header = getattr(message, "header", None)
-            stamp = 0 if header is None else header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-            yield stamp or arrived, message
+        if not connections:
+            return
+        for connection, arrived, data in self._reader.messages(connections):
+            yield arrived, self._reader.deserialize(data, connection.msgtype)
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The bags of a recording: itself, or those in its folder, in their order."""
-    inside = [p.parent for p in path.glob("*/metadata.yaml")] if path.is_dir() else []
-    return sorted(inside, key=lambda p: (len(p.name), p.name)) or [path]
+    """The bags of a recording: itself, or those in its folder, in their order.
+
+    A bag's folder has a `metadata.yaml`; where the recorder was killed, only its files are there.
+    """
+    if not path.is_dir():
+        return [path]
+    folders = [path, *sorted((inside for inside in path.iterdir() if inside.is_dir()), key=_numbered)]
+    bags = [[each] if (each / "metadata.yaml").exists() else files_of(each) for each in folders]
+    return bags[0] or [bag for inside in bags[1:] for bag in inside]
+
+
+def files_of(path: Path) -> list[Path]:
+    """The file itself, or the bag files in a bag's folder, in the order in which they were recorded."""
+    if not path.is_dir():
+        return [path]
+    return sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=_numbered)
+
+
+def _numbered(path: Path) -> tuple[int, str]:
+    """For sorting: walk_10 comes after walk_9."""
+    return len(path.name), path.name
 
 
 def bag(path: Path, options: RecordingOptions) -> Recording:
@@ -128,35 +202,24 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
     """
     opened = Bag(path)
     image = _chosen(opened, options.image_topic, IMAGE_TYPES, "images", "--image-topic")
-    stamps: list[int] = []
-    damage = ""
-    try:
-        stamps.extend(stamp for stamp, _ in opened.messages(image.name))
-    except DeviceError as error:
-        damage = str(error)
+    stamps = [stamp for stamp, _ in opened.messages(image.name)]
     if not stamps:
-        raise DeviceError(damage or f"{path}: {image.name} has no images")
-    notes = [f"images from {image.name}", *([f"{damage}; what came before is used"] if damage else [])]
-    order = np.argsort(np.array(stamps, np.int64), kind="stable")
+        raise DeviceError((opened.damage or [f"{path}: {image.name} has no images"])[-1])
+    notes = [f"images from {image.name}"]
     if (np.diff(np.array(stamps)) <= 0).any():
         raise DeviceError(f"{path}: the stamps of {image.name} do not ascend")
     camera, distortion = _camera(opened, image.name, options, notes)
-    images = Images(np.array(stamps, np.int64)[order], _sequential(opened, image.name))
+    images = Images(np.array(stamps, np.int64), _sequential(opened, image.name))
+    kind = f"bag ({path.suffix.lstrip('.') or 'folder'})"
     if options.odometry is not None:
         odometry = read_poses(options.odometry)
-    else:
-        topic = _odometry_topic(opened, options)
+    elif (topic := _odometry_topic(opened, options)) is not None:
         notes.append(f"odometry from {topic.name}")
         odometry = _poses(opened, topic.name)
-    return assembled(
-        path,
-        f"bag ({path.suffix.lstrip('.') or 'folder'})",
-        camera,
-        distortion,
-        images,
-        odometry,
-        tuple(notes),
-    )
+    else:
+        message, lost = f"{NO_ODOMETRY}; topics: {_names(opened.topics)}", tuple(opened.damage)
+        raise without_odometry(path, kind, camera, distortion, images, message, tuple(notes), lost)
+    return assembled(path, kind, camera, distortion, images, odometry, tuple(notes), tuple(opened.damage))
 
 
 def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, option: str) -> Topic:
@@ -177,13 +240,13 @@ def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, op
     return next(topic for topic in fitting if topic.count == most)
 
 
-def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic:
+def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic | None:
     if options.odometry_topic is not None:
         return _chosen(opened, options.odometry_topic, POSE_TYPES, "poses", "--odometry-topic")
     fitting = [topic for topic in opened.topics if topic.kind == ODOMETRY_TYPE and topic.count]
     fitting = [topic for topic in fitting if not any(word in topic.name.lower() for word in TRUTH)]
     if not fitting:
-        raise DeviceError(f"{opened.path}: {NO_ODOMETRY}; topics: {_names(opened.topics)}")
+        return None
     # Filtered odometry may hold other sensors' errors; the wheels' own is what the filters here expect.
     return min(fitting, key=lambda topic: ("filter" in topic.name.lower(), -topic.count, topic.name))
 
@@ -200,11 +263,16 @@ def _poses(opened: Bag, topic: str) -> StampedPoses:
         rows.append((stamp, pose.position.x, pose.position.y, heading_of(q.x, q.y, q.z, q.w)))
     stamps = np.array([row[0] for row in rows], np.int64)
     poses = np.array([row[1:] for row in rows]).reshape(-1, 3)
-    kept = np.append(True, np.diff(stamps) > 0)[: len(stamps)]
-    if kept.sum() < 2 or not np.isfinite(poses).all():
-        raise DeviceError(
-            f"{opened.path}: {topic} has {int(kept.sum())} poses; there must be two, all finite"
-        )
+    good = np.isfinite(poses).all(axis=1)
+    if not good.all():
+        first = int(good.argmin())
+        opened.damaged(f"{opened.path}: pose {first} of {topic} is not finite; what comes before is used")
+        stamps, poses = stamps[:first], poses[:first]
+    # A stamp that lies ahead by damage hides what follows it; nothing goes back in time.
+    kept = np.append(True, stamps[1:] > np.maximum.accumulate(stamps)[:-1])[: len(stamps)]
+    if kept.sum() < 2:
+        why = f" ({opened.damage[-1]})" if opened.damage else ""
+        raise DeviceError(f"{opened.path}: {topic} has {int(kept.sum())} poses; there must be two{why}")
     return StampedPoses(stamps[kept], poses[kept])
 
 
@@ -220,7 +288,9 @@ def _camera(
     if not (near or len(infos) == 1):
         raise DeviceError(f"{opened.path}: no camera_info beside {image}; give --camera FILE (a camera.toml)")
     info = (near or infos)[0]
-    _, message = next(opened.messages(info.name))
+    _, message = next(opened.messages(info.name), (0, None))
+    if message is None:
+        raise DeviceError(opened.damage[-1])
     model = str(message.distortion_model)
     if model not in LENS_MODELS:
         known = " and ".join(name for name in LENS_MODELS if name)

@@ -13,7 +13,7 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_in, images_of, read_increments, read_times
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Images, Recording, Stamps, assembled
+from mapweave.agent.recordings.recording import Images, Recording, Stamps, assembled, without_odometry
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
@@ -122,8 +122,10 @@ def images_folder(folder: Path, options: RecordingOptions) -> Recording:
     if options.odometry is not None or _is_poses(path):
         poses = read_poses(options.odometry or path)
         return assembled(folder, "folder of images", camera, distortion, images, poses)
-    increments = read_increments(path, len(paths))
-    return assembled(folder, "folder of images", camera, distortion, images, increments)
+    increments, damage = read_increments(path, len(paths))
+    images = Images(stamps[: len(increments)], images.read)
+    lines = (f"{damage}; the images before it are used",) if damage else ()
+    return assembled(folder, "folder of images", camera, distortion, images, increments, damage=lines)
 
 
 def _is_poses(path: Path) -> bool:
@@ -146,9 +148,11 @@ def _folder(
     camera, distortion = options.camera_of(folder, given)
     beside = next((p for p in (folder / "odometry.csv", folder / "odometry.txt") if p.exists()), None)
     odometry = options.odometry or beside
+    images = _images(paths, stamps_ns)
     if odometry is None:
-        raise DeviceError(f"{folder}: {kind}, {len(paths)} images, but {NO_ODOMETRY}")
-    return assembled(folder, kind, camera, distortion, _images(paths, stamps_ns), read_poses(odometry))
+        message = f"{kind}, {len(paths)} images, but {NO_ODOMETRY}"
+        raise without_odometry(folder, kind, camera, distortion, images, message)
+    return assembled(folder, kind, camera, distortion, images, read_poses(odometry))
 
 
 def _images(paths: Sequence[Path], stamps_ns: Stamps, camera: Camera | None = None) -> Images:

@@ -63,28 +63,49 @@ def read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     return times
 
 
-def read_increments(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """(count, 2) forward m and turn rad since the image before, of an odometry.csv.
+def read_increments(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np.float64]], str]:
+    """Forward, m, and turn, rad, since the image before, of an odometry.csv.
+
+    Args:
+        path: of it.
+        count: how many images there are.
+
+    Returns:
+        (K, 2) the rows before the first that is damaged, and what is damaged, in one line; empty if nothing
+        is, and K is `count`.
 
     Raises:
-        DeviceError: it is missing or wrong.
+        DeviceError: it is missing or wrong, or has less than two rows that can be read.
     """
+    rows: list[tuple[float, float]] = []
+    damage = ""
     try:
         with path.open(newline="") as file:
             reader = csv.DictReader(file)
             try:
-                rows = [(number(row, "forward_m"), number(row, "turn_rad")) for row in reader]
-            except ValueError as error:
-                raise DeviceError(f"{path}: line {reader.line_num}: {error}") from None
+                for row in reader:
+                    values = number(row, "forward_m"), number(row, "turn_rad")
+                    if not all(map(math.isfinite, values)):
+                        raise ValueError("there must be one finite row for each image")
+                    rows.append(values)
+            except (ValueError, TypeError, csv.Error) as error:
+                damage = f"{path}: line {reader.line_num}: {error}"
+        whole = read_whole(path).endswith(b"\n")
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file; without odometry the map has no scale") from None
     except KeyError as missing:
         raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
-    except (OSError, ValueError, TypeError, csv.Error) as error:
+    except (OSError, ValueError) as error:
         raise DeviceError(f"{path}: {error}") from None
-    if len(rows) != count or not all(math.isfinite(v) for row in rows for v in row):
-        raise DeviceError(f"{path}: {len(rows)} rows for {count} images; there must be one finite row each")
-    return np.array(rows)
+    if (len(rows) >= count and damage) or len(rows) > count:
+        raise DeviceError(damage or f"{path}: {len(rows)} rows for {count} images; there must be one each")
+    if len(rows) < count and not damage:
+        damage = f"{path}: {len(rows)} rows for {count} images"
+        # The number that a file without a last line's end ends in may have had more digits.
+        rows = rows if whole else rows[:-1]
+    if len(rows) < 2:
+        raise DeviceError(damage)
+    return np.array(rows), damage
 
 
 def read_split(path: Path, robot: str | None, count: int) -> range:

@@ -39,6 +39,6 @@ def open_recording(path: Path, options: RecordingOptions | None = None) -> Recor
     for mark, opened in marks.items():
         if (path / mark).exists():
             return opened(path, options)
-    if any(path.glob("*/metadata.yaml")):
+    if bags.parts_of(path):
         return bags.bag(path, options)
     raise DeviceError(f"{path}: not a recording; one is {FORMATS}")

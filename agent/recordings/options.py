@@ -55,6 +55,6 @@ class RecordingOptions:
 
 
 NO_ODOMETRY = (
-    "no odometry: give --odometry FILE (stamped poses), or make a map of some of the images alone with "
-    "`mapweave map from-photos`"
+    "no odometry: give --odometry FILE (stamped poses), or let `mapweave replay` map it by its images alone, "
+    "without a scale"
 )

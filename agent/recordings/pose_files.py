@@ -20,7 +20,8 @@ def read_poses(path: Path) -> StampedPoses:
     """Read poses.
 
     A `.csv` has the columns stamp_s, x_m, y_m and heading_rad. Any other file has lines of
-    `stamp x y z qx qy qz qw`, s and m, z up; lines that begin with # are comments.
+    `stamp x y z qx qy qz qw`, s and m, z up; lines that begin with # are comments. A last line without its
+    end is left out. A damaged line ends the poses.
 
     Raises:
         DeviceError: the file is missing or wrong.
@@ -31,12 +32,13 @@ def read_poses(path: Path) -> StampedPoses:
         raise DeviceError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
         raise DeviceError(f"{path}: {error}") from None
-    rows = _csv(path, text) if path.suffix == ".csv" else _tum(path, text)
-    if len(rows) < 2 or not np.isfinite(rows).all():
-        raise DeviceError(f"{path}: {len(rows)} poses; there must be two or more, all finite")
+    rows, damage = _csv(path, text) if path.suffix == ".csv" else _tum(path, text)
+    if len(rows) < 2:
+        raise DeviceError(damage or f"{path}: {len(rows)} poses; there must be two or more")
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     rows = rows[np.append(True, np.diff(rows[:, 0]) > 0)]
-    return StampedPoses(np.array([round(1e9 * t) for t in rows[:, 0]], np.int64), rows[:, 1:])
+    stamps = np.array([round(1e9 * t) for t in rows[:, 0]], np.int64)
+    return StampedPoses(stamps, rows[:, 1:], f"{damage}; the poses before it are used" if damage else "")
 
 
 def heading_of(qx: float, qy: float, qz: float, qw: float) -> float:
@@ -44,26 +46,41 @@ def heading_of(qx: float, qy: float, qz: float, qw: float) -> float:
     return math.atan2(2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
 
 
-def _csv(path: Path, text: str) -> Array:
-    reader = csv.DictReader(text.splitlines())
+def _csv(path: Path, text: str) -> tuple[Array, str]:
+    reader = csv.DictReader(_whole_lines(text))
     missing = [name for name in CSV_COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
         raise DeviceError(f"{path}: no column {missing[0]!r}; poses have {', '.join(CSV_COLUMNS)}")
+    rows, damage = list[list[float]](), ""
     try:
-        return np.array([[float(row[name]) for name in CSV_COLUMNS] for row in reader]).reshape(-1, 4)
-    except (TypeError, ValueError) as error:
-        raise DeviceError(f"{path}: line {reader.line_num}: {error}") from None
+        for row in reader:
+            rows.append(_finite([float(row[name]) for name in CSV_COLUMNS]))
+    except (TypeError, ValueError, csv.Error) as error:
+        damage = f"{path}: line {reader.line_num}: {error}"
+    return np.array(rows).reshape(-1, 4), damage
 
 
-def _tum(path: Path, text: str) -> Array:
-    rows = []
-    for number, line in enumerate(text.splitlines(), 1):
+def _tum(path: Path, text: str) -> tuple[Array, str]:
+    rows = list[tuple[float, ...]]()
+    for number, line in enumerate(_whole_lines(text), 1):
         words = line.split("#")[0].replace(",", " ").split()
         if not words:
             continue
         try:
-            stamp, x, y, _, qx, qy, qz, qw = map(float, words)
-        except ValueError:
-            raise DeviceError(f"{path}: line {number}: a pose is `stamp x y z qx qy qz qw`") from None
+            stamp, x, y, _, qx, qy, qz, qw = _finite(list(map(float, words)))
+        except ValueError as error:
+            why = error if "finite" in str(error) else "a pose is `stamp x y z qx qy qz qw`"
+            return np.array(rows).reshape(-1, 4), f"{path}: line {number}: {why}"
         rows.append((stamp, x, y, heading_of(qx, qy, qz, qw)))
-    return np.array(rows).reshape(-1, 4)
+    return np.array(rows).reshape(-1, 4), ""
+
+
+def _whole_lines(text: str) -> list[str]:
+    """Without what follows the last line's end: of a file that was cut off, a number may lack digits."""
+    return text[: text.rfind("\n") + 1].splitlines()
+
+
+def _finite(values: list[float]) -> list[float]:
+    if not all(map(math.isfinite, values)):
+        raise ValueError("all numbers must be finite")
+    return values

@@ -20,6 +20,8 @@ from mapweave.vision.lens import Distortion
 
 Stamps = NDArray[np.int64]
 
+SILENCE_S, SILENCE_GAPS = 2.0, 10.0
+"""A camera that gives no image for so long, s and median gaps, has stopped."""
 MOST_WIDTH = 800
 """px; wider images are reduced. SIFT takes time in proportion to the area."""
 
@@ -37,6 +39,7 @@ class Recording:
         read: gives an image by its number, (H, W) grey of the camera's size. Raises DeviceError.
         increments: (N, 2) way of the middle of the axle, m, and turn, rad, since the image before.
         notes: what was guessed or left out, a line each.
+        damage: what cannot be read of it, a line each; what comes before is used.
     """
 
     path: Path
@@ -47,6 +50,7 @@ class Recording:
     read: Callable[[int], NDArray[np.uint8]]
     increments: Array
     notes: tuple[str, ...] = ()
+    damage: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """How many images there are."""
@@ -73,10 +77,25 @@ class StampedPoses:
     Attributes:
         stamps_ns: (M,) ascending, by the images' clock.
         poses: (M, 3) x m, y m, heading rad, in a frame that drifts.
+        damage: what follows and cannot be read, in one line; empty if nothing does.
     """
 
     stamps_ns: Stamps
     poses: Array
+    damage: str = ""
+
+
+class NoOdometry(DeviceError):
+    """A recording has all but odometry.
+
+    Attributes:
+        recording: the rest; its increments are zero.
+    """
+
+    def __init__(self, message: str, recording: Recording) -> None:
+        """Take the line for people, and what there is."""
+        super().__init__(message)
+        self.recording = recording
 
 
 def increments_between(odometry: StampedPoses, stamps_ns: Stamps) -> tuple[NDArray[np.bool_], Array]:
@@ -126,6 +145,7 @@ def assembled(
     images: Images,
     odometry: StampedPoses | Array,
     notes: tuple[str, ...] = (),
+    damage: tuple[str, ...] = (),
 ) -> Recording:
     """Put images and odometry together; large images are reduced.
 
@@ -137,6 +157,7 @@ def assembled(
         images: all of them.
         odometry: poses with stamps, or (N, 2) increments since the image before.
         notes: for people.
+        damage: likewise, of what cannot be read.
 
     Raises:
         DeviceError: they do not fit together.
@@ -151,6 +172,7 @@ def assembled(
             inside, increments = increments_between(odometry, stamps)
         except DeviceError as error:
             raise DeviceError(f"{path}: {error}") from None
+        damage = (*damage, odometry.damage) if odometry.damage else damage
         if not inside.all():
             notes = (*notes, f"{int((~inside).sum())} of {len(stamps)} images have no odometry: left out")
         numbers = np.flatnonzero(inside)
@@ -159,6 +181,7 @@ def assembled(
         def read(k: int) -> NDArray[np.uint8]:
             return whole(int(numbers[k]))
 
+        notes = (*notes, *_silence(stamps, odometry.stamps_ns))
     else:
         increments = odometry
     if len(increments) != len(stamps) or not np.isfinite(increments).all():
@@ -177,7 +200,34 @@ def assembled(
         _reader(path, read, camera, factor),
         increments,
         notes,
+        damage,
     )
+
+
+def _silence(stamps_ns: Stamps, odometry_ns: Stamps) -> list[str]:
+    """A line if the camera stops while the wheels go on."""
+    gaps = np.diff(stamps_ns, append=max(stamps_ns[-1], odometry_ns[-1]))
+    longest = int(gaps.argmax())
+    if gaps[longest] <= max(SILENCE_S * 1e9, SILENCE_GAPS * float(np.median(gaps))):
+        return []
+    begin = (stamps_ns[longest] - stamps_ns[0]) / 1e9
+    return [f"the camera is silent for {gaps[longest] / 1e9:.1f} s, {begin:.1f} s after its first image"]
+
+
+def without_odometry(
+    path: Path,
+    kind: str,
+    camera: Camera,
+    distortion: Distortion,
+    images: Images,
+    message: str,
+    notes: tuple[str, ...] = (),
+    damage: tuple[str, ...] = (),
+) -> NoOdometry:
+    """The error of a recording that has no odometry, with the images. Arguments as of `assembled`."""
+    nothing = np.zeros((len(images.stamps_ns), 2))
+    recording = assembled(path, kind, camera, distortion, images, nothing, notes, damage)
+    return NoOdometry(f"{path}: {message}", recording)
 
 
 def reduced(camera: Camera, factor: int) -> Camera:

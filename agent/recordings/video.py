@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Images, Recording, assembled
+from mapweave.agent.recordings.recording import Images, Recording, assembled, without_odometry
 from mapweave.hybridmap.errors import DeviceError
 
 SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
+
+INDEXED = {".mp4", ".mov", ".m4v"}
+"""Their index stands at the end."""
 
 
 def video(path: Path, options: RecordingOptions) -> Recording:
@@ -29,7 +32,8 @@ def video(path: Path, options: RecordingOptions) -> Recording:
     beside = path.with_suffix(".csv")
     odometry = options.odometry or (beside if beside.exists() else None)
     if odometry is None:
-        raise DeviceError(f"{path}: video, {len(images.stamps_ns)} frames, but {NO_ODOMETRY}")
+        message = f"video, {len(images.stamps_ns)} frames, but {NO_ODOMETRY}"
+        raise without_odometry(path, "video", camera, distortion, images, message)
     return assembled(path, "video", camera, distortion, images, read_poses(odometry))
 
 
@@ -44,7 +48,8 @@ def video_images(path: Path) -> Images:
     while capture.grab():
         stamps.append(round(1e6 * capture.get(cv2.CAP_PROP_POS_MSEC)))
     if len(stamps) < 2:
-        raise DeviceError(f"{path}: no video that can be read")
+        lost = "; an MP4 that was cut off has lost its index" if path.suffix.lower() in INDEXED else ""
+        raise DeviceError(f"{path}: no video that can be read{lost}")
     if not all(before < after for before, after in itertools.pairwise(stamps)):
         # Some containers give no stamps for each frame.
         rate = capture.get(cv2.CAP_PROP_FPS)

@@ -26,7 +26,7 @@ AT_MOST = 10_000
 COMPARISONS = 400_000
 """Of views with nodes, about: among many nodes not every view is asked."""
 RIVALS = MOST_COMPARED
-"""Places that look most like a view, among which doubles are looked for."""
+"""Places that look most like a view, among which aliases are looked for."""
 NODES_AT_ONCE = 40
 """Whose landmarks are compared at once."""
 

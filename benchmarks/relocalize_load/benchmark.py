@@ -52,7 +52,7 @@ ROOM_NODES = 20
 """Nodes a room, one robot each."""
 PATIENCE = 10.0
 """Longest wait for an answer, s."""
-RIVALS = {"desk": "", "in_turn": "[admission_control]\nworkers = 1\nin_time = 1000.0\n"}
+RIVALS = {"admission_control": "", "in_turn": "[admission_control]\nworkers = 1\nin_time = 1000.0\n"}
 """Settings of the servers."""
 
 
@@ -168,12 +168,12 @@ def ask_routes(bus: ZenohBus, building: Building, stop: threading.Event) -> list
     return times
 
 
-def measure(desk: str, options: argparse.Namespace, folder: Path, progress: Progress) -> dict[str, float]:
+def measure(rival: str, options: argparse.Namespace, folder: Path, progress: Progress) -> dict[str, float]:
     """Start a server, let all robots ask, and say how it was."""
     rng = np.random.default_rng(options.seed)
     folder.mkdir(parents=True)
     building = Building.make(options.nodes, folder / "s0.sqlite", rng)
-    (folder / "server.toml").write_text(desk)
+    (folder / "server.toml").write_text(rival)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     step = progress.add_task(f"{folder.name}: the server reads its store", total=options.seconds)
     queries = [[building.query(rng) for _ in range(10)] for _ in range(options.robots)]
@@ -271,8 +271,8 @@ def main() -> None:
     table.add_column("")
     for name in rows:
         table.add_column(name, justify="right")
-    for key in rows["desk"]:
+    for key in rows["admission_control"]:
         table.add_row(key, *(f"{row[key]:g}" for row in rows.values()))
     Console(stderr=options.json).print(table)
     if options.json:
-        print(json.dumps({**report, **rows["desk"], "in_turn": rows["in_turn"]}))
+        print(json.dumps({**report, **rows["admission_control"], "in_turn": rows["in_turn"]}))

@@ -1,4 +1,4 @@
-"""The making of the tables that code landmarks (hybridmap/landmarks_v2.npz).
+"""The making of the tables that code landmarks (hybridmap/landmarks.npz).
 
     python -m benchmarks.train_descriptor [--json]    train, and compare with the tables that are shipped
     python -m benchmarks.train_descriptor --write     train, and store

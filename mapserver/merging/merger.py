@@ -80,7 +80,7 @@ class Merger:
 
     @property
     def recollecting(self) -> bool:
-        """Whether there are findings of before that no merge has taken over yet."""
+        """Whether there are earlier verdicts that no merge has taken over yet."""
         return self._comparisons.recollecting
 
     def recollect(self, findings: VerificationCache) -> None:

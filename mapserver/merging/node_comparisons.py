@@ -160,7 +160,7 @@ class NodeComparisons:
 
     @property
     def recollecting(self) -> bool:
-        """Whether there are findings of before that have not been taken over yet."""
+        """Whether there are earlier verdicts that have not been taken over yet."""
         return self._cached is not None
 
     def recollect(self, findings: VerificationCache) -> None:

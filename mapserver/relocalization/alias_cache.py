@@ -64,7 +64,7 @@ class AliasCache:
 
     def __init__(self, recognition: RecognitionSettings, candidates: int = 16) -> None:
         """Take when a place counts as recognised, and how many nodes are compared with one."""
-        self._doubles, self._recognition, self._candidates = (
+        self._aliased, self._recognition, self._candidates = (
             AliasedLandmarks(recognition),
             recognition,
             candidates,
@@ -145,7 +145,7 @@ class AliasCache:
                 if left < s.least_inliers:
                     same.append(candidate_id)
                     continue
-            likeness = self._doubles.compare(candidate, node)
+            likeness = self._aliased.compare(candidate, node)
             if likeness is not None:
                 aliases[candidate_id] = AliasedNode(
                     candidate, likeness.node_from_robot, likeness.pairs[:, 1], likeness.pairs[:, 0]

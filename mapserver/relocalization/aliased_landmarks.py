@@ -35,7 +35,7 @@ EXPLAINED_PX = 12.0
 """A match nearer than this to its prediction supports the pose."""
 
 NEAR_M, NEAR_HEADING = 0.5, 0.35
-"""Two nodes see the same place, and are no doubles, if the map has them about where they see each
+"""Two nodes see the same place, and are not aliased, if the map has them about where they see each
 other, m and rad."""
 
 

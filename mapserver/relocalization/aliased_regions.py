@@ -40,10 +40,10 @@ class AliasedRegionSettings:
 
     Attributes:
         least_nodes: nodes around it whose aliases imply the same motion. 0: regions are not tested.
-        least_share: of the landmarks that the view shows, how many must lie on what these doubles show.
+        least_share: of the landmarks that the view shows, how many must lie on what these aliases show.
         most_looked_at: how many of them may be, in the other region, in observed but empty places, if the
             aliases show less. Then they must show more than one thing.
-        least_around: nodes whose doubles must imply the same motion then. All but one must have a double of
+        least_around: nodes whose aliases must imply the same motion then. All but one must have an alias of
             its own.
     """
 
@@ -76,15 +76,15 @@ Frame = int | MapId
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
-    """A node here and its double there.
+    """A node here and its alias there.
 
     Attributes:
         here: the node.
         alike: its alias.
         frame: in which that lies.
-        there: `frame_from_double`.
+        there: `frame_from_alias`.
         robot: `frame_from_robot`, by the two.
-        shown: (K, 3) m, landmarks here that the double shows too, in the frame here.
+        shown: (K, 3) m, landmarks here that the alias shows too, in the frame here.
     """
 
     here: Node
@@ -100,7 +100,7 @@ NODES = 8
 REACH = 3.0
 """Nodes farther from the robot are not asked, m."""
 BESIDE = 0.35
-"""A landmark nearer than this to one that a double shows is shown by it too, m."""
+"""A landmark nearer than this to one that an alias shows is shown by it too, m."""
 
 
 class AliasedRegions:

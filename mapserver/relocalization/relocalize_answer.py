@@ -26,14 +26,14 @@ def answer_of(
         least_features: that a view needs.
     """
     reason = _reason(verdict, merged, least_features)
-    if verdict.outcome not in (Outcome.FOUND, Outcome.AMBIGUOUS):
+    if verdict.outcome not in (Outcome.FOUND, Outcome.AMBIGUOUS) and not verdict.confirmable:
         return RelocalizeAnswer(Certainty.UNKNOWN, (), reason)
     chances = probabilities(supported(verdict.places))
     candidates = tuple(
         _whereabouts(place, chance, merged, node_of)
         for place, chance in zip(verdict.places, chances, strict=True)
     )
-    certainty = Certainty.AMBIGUOUS
+    certainty = Certainty.UNKNOWN if verdict.confirmable else Certainty.AMBIGUOUS
     if verdict.outcome is Outcome.FOUND:
         # The distance from a photograph is unknown.
         certainty = Certainty.FOUND if candidates[0].distance_known else Certainty.PLACE

@@ -42,7 +42,7 @@ class Outcome(Enum):
     NO_CANDIDATE = auto()
     NOT_RECOGNISED = auto()
     ONE_WEAK_NODE = auto()
-    """A single node supports it, with few landmarks."""
+    """A single node supports it, with few landmarks, and nothing speaks against it."""
     ONE_THING = auto()
     """All landmarks that agree are on one thing, which may have been moved."""
 
@@ -56,12 +56,15 @@ class Verdict:
         registration: the grounds.
         places: that come into question, best supported first.
         rivals: more than one if ambiguous: places that explain the view about as well as the first.
+        confirmable: another view that gives the same place would make it certain: it lacks nothing but
+            landmarks.
     """
 
     outcome: Outcome
     registration: Registration
     places: Sequence[PlaceHypothesis] = ()
     rivals: Sequence[PlaceHypothesis] = ()
+    confirmable: bool = False
 
 
 class HypothesisSelector:
@@ -83,15 +86,15 @@ class HypothesisSelector:
         places = self.places(registration)
         rivals = self._rivals(places)
         outcome = self._refusal(registration, places, rivals)
-        if outcome is None:
-            ranked = [node for node, _ in registration.candidates.ranked]
-            counterpart = self._counterpart(places[0], ranked)
-            if counterpart is None:
-                outcome = Outcome.FOUND
-            else:
-                outcome, rivals = Outcome.AMBIGUOUS, [places[0], counterpart]
-                places = [*places, counterpart]
-        return Verdict(outcome, registration, places, rivals)
+        weak = outcome is Outcome.ONE_WEAK_NODE and not places[0].best.lonely
+        if outcome is not None and not weak:
+            return Verdict(outcome, registration, places, rivals)
+        ranked = [node for node, _ in registration.candidates.ranked]
+        counterpart = self._counterpart(places[0], ranked)
+        if counterpart is None:
+            return Verdict(outcome or Outcome.FOUND, registration, places, rivals, weak)
+        places, rivals = [*places, counterpart], [places[0], counterpart]
+        return Verdict(outcome or Outcome.AMBIGUOUS, registration, places, rivals)
 
     def _refusal(
         self,

@@ -26,7 +26,8 @@ def add_to(commands: Any) -> None:
         description="Map from one pass of a recording, ask where each image of the others was taken, and "
         "print recall and error. A drive with odometry.csv and splits.toml: the first robot maps as if "
         "carried along, the others ask; truth.csv has the true poses. Photographs with lap_truth.csv: the "
-        "images that are no query are the map, by appearance alone.",
+        "images that are no query are the map, by appearance alone. Recall is of single images, and of a "
+        "robot that asks again within 2 m of driving.",
     )
     relocalize.add_argument("folder", type=Path, help="recording: images/ and its other files")
     relocalize.add_argument(
@@ -108,6 +109,8 @@ def run_replay(arguments: argparse.Namespace) -> int:
         evaluated = evaluate_replay(
             replay, settings_of(arguments).agent, truth, lambda frame: progress.advance(task)
         )
+    for line in replay.damage:
+        console.print(line, highlight=False)
     for written in evaluated.write(out):
         console.print(f"{written}", highlight=False)
     report = evaluated.report()

@@ -26,8 +26,17 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from mapweave.agent.recordings.opening import open_recording
+    from mapweave.agent.recordings.recording import NoOdometry
 
-    recording = open_recording(arguments.recording, options_of(arguments))
+    missing = []
+    try:
+        recording = open_recording(arguments.recording, options_of(arguments))
+    except NoOdometry as error:
+        recording = error.recording
+        missing.append(
+            "odometry: `mapweave replay` maps it by its images alone; such a map has no scale, so nothing in "
+            "it is metric, and lost robots get the place but not the distance"
+        )
     camera, stamps = recording.camera, recording.stamps_ns
     recording.read(0)
     seconds = float(stamps[-1] - stamps[0]) * 1e-9
@@ -45,9 +54,11 @@ def run(arguments: argparse.Namespace) -> int:
         "focal_px": round(camera.fx, 1),
         "camera_height_m": round(camera.mount_height, 3),
         "camera_forward_m": round(camera.mount_forward, 3),
-        "driven_m": round(float(way), 2),
-        "turned_rad": round(float(turn), 2),
+        "driven_m": None if missing else round(float(way), 2),
+        "turned_rad": None if missing else round(float(turn), 2),
+        "missing": missing,
         "notes": list(recording.notes),
+        "damage": list(recording.damage),
     }
     if arguments.json:
         print(json.dumps(facts))
@@ -57,7 +68,10 @@ def run(arguments: argparse.Namespace) -> int:
     print(f", longest gap {facts['longest_gap_s']:g} s")
     print(f"  camera {camera.width}x{camera.height} px, focal length {camera.fx:.0f} px, ", end="")
     print(f"{camera.mount_height:.2f} m high, {camera.mount_forward:.2f} m ahead of the axle")
-    print(f"  odometry {way:.1f} m, {turn:.1f} rad of turns")
-    for note in recording.notes:
+    if not missing:
+        print(f"  odometry {way:.1f} m, {turn:.1f} rad of turns")
+    for words in missing:
+        print(f"  missing: {words}")
+    for note in (*recording.notes, *recording.damage):
         print(f"  {note}")
     return 0

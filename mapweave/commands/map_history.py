@@ -42,10 +42,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(json_values(events)))
         return 0
-    happenings = events.history
-    left_out = len(happenings) - arguments.most
+    listed = events.history
+    left_out = len(listed) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
-    lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in happenings[-arguments.most :]]
+    lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in listed[-arguments.most :]]
     print("\n".join(lines) if lines else "no joins, splits or manual constraints yet")
     return 0
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.hybridmap.errors import DeviceError
 
 if TYPE_CHECKING:
     from mapweave.agent.recordings.options import RecordingOptions
+    from mapweave.agent.recordings.recording import Recording
 
 
 def add_to(commands: Any) -> None:
@@ -18,7 +22,8 @@ def add_to(commands: Any) -> None:
         "replay",
         help="run an agent on a recording",
         description="Run a robot's pipeline on recorded camera images and odometry, as if it were carried "
-        "along. The map goes to a file and, if a server can be reached, to the server.",
+        "along. The map goes to a file and, if a server can be reached, to the server. Of a recording "
+        "that is damaged, what can be read is mapped; a line says what is lost, the status is 1.",
     )
     add_recording(parser)
     parser.add_argument("--robot", metavar="NAME", help="one of the robots in the recording's splits.toml")
@@ -62,21 +67,21 @@ def options_of(arguments: argparse.Namespace) -> RecordingOptions:
 
 def run(arguments: argparse.Namespace) -> int:
     """Play the recording to its end."""
-    import re
-
     from mapweave.agent.drivers.replay import Replay
+    from mapweave.agent.recordings.recording import NoOdometry
     from mapweave.hybridmap.mission_order import MissionKind
-    from mapweave.hybridmap.node import check_name
     from mapweave.processes.agent import AgentOptions, run_agent
 
-    robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
+    try:
+        robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
+    except NoOdometry as missing:
+        return _map_images(arguments, missing.recording)
     for note in robot.recording.notes:
         print(note)
-    fallback = re.sub("[^a-z0-9_-]", "-", (arguments.robot or arguments.recording.resolve().stem).lower())
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     options = AgentOptions(
-        name=check_name(arguments.name or fallback),
+        name=_name(arguments),
         data=arguments.data,
         epoch=arguments.epoch,
         fresh=True,  # a recording begins where it began, not where another has ended
@@ -92,4 +97,66 @@ def run(arguments: argparse.Namespace) -> int:
         run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
         bus.close()
-    return 0
+    return _report(robot.damage)
+
+
+def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
+    """Map a recording without odometry by its images alone."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from mapweave.agent.replication.epochs import newest_on_server, next_epoch
+    from mapweave.agent.replication.journal import Journal
+    from mapweave.hybridmap.change import NodePut
+    from mapweave.photographs import send_map
+    from mapweave.processes.agent import FIRST_PATIENCE, epochs_of_files, map_path
+    from mapweave.storage.map_file import MapFile, write_map_file
+    from mapweave.visual_mapping import keyframes, visual_maps
+
+    name, data, console = _name(arguments), arguments.data, Console(stderr=True)
+    network = network_of(arguments, settings_of(arguments))
+    print(f"{recording.path}: no odometry, so it is mapped by its images alone: the map has no scale")
+    data.mkdir(parents=True, exist_ok=True)
+    path = data / f"{name}.sqlite"
+    journal = Journal(path, name)
+    taken = [*epochs_of_files(data, name), *(known_map.epoch for known_map in journal.maps())]
+    journal.close()
+    bus, keys = connect(network)
+    try:
+        stored = None
+        if not (taken or arguments.offline):
+            stored = newest_on_server(bus, keys, network.server, name, FIRST_PATIENCE)
+        epoch = max([arguments.epoch or 0, *(used + 1 for used in taken)]) or next_epoch(taken, stored)
+        frames = track(range(len(recording)), name, console=console)
+        walk, damage = keyframes(recording, frames)
+        maps = visual_maps(walk, recording.camera, name, epoch)
+        if not maps:
+            why = f"no two of its {len(walk)} keyframes show the same things from two places"
+            raise DeviceError(damage[0] if damage else f"{recording.path}: {why}: nothing can be mapped")
+        for map_id, changes in maps:
+            write_map_file(map_path(data, map_id), MapFile("agent", str(map_id), tuple(changes)))
+            nodes = sum(isinstance(change, NodePut) for change in changes)
+            console.print(f"{name}: {nodes} nodes in {map_path(data, map_id)}; its scale is unknown")
+            if not arguments.offline:
+                sent = send_map(changes, map_id, path, bus, keys, network.server, arguments.patience)
+                console.print(f"server {network.server} has {'' if sent else 'not taken '}it all")
+    finally:
+        bus.close()
+    return _report([*recording.damage, *damage])
+
+
+def _name(arguments: argparse.Namespace) -> str:
+    """In the fleet."""
+    import re
+
+    from mapweave.hybridmap.node import check_name
+
+    fallback = re.sub("[^a-z0-9_-]", "-", (arguments.robot or arguments.recording.resolve().stem).lower())
+    return check_name(arguments.name or fallback)
+
+
+def _report(damage: Sequence[str]) -> int:
+    """Say what could not be read; the exit status."""
+    for line in damage:
+        print(f"mapweave: {line}", file=sys.stderr)
+    return 1 if damage else 0

@@ -104,7 +104,7 @@ def _add_serve(kinds: Any) -> None:
         "--listen", metavar="ENDPOINT", help="be reachable here, instead of connecting to the fleet's router"
     )
     parser.add_argument(
-        "--held", action="store_true", help="let no time pass before a scenario's conductor asks for it"
+        "--held", action="store_true", help="let no time pass before a scenario's runner asks for it"
     )
     add_network(parser)
     parser.set_defaults(run=run_serve)

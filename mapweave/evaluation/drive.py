@@ -11,12 +11,13 @@ from mapweave.agent.mission import Carried
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings
+from mapweave.evaluation.asking_again import Asked, Trial, trials_of
 from mapweave.evaluation.truth import Truth
-from mapweave.evaluation.verdict import LEVELS, Verdict
+from mapweave.evaluation.verdict import LEVELS, SURE, Verdict
 from mapweave.hybridmap.change import Change
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
-from mapweave.hybridmap.query import Certainty
+from mapweave.hybridmap.query import Whereabouts
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.vision.lens import Lens
@@ -37,6 +38,7 @@ class DriveMap:
         description: of the robot.
         nodes: how many were made.
         covered: truth of all its images.
+        trials: of the robots that have asked to their end.
     """
 
     def __init__(self, robot: Replay, truth: Truth, settings: AgentSettings, ticks: Iterable[int]) -> None:
@@ -50,6 +52,7 @@ class DriveMap:
         """
         self.description: RobotDescription = robot.describe()
         self.covered: list[Pose2] = []
+        self.trials: list[Trial] = []
         map_id = MapId("map", 1)
         pipeline = Pipeline(map_id, self.description, settings)
         pipeline.set_mission(Carried())
@@ -69,7 +72,9 @@ class DriveMap:
         self._sift = Sift(Lens(self.description.camera, self.description.distortion))
 
     def questions(self, robot: Replay) -> Iterator[Verdict]:
-        """Ask where each image of another pass was taken."""
+        """Ask where each image of another pass was taken; at the end `trials` has what robots make of it."""
+        asked, true_poses = list[Asked](), list[Pose2 | None]()
+        odom_from_robot, way, turned = Pose2(), 0.0, 0.0
         while (observation := robot.sense()) is not None:
             assert observation.image is not None, "a recording has all its images"
             began = time.perf_counter()
@@ -78,30 +83,28 @@ class DriveMap:
             answer = self._relocalizer.answer(view)
             done = time.perf_counter()
             true = self._truth.at(observation.stamp_ns)
+            expected = None if true is None else self._covers(true)
+            odom_from_robot = odom_from_robot @ observation.odometry.motion()
+            way += abs(observation.odometry.forward)
+            turned += abs(observation.odometry.turn)
+            asked.append(Asked(answer, odom_from_robot, way, turned, expected))
+            true_poses.append(true)
             error_m, error_deg, place = math.nan, math.nan, ""
-            if answer.certainty is Certainty.FOUND:
-                best = answer.candidates[0]
-                place = str(best.node)
-                error_m, error_deg = self._error(best.node, best.node_from_robot.mean, true)
-            elif answer.certainty is Certainty.PLACE:
-                best = answer.candidates[0]
-                place = str(best.node)
-                error_m, error_deg = self._error(best.node, Pose2(), true)
-            has_truth = math.isfinite(error_m)
-            coarse = (
-                LEVELS[-1] if answer.certainty is Certainty.FOUND else (LEVELS[-1][0], math.degrees(TURN))
-            )
+            if answer.certainty in SURE:
+                place = str(answer.candidates[0].node)
+                error_m, error_deg = self._error(answer.candidates[0], true)
             yield Verdict(
                 query=f"{observation.stamp_ns / 1e9:.3f} s",
-                expected=None if true is None else self._covers(true),
+                expected=expected,
                 certainty=answer.certainty,
                 place=place,
-                right=error_m <= coarse[0] and error_deg <= coarse[1] if has_truth else None,
+                right=self._is_right(answer.candidates[0], true) if answer.certainty in SURE else None,
                 error_m=error_m,
                 error_deg=error_deg,
                 extract_ms=1e3 * (extracted - began),
                 answer_ms=1e3 * (done - extracted),
             )
+        self.trials += trials_of(asked, lambda k, place: self._is_right(place, true_poses[k]))
 
     def _covers(self, true: Pose2) -> bool:
         return any(
@@ -109,11 +112,19 @@ class DriveMap:
             for pose in self.covered
         )
 
-    def _error(self, node_id: NodeId, node_from_robot: Pose2, true: Pose2 | None) -> tuple[float, float]:
+    def _is_right(self, place: Whereabouts, true: Pose2 | None) -> bool | None:
+        """Whether a robot is at a place; None without truth."""
+        error_m, error_deg = self._error(place, true)
+        if not math.isfinite(error_m):
+            return None
+        most_m, most_deg = LEVELS[-1]
+        return error_m <= most_m and error_deg <= (most_deg if place.distance_known else math.degrees(TURN))
+
+    def _error(self, place: Whereabouts, true: Pose2 | None) -> tuple[float, float]:
         """Of the position, m, and of the heading, degrees; NaN without truth."""
-        node = self._merger.node(node_id)
+        node = self._merger.node(place.node)
         at_node = None if node is None else self._truth.at(node.stamp_ns)
         if true is None or at_node is None:
             return math.nan, math.nan
-        answered = at_node @ node_from_robot
+        answered = at_node @ (place.node_from_robot.mean if place.distance_known else Pose2())
         return answered.distance(true), math.degrees(abs(wrap_angle(answered.heading - true.heading)))

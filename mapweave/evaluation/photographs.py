@@ -11,7 +11,7 @@ import csv
 import math
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.recordings.image_folder import images_of
+from mapweave.evaluation.asking_again import Trial
 from mapweave.evaluation.verdict import Verdict
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
@@ -181,6 +182,20 @@ class AppearanceMap:
 
     def _view(self, path: Path) -> View:
         return self._sift.extract(read_grey(path, self._camera)).view(self._camera)
+
+
+def photograph_trials(verdicts: Sequence[Verdict]) -> list[Trial]:
+    """A robot that asks at a photograph and, where that is no answer, at the next one.
+
+    Photographs have no odometry. They are 1 to 3 m apart, so the next one is what lies within 2 m.
+    """
+    trials = []
+    for first, second in zip(verdicts, [*verdicts[1:], None], strict=True):
+        asked = [first] if second is None or int(second.query) != int(first.query) + 1 else [first, second]
+        answered = next((verdict for verdict in asked if verdict.certainty is Certainty.FOUND), None)
+        right = None if answered is None else answered.right
+        trials.append(Trial(first.expected, answered is not None, right))
+    return trials
 
 
 def _is_right(place: int, reference: Reference | None) -> bool:

@@ -15,8 +15,9 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_of
 from mapweave.agent.settings import AgentSettings
+from mapweave.evaluation.asking_again import Trial, trial_figures
 from mapweave.evaluation.drive import DriveMap
-from mapweave.evaluation.photographs import AppearanceMap, Photographs
+from mapweave.evaluation.photographs import AppearanceMap, Photographs, photograph_trials
 from mapweave.evaluation.splits import robots_of
 from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import Verdict, figures
@@ -36,16 +37,19 @@ class RelocalizationEvaluation:
     Attributes:
         about: the recording, in figures.
         verdicts: of each question, by how places were verified.
+        trials: of robots that ask again while they drive.
     """
 
     about: dict[str, Any]
     verdicts: dict[str, list[Verdict]]
+    trials: list[Trial]
 
     def report(self) -> dict[str, Any]:
         """For `json.dumps`: figures of the first way at the top, those of the others under their names."""
         names = list(self.verdicts)
         by_selection = {name: figures(self.verdicts[name]) for name in names[1:]}
-        return {**self.about, "verified": names[0], **figures(self.verdicts[names[0]]), **by_selection}
+        first = {**figures(self.verdicts[names[0]]), **trial_figures(self.trials)}
+        return {**self.about, "verified": names[0], **first, **by_selection}
 
     def write(self, folder: Path) -> list[Path]:
         """One table of verdicts for each way."""
@@ -108,7 +112,7 @@ def _examine_drive(folder: Path, settings: AgentSettings, console: Console) -> R
     questions = (verdict for robot in asking for verdict in drive.questions(robot))
     verdicts = list(track(questions, f"{', '.join(names[1:])} ask", total=total, console=console))
     about = {"folder": folder.name, "nodes": drive.nodes, "truth": bool(truth.poses)}
-    return RelocalizationEvaluation(about, {"depths": verdicts})
+    return RelocalizationEvaluation(about, {"depths": verdicts}, drive.trials)
 
 
 def _examine_photographs(
@@ -124,7 +128,7 @@ def _examine_photographs(
         for number, image in track(list(photographs.questions.items()), "questions", console=console)
     ]
     about = {"folder": folder.name, "nodes": len(photographs.places), "focal_px": camera.fx}
-    return RelocalizationEvaluation(about, {"looks": verdicts})
+    return RelocalizationEvaluation(about, {"looks": verdicts}, photograph_trials(verdicts))
 
 
 def _camera_of(folder: Path, camera_file: Path | None, focal_px: float | None) -> tuple[Camera, Distortion]:

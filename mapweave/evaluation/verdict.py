@@ -75,6 +75,7 @@ def figures(verdicts: Sequence[Verdict]) -> dict[str, Any]:
         "recall_at_1": _share([v.certainty is Certainty.FOUND and bool(v.right) for v in expected]),
         "retrieved_at_1": _share([bool(v.first) for v in expected if v.first is not None]),
         "precision": _share([bool(v.right) for v in judged]),
+        "found_wrong": sum(not v.right for v in judged) if judged else None,
         "by_looks": len(by_place),
         "by_looks_precision": _share([bool(v.right) for v in by_place if v.right is not None]),
         "place_at_1": _share([v.certainty in SURE and bool(v.right) for v in expected]),

@@ -22,7 +22,7 @@ def environment() -> Mapping[str, str]:
 def hold(stop: threading.Event) -> None:
     """Set `stop` when the parent has ended; does nothing in a process not started as such a child."""
     if os.environ.get(NAME):
-        threading.Thread(target=_wait, args=(stop,), name="lifeline", daemon=True).start()
+        threading.Thread(target=_wait, args=(stop,), name="parent watchdog", daemon=True).start()
 
 
 def _wait(stop: threading.Event) -> None:

@@ -154,7 +154,7 @@ class FilmFrame:
             snapshot: the moment.
             nodes: places by robot, (N, 3) [x m, y m, heading rad], in world.
             statuses: what each robot is doing, a few words.
-            caption: what is happening, one line below the plan.
+            caption: the present event, one line below the plan.
         """
         frame = self._background(snapshot.furniture, nodes or {}).copy()
         statuses = statuses or {}

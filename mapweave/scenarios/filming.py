@@ -47,7 +47,7 @@ def filming(
         SettingsError: the port of the live view cannot be used.
     """
     if not options.film and options.port is None:
-        yield lambda conductor: None
+        yield lambda runner: None
         return
     with ExitStack() as stack:
         title = f"{stage.scenario.name}, seed {stage.seed}"
@@ -59,14 +59,14 @@ def filming(
         places: dict[str, list[tuple[float, float, float]]] = {robot: [] for robot in stage.robots}
         due = 0.0
 
-        def frame(conductor: ScenarioRunner) -> None:
+        def frame(runner: ScenarioRunner) -> None:
             nonlocal due
-            if conductor.now < due - 1e-6:
+            if runner.now < due - 1e-6:
                 return
-            due = conductor.now + options.every
+            due = runner.now + options.every
             shot = fleet.control.snapshot()
             captions = {}
-            for robot, report in conductor.agents.items():
+            for robot, report in runner.agents.items():
                 captions[robot] = f"{report.status.nodes} nodes, {report.status.doing}"
                 # A node is made about where the robot is: good enough for a dot in a film.
                 while len(places[robot]) < report.status.nodes:
@@ -75,7 +75,7 @@ def filming(
             nodes: dict[str, Array] = {
                 robot: np.array(poses).reshape(-1, 3) for robot, poses in places.items() if poses
             }
-            drawn = scene.draw(shot, nodes, captions, conductor.doing)
+            drawn = scene.draw(shot, nodes, captions, runner.doing)
             if film is not None:
                 film.add(drawn)
             if live is not None:

@@ -61,7 +61,7 @@ class Fleet(Protocol):
 
     @property
     def bus(self) -> Bus:
-        """The conductor's own connection to the fleet's network."""
+        """The runner's own connection to the fleet's network."""
         ...
 
     @property

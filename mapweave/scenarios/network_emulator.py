@@ -40,7 +40,7 @@ class NetworkEmulator:
         self.carried = 0
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listener.getsockname()[1])
-        threading.Thread(target=self._accept, name=f"cable-{self.port}", daemon=True).start()
+        threading.Thread(target=self._accept, name=f"emulator-{self.port}", daemon=True).start()
 
     def cut(self) -> None:
         """Break every connection and take no new one."""

@@ -34,7 +34,7 @@ class ProcessFleet:
         self.keys = Keys(FLEET)
         self._fleet_port, self._simulator_port = free_port(), free_port()
         self._children = Children(stage.out / "logs")
-        self._cables: dict[str, NetworkEmulator] = {}
+        self._emulators: dict[str, NetworkEmulator] = {}
         self.bus = _client(self._fleet_port)
         self._sim_bus = _client(self._simulator_port)
         self.control = SimControl(self._sim_bus, FLEET, timeout=60.0)
@@ -43,7 +43,7 @@ class ProcessFleet:
         """Server, simulator, agents; returns when every robot has asked for its first step."""
         stage, scenario = self._stage, self._stage.scenario
         touched = {e.table["robot"] for e in scenario.events if e.table["do"] in ("cut", "worsen", "restore")}
-        self._cables = {robot: NetworkEmulator(self._fleet_port, stage.seed) for robot in sorted(touched)}
+        self._emulators = {robot: NetworkEmulator(self._fleet_port, stage.seed) for robot in sorted(touched)}
         overrides = [part for override in scenario.overrides for part in ("--set", override)]
         self.start_server()
         self._children.start(
@@ -75,7 +75,7 @@ class ProcessFleet:
 
     def _start_agent(self, robot: str) -> None:
         stage = self._stage
-        port = self._cables[robot].port if robot in self._cables else self._fleet_port
+        port = self._emulators[robot].port if robot in self._emulators else self._fleet_port
         arguments = [
             "agent", robot, "--data", str(stage.agents), "--epoch", str(FIRST_EPOCH),
             "--seed", str(stage.agent_seed(robot)), "--lockstep", "--fleet", FLEET,
@@ -104,23 +104,23 @@ class ProcessFleet:
 
     def cut(self, robot: str) -> None:
         """Cut the robot's cable."""
-        self._cables[robot].cut()
+        self._emulators[robot].cut()
 
     def worsen(self, robot: str, loss: float, delay: float) -> None:
         """Make the robot's cable bad."""
-        self._cables[robot].worsen(loss, delay)
+        self._emulators[robot].worsen(loss, delay)
 
     def restore(self, robot: str) -> None:
         """Mend the robot's cable."""
-        self._cables[robot].restore()
+        self._emulators[robot].restore()
 
     def end(self) -> None:
         """Agents first: they hand over what they have; the server last."""
         for name in (*self._stage.robots, "sim", "server"):
             self._children.end(name)
-        for cable in self._cables.values():
-            cable.close()
-        self._cables.clear()
+        for emulator in self._emulators.values():
+            emulator.close()
+        self._emulators.clear()
         self.bus.close()
         self._sim_bus.close()
 

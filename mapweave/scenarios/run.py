@@ -1,4 +1,4 @@
-"""One trial from beginning to end: fleet, conductor, recording, figures, folder."""
+"""One trial from beginning to end: fleet, runner, recording, figures, folder."""
 
 from __future__ import annotations
 
@@ -112,21 +112,21 @@ def _record(stage: Stage, options: TrialOptions, show: TerminalProgress) -> Reco
         wanted = FilmingOptions(options.film_every or 1.0, bool(options.film_every), options.view, show.say)
         camera = stack.enter_context(filming(stage, wanted, fleet, options.out))
 
-        def look(conductor: ScenarioRunner) -> None:
-            show.look(conductor)
-            camera(conductor)
+        def look(runner: ScenarioRunner) -> None:
+            show.look(runner)
+            camera(runner)
 
-        conductor = ScenarioRunner(stage, fleet, look, options.film_every or 1.0)
-        stack.callback(conductor.reports.close)
-        conductor.run()
+        runner = ScenarioRunner(stage, fleet, look, options.film_every or 1.0)
+        stack.callback(runner.reports.close)
+        runner.run()
         ran = time.monotonic() - started
         show.stage("asking for the merged map and the truth")
-        merged = conductor.merged()
+        merged = runner.merged()
         status, control = fleet.control.status(), fleet.control
         truth = {robot: Trajectory(*control.trajectory(robot)) for robot in stage.robots}
-        conductor.agents = conductor.reports.agents(stage.robots)
+        runner.agents = runner.reports.agents(stage.robots)
         plan, wall = control.plan(), fleet.wall()
-        reports = conductor.reports
+        reports = runner.reports
         fleet.end()
     disks = read_disks(stage.agents, stage.store, stage.robots)
     robots = {
@@ -147,10 +147,10 @@ def _record(stage: Stage, options: TrialOptions, show: TerminalProgress) -> Reco
         robots=robots,
         plan=plan,
         merged=merged,
-        lost=tuple(conductor.lost),
-        photographed=conductor.photographed,
-        moments=tuple(conductor.moments),
-        recoveries_s=tuple(conductor.recoveries_s),
+        lost=tuple(runner.lost),
+        photographed=runner.photographed,
+        moments=tuple(runner.moments),
+        recoveries_s=tuple(runner.recoveries_s),
         sim_s=status.stamp_ns / 1e9,
         wall_s=ran,
         wall={**wall, "starting": started - began, "whole": time.monotonic() - began},

@@ -57,7 +57,7 @@ class ScenarioRunner:
         self,
         stage: Stage,
         fleet: Fleet,
-        on_look: Callable[[ScenarioRunner], None] = lambda conductor: None,
+        on_look: Callable[[ScenarioRunner], None] = lambda runner: None,
         stride: float = STRIDE,
     ) -> None:
         """Take the means.

@@ -45,15 +45,15 @@ class TerminalProgress:
         """Print an activity outside the scenario."""
         self._progress.update(self._whole, doing=text)
 
-    def look(self, conductor: ScenarioRunner) -> None:
+    def look(self, runner: ScenarioRunner) -> None:
         """Print the progress of the trial, and the activity of every robot."""
-        for moment in conductor.moments[self._printed :]:
+        for moment in runner.moments[self._printed :]:
             self._console.print(f"{moment.stamp_ns / 1e9:7.1f} s  {moment.text}", highlight=False)
-        self._printed = len(conductor.moments)
-        doing = f"{conductor.now:6.1f} s  {conductor.doing}"
-        self._progress.update(self._whole, completed=float(conductor.done), doing=doing[:110])
+        self._printed = len(runner.moments)
+        doing = f"{runner.now:6.1f} s  {runner.doing}"
+        self._progress.update(self._whole, completed=float(runner.done), doing=doing[:110])
         for robot, task in self._robots.items():
-            report = conductor.agents.get(robot)
+            report = runner.agents.get(robot)
             if report is None:
                 self._progress.update(task, doing="not in reach")
                 continue

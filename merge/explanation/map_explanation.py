@@ -213,8 +213,8 @@ def _weakest(merged: MergedMap, links: Sequence[Link]) -> tuple[NearMiss, ...]:
 
 def _near_miss(link: Link, words: str) -> NearMiss:
     inliers = int(link.evidence.get("inliers", link.weight))
-    if link.doubles:
-        words = f"{link.doubles} of these are found at other places too; {words}"
+    if link.aliased:
+        words = f"{link.aliased} of these are found at other places too; {words}"
     return NearMiss(*link.pair, int(link.evidence.get("matches", inliers)), inliers, words)
 
 

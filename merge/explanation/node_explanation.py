@@ -170,10 +170,10 @@ def _refusal(merged: MergedMap, a: NodeId, b: NodeId, joined: bool) -> RefusedLi
 
 
 def _landmarks(link: Link) -> str:
-    if not link.doubles:
+    if not link.aliased:
         return f"{link.weight} landmarks agree on one pose"
-    inliers = link.weight + link.doubles
-    return f"{inliers} landmarks agree on one pose, {link.doubles} of them found at other places too"
+    inliers = link.weight + link.aliased
+    return f"{inliers} landmarks agree on one pose, {link.aliased} of them found at other places too"
 
 
 def _other_links_in_words(count: int) -> str:

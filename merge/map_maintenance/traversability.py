@@ -44,7 +44,7 @@ class Traversability:
             foreign: edges that lead out of their own maps, see `ForeignEdges`.
             without: nodes that are left out from the start.
         """
-        self._merged, self._book, self._same_place = merged, reaches, same_place
+        self._merged, self._reachability, self._same_place = merged, reaches, same_place
         self._removed = set(without)
         self._trees: dict[NodeId, cKDTree] = {}
         self._ways: dict[NodeId, dict[NodeId, float]] = {}
@@ -152,7 +152,7 @@ class Traversability:
             return True
         maps = self._merged.maps
         a, b = (maps[end.map].nodes.get(end) if end.map in maps else None for end in (edge.a, edge.b))
-        return a is not None and b is not None and self._book.reach(edge, a, b, (None, None)).drivable
+        return a is not None and b is not None and self._reachability.reach(edge, a, b, (None, None)).drivable
 
     def _graph(self, node: NodeId) -> PoseGraph:
         component = self._merged.component_of(node)

@@ -53,7 +53,7 @@ class DecisionCache:
         for link, now in zip(links, weighed, strict=True):
             if now is not link:
                 before = self._weighed.get(link.pair)
-                if before is None or before[0] is not link or before[1].doubles != now.doubles:
+                if before is None or before[0] is not link or before[1].aliased != now.aliased:
                     before = self._weighed[link.pair] = link, now
                 now = before[1]
             weighed_links.append(now)

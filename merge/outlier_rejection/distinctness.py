@@ -24,7 +24,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.explanation import DOUBLES
+from mapweave.hybridmap.explanation import ALIASED
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Array
@@ -65,19 +65,19 @@ def weigh(
     claims = [link_of(e) for e in own if e.kind is EdgeKind.LOOP]
     with_landmarks = (link for link in (*links, *claims) if len(link.shared))
     connected = [link for link in with_landmarks if link.a in by_node and link.b in by_node]
-    doubles: set[Landmark] = set()
+    aliased: set[Landmark] = set()
     if connected:
         sides = _Sides.of(connected, by_node)
         loops, pairs = sides.loops(), sides.pairs()
         astray = sides.contradict(loops, None, c)
         for k in loops[astray]:
-            doubles |= _ends(connected[k])
+            aliased |= _ends(connected[k])
         for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c)]:
             node, a, b = sides.meeting(i, j)
-            doubles |= {(node, int(landmark)) for landmark in np.intersect1d(a, b)}
-        if doubles:
-            doubles = _followed(doubles, [connected[k] for k in loops[~astray]], maps)
-    return [_weighed(link, doubles) for link in links]
+            aliased |= {(node, int(landmark)) for landmark in np.intersect1d(a, b)}
+        if aliased:
+            aliased = _followed(aliased, [connected[k] for k in loops[~astray]], maps)
+    return [_weighed(link, aliased) for link in links]
 
 
 APART_XY = 0.5
@@ -207,7 +207,7 @@ def _ends(link: Link) -> set[Landmark]:
 
 
 def _followed(
-    doubles: Iterable[Landmark], loops: Sequence[Link], maps: Mapping[MapId, HybridMap]
+    aliased: Iterable[Landmark], loops: Sequence[Link], maps: Mapping[MapId, HybridMap]
 ) -> set[Landmark]:
     """All landmarks that show the same things as some."""
     by_loop: dict[NodeId, list[Link]] = defaultdict(list)
@@ -215,7 +215,7 @@ def _followed(
         by_loop[link.a].append(link)
         by_loop[link.b].append(link.turned())
     onward: dict[NodeId, dict[int, list[Landmark]]] = {}
-    reached, waiting = set(doubles), list(doubles)
+    reached, waiting = set(aliased), list(aliased)
     while waiting:
         node, landmark = waiting.pop()
         if node not in onward:
@@ -237,11 +237,11 @@ def _next_to(node: NodeId, loops: Iterable[Link], hybrid_map: HybridMap) -> dict
     return table
 
 
-def _weighed(link: Link, doubles: set[Landmark]) -> Link:
+def _weighed(link: Link, aliased: set[Landmark]) -> Link:
     count = 0
-    if doubles:
-        count = sum((link.a, i) in doubles or (link.b, j) in doubles for i, j in link.shared.tolist())
-    if count == link.doubles:
+    if aliased:
+        count = sum((link.a, i) in aliased or (link.b, j) in aliased for i, j in link.shared.tolist())
+    if count == link.aliased:
         return link
-    evidence = {name: value for name, value in link.evidence.items() if name != DOUBLES}
-    return replace(link, evidence={**evidence, DOUBLES: float(count)} if count else evidence)
+    evidence = {name: value for name, value in link.evidence.items() if name != ALIASED}
+    return replace(link, evidence={**evidence, ALIASED: float(count)} if count else evidence)

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.explanation import DOUBLES
+from mapweave.hybridmap.explanation import ALIASED
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.merge.pose_graph.factors import Measurement
@@ -64,19 +64,19 @@ class Link:
         return self.a.map == self.b.map
 
     @property
-    def doubles(self) -> int:
+    def aliased(self) -> int:
         """Landmarks that agree and are known to be found at other places too."""
-        return int(self.evidence.get(DOUBLES, 0.0))
+        return int(self.evidence.get(ALIASED, 0.0))
 
     @property
     def weight(self) -> int:
-        """How much counts for it: landmarks that agree and are no doubles, at least 1."""
-        return max(int(self.evidence.get("inliers", 1.0)) - self.doubles, 1)
+        """How much counts for it: landmarks that agree and are not aliased, at least 1."""
+        return max(int(self.evidence.get("inliers", 1.0)) - self.aliased, 1)
 
     @property
     def telling(self) -> bool:
         """Whether its landmarks identify a place."""
-        return self.doubles == 0 or self.weight >= LEAST_DISTINCT
+        return self.aliased == 0 or self.weight >= LEAST_DISTINCT
 
     def turned(self) -> Link:
         """The same link seen from its other end; turned twice it is itself."""
@@ -147,5 +147,5 @@ def refuse_edge(edge: Edge, reason: str) -> RefusedLink:
 
 def place_distinct(links: Sequence[Link]) -> bool:
     """Whether links that agree identify a place together."""
-    doubles = sum(link.doubles for link in links)
-    return doubles == 0 or sum(link.weight for link in links) - AGAINST * doubles >= LEAST_DISTINCT
+    aliased = sum(link.aliased for link in links)
+    return aliased == 0 or sum(link.weight for link in links) - AGAINST * aliased >= LEAST_DISTINCT

@@ -238,7 +238,6 @@ WRONG = {
     "odometry is a folder": (folder_at("odometry.csv"), "odometry.csv"),
     "odometry is empty": (written("odometry.csv", ""), "0 rows for 14 images"),
     "odometry without a turn": (replaced("odometry.csv", "turn_rad", "turn"), "no column 'turn_rad'"),
-    "odometry too short": (written("odometry.csv", ODOMETRY[:-6]), "13 rows for 14 images"),
     "odometry too long": (written("odometry.csv", ODOMETRY + "0,0,0\n"), "15 rows for 14 images"),
     "odometry with text": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0,far", 1)), "'far' is no"),
     "odometry with a gap": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0", 1)), "2: forward_m is"),
@@ -318,15 +317,42 @@ def test_errors_of_a_split_are_reported_in_one_line(folder, case):
 
 
 @pytest.mark.parametrize("case", WRONG_IMAGES)
-def test_errors_of_an_image_are_reported_at_its_turn(folder, case):
-    replay = Replay(folder)
+def test_an_image_that_cannot_be_used_is_left_out_and_named(folder, case):
+    """The wheels' way past it is kept."""
     spoil, message = WRONG_IMAGES[case]
+    replay = Replay(folder)
     spoil(folder)
-    replay.sense()
-    replay.sense()
-    words = refused(replay.sense)
-    assert message in words
-    assert "frame2.png" in words
+    observations = everything(replay)
+    assert [o.stamp_ns for o in observations] == [
+        round((100 + 0.2 * k) * 1e9) for k in range(COUNT) if k != 2
+    ]
+    assert sum(o.odometry.forward for o in observations) == pytest.approx(sum(STEPS))
+    (words,) = replay.damage
+    assert message in words and "frame2.png" in words and "1 of 14 images" in words
+
+
+def test_a_recording_of_which_no_image_can_be_read_is_refused(folder):
+    for path in (folder / "images").glob("*.png"):
+        path.write_bytes(path.read_bytes()[:40])
+    assert "not an image that can be read" in refused(Replay(folder).sense)
+
+
+@given(share=st.floats(0.0, 1.0))
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_odometry_that_is_cut_off_anywhere_is_used_up_to_there(original, folder, share):
+    """Also in the middle of a number, which must not be read as another."""
+    text = (original / "odometry.csv").read_bytes()
+    (folder / "odometry.csv").write_bytes(text[: round(share * len(text))])
+    whole = text[: round(share * len(text))].count(b"\n") - 1
+    if whole < 2:
+        refused(lambda: Replay(folder))
+        return
+    replay = Replay(folder)
+    observations = everything(replay)
+    # A file without the last line's end may be whole: then there is a row for each image.
+    assert len(observations) in (whole, COUNT) and bool(replay.damage) == (len(observations) < COUNT)
+    for k, observation in enumerate(observations[:whole]):
+        assert (observation.odometry.forward, observation.odometry.turn) == (STEPS[k], TURNS[k])
 
 
 toml_values = st.one_of(

@@ -17,7 +17,7 @@ from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.wire.codec import decode_body, encode_body
 from synthetic.world import CAMERA, random_vectors
 
-EVIDENCE = ("inliers", "doubles", "matches", "share", "there", "back", "sigma_xy", "log_evidence")
+EVIDENCE = ("inliers", "aliased", "matches", "share", "there", "back", "sigma_xy", "log_evidence")
 
 
 def pose(rng: np.random.Generator) -> PoseGaussian:

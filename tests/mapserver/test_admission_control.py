@@ -29,7 +29,7 @@ class Counter:
 
     def __init__(self, settings: AdmissionSettings) -> None:
         self.clock = Clock()
-        self.desk = AdmissionControl(settings, self.clock)
+        self.services = AdmissionControl(settings, self.clock)
         self.go = threading.Event()
         self.taken = self.asked = 0
 
@@ -37,7 +37,7 @@ class Counter:
         """One more question: 0 if it is taken on, else the seconds after which to ask again."""
         self.asked += 1
         try:
-            self.desk.submit(lambda: self.go.wait(60), self.asked if ticket is None else ticket)
+            self.services.submit(lambda: self.go.wait(60), self.asked if ticket is None else ticket)
         except Busy as busy:
             return busy.retry_after
         self.taken += 1
@@ -45,7 +45,7 @@ class Counter:
 
     def end(self) -> None:
         self.go.set()
-        self.desk.close()
+        self.services.close()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -110,15 +110,15 @@ class Simulated:
 
     def __init__(self, robots: int, seconds: float, keep: bool, rng: np.random.Generator) -> None:
         self.clock = Clock()
-        self.desk = AdmissionControl(AdmissionSettings(1, in_time=0.7, first_guess=seconds), self.clock)
-        self.pool = self.desk._pool
+        self.services = AdmissionControl(AdmissionSettings(1, in_time=0.7, first_guess=seconds), self.clock)
+        self.pool = self.services._pool
         queue: list[tuple[float, int]] = []  # when it came, and whose it is
 
         class Waiting:
             def submit(self, _work: object, _call: object, ticket: int, *_rest: object) -> None:
                 queue.append((0.0, ticket))
 
-        self.desk._pool = Waiting()  # type: ignore[assignment]
+        self.services._pool = Waiting()  # type: ignore[assignment]
         begin = {robot: 100.0 + 0.01 * robot for robot in range(robots)}
         due, number = dict(begin), dict.fromkeys(begin, 0)
         self.waits: list[float] = []
@@ -131,8 +131,8 @@ class Simulated:
                 _, ticket = queue.pop(0)
                 done, asker = self.clock.now + seconds, ticket % robots
                 free = done
-                with self.desk._lock:
-                    self.desk._open -= 1
+                with self.services._lock:
+                    self.services._open -= 1
                 self.waits.append(done - begin[asker])
                 number[asker] += 1
                 begin[asker] = due[asker] = done + rng.uniform(0.0, 0.01)
@@ -141,7 +141,7 @@ class Simulated:
             self.clock.now = max(self.clock.now, due[robot])
             ticket = robot + robots * number[robot] if keep else int(rng.integers(1 << 40)) * robots + robot
             try:
-                self.desk.submit(lambda: None, ticket)
+                self.services.submit(lambda: None, ticket)
             except Busy as busy:
                 self.refusals += 1
                 due[robot] = self.clock.now + busy.retry_after

@@ -64,7 +64,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def events(history: MapHistory) -> list[tuple[MapEventKind, str]]:
-    return [(event.kind, event.words.split(":")[0].split(", by")[0]) for event in history.happenings]
+    return [(event.kind, event.words.split(":")[0].split(", by")[0]) for event in history.events]
 
 
 JOINED = (MapEventKind.JOINED, "a.1 and b.1 are one map now")
@@ -77,8 +77,8 @@ def test_each_event_is_listed_once_with_its_time(one: MergedMap, two: MergedMap)
     for merged in (MergedMap.empty(), one, one, two, two, one):
         history.follow(merged)
     assert events(history) == [JOINED, PARTED, JOINED]
-    assert "two kitchens" in history.happenings[1].words and history.newest.startswith("a.1 and b.1")
-    stamps = [happening.stamp_ns for happening in history.happenings]
+    assert "two kitchens" in history.events[1].words and history.newest.startswith("a.1 and b.1")
+    stamps = [event.stamp_ns for event in history.events]
     assert stamps == sorted(stamps) and stamps[0] >= 10**18
 
 
@@ -93,7 +93,7 @@ def test_a_restarted_server_publishes_only_news(store: Store, one: MergedMap, tw
     third.follow(two)
     assert events(third) == [JOINED, PARTED]
     assert "refused (undone with all links between a.1 and b.1 by anna" in third.newest
-    assert MapHistory(store).happenings == third.happenings
+    assert MapHistory(store).events == third.events
 
 
 def test_it_is_bounded(store: Store, one: MergedMap, two: MergedMap) -> None:
@@ -108,7 +108,7 @@ def test_many_events_at_once_are_summarised(one: MergedMap) -> None:
     nodes = frozenset(next(iter(one.maps[A].nodes))._replace(agent=name.agent) for name in many)
     history = MapHistory()
     history.follow(replace(one, maps=many, links=(), components=(nodes,)))
-    assert len(history.happenings) == MOST_AT_ONCE + 1
+    assert len(history.events) == MOST_AT_ONCE + 1
     assert history.newest == f"and {199 - MOST_AT_ONCE} more at once"
 
 
@@ -128,7 +128,7 @@ def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
     assert history.newest == (f"a.1 and b.1 are kept apart: {len(links)} links refused ({clash.reason})")
     again = MapHistory(store)
     again.follow(held)
-    assert again.happenings == history.happenings, "recorded already"
+    assert again.events == history.events, "recorded already"
     again.follow(one)
     again.follow(held)
     # The split by it has the reason itself.
@@ -173,12 +173,12 @@ def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> N
 def test_a_damaged_record_is_replaced_and_reported(store: Store, one: MergedMap) -> None:
     store.put_result("history", b"rubbish")
     history = MapHistory(store)
-    (failed,) = history.happenings
+    (failed,) = history.events
     assert failed.kind is MapEventKind.FAILED and "damaged" in failed.words and history.newest == ""
     history.failed(failed.words)
-    assert history.happenings == (failed,), "recorded once"
+    assert history.events == (failed,), "recorded once"
     history.follow(one)
-    assert MapHistory(store).happenings == history.happenings
+    assert MapHistory(store).events == history.events
 
 
 def test_a_disk_that_does_not_take_it_ends_nothing(
@@ -201,16 +201,16 @@ def test_a_disk_that_does_not_take_it_ends_nothing(
 
 
 def test_constraints_are_listed_in_the_history() -> None:
-    happenings = [MapEvent(10**18 + k, MapEventKind.JOINED, "x") for k in (-1, 1)]
-    kinds = [event.kind for event in with_constraints(happenings, APART)]
+    events = [MapEvent(10**18 + k, MapEventKind.JOINED, "x") for k in (-1, 1)]
+    kinds = [event.kind for event in with_constraints(events, APART)]
     assert kinds == [MapEventKind.JOINED, MapEventKind.CONSTRAINED, MapEventKind.JOINED]
     assert "two kitchens" in with_constraints((), APART)[0].words
 
 
 def test_it_comes_through_bytes() -> None:
-    happenings = (MapEvent(5, MapEventKind.PARTED, "a and b"), MapEvent(6, MapEventKind.FAILED, "no"))
-    assert decode(encode(History(happenings)), History).history == happenings
-    kept = KeptHistory(happenings, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
+    events = (MapEvent(5, MapEventKind.PARTED, "a and b"), MapEvent(6, MapEventKind.FAILED, "no"))
+    assert decode(encode(History(events)), History).history == events
+    kept = KeptHistory(events, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
     assert decode(encode(kept), KeptHistory) == kept
     with pytest.raises(InvalidValue, match="printable"):
         encode(History((MapEvent(5, MapEventKind.PARTED, "two\nlines"),)))
@@ -218,7 +218,7 @@ def test_it_comes_through_bytes() -> None:
         {"stamp_ns": 1, "kind": "danced", "words": "x"},
         {"stamp_ns": 6, "kind": "failed", "words": "no"},
     ]
-    assert decode(pack({"history": newer}), History).history == happenings[1:]
+    assert decode(pack({"history": newer}), History).history == events[1:]
     wrong: list[object] = [
         [{"stamp_ns": 1, "kind": "joined"}],
         [{**newer[1], "kind": 2}],

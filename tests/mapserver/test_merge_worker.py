@@ -177,3 +177,17 @@ def test_a_database_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
     worker.read(iter(changes))
     assert len(places) == 4
     worker.close()
+
+
+def test_the_last_waiting_write_of_a_node_counts() -> None:
+    _, _, (first, *_) = mapped_room(("a",))
+    assert isinstance(first.body, NodePut)
+    worker = MergeWorker(LiveSchedule(), 1.0)
+    nodes = [replace(first.body.node, stamp_ns=k) for k in range(50)]
+    for k, one in enumerate(nodes):
+        worker.take(Change(first.map, k + 1, 0, NodePut(one)))
+    worker.start()
+    assert worker.settle(30) and worker.settled
+    assert worker.answers.merged.maps[first.map].nodes[first.body.node.id] is nodes[-1]
+    assert worker._merger.counters.changes == 1
+    worker.close()

@@ -45,8 +45,8 @@ class Served:
         self.room = room
         hub = MemoryHub()
         self.bus, self.asker = MemoryBus(hub), MemoryBus(hub)
-        desk = AdmissionSettings(workers=2, in_time=0.31, too_late=1e3, first_guess=0.1)
-        settings, schedule = ServerSettings(desk), LockstepSchedule() if lockstep else LiveSchedule()
+        services = AdmissionSettings(workers=2, in_time=0.31, too_late=1e3, first_guess=0.1)
+        settings, schedule = ServerSettings(services), LockstepSchedule() if lockstep else LiveSchedule()
         self.server = MapServer(self.bus, KEYS, room.path, "s0", settings, schedule)
         self.nodes = sorted(room.truth)
 

@@ -325,9 +325,9 @@ def beside(tmp_path: Path) -> Iterator[Beside]:
     faiss.omp_set_num_threads(threads)
 
 
-@pytest.mark.parametrize("part", range(4))
-def test_300_random_legal_contents_change_nothing_for_sound_robots(part: int, beside: Beside) -> None:
-    for seed in range(75 * part, 75 * (part + 1)):
+@pytest.mark.parametrize("part", range(2))
+def test_random_legal_contents_change_nothing_for_sound_robots(part: int, beside: Beside) -> None:
+    for seed in range(60 * part, 60 * (part + 1)):
         beside.check(seed)
 
 
@@ -360,7 +360,7 @@ def test_a_content_whose_loops_have_singular_covariances_changes_nothing(beside:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Beside) -> None:
-    for seed in range(300, 3300):
+    for seed in range(120, 3120):
         beside.check(seed)
 
 
@@ -390,15 +390,3 @@ def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
         stop.set()
         hurrying.join()
         worker.close()
-
-
-def test_the_last_waiting_write_of_a_node_counts() -> None:
-    worker = MergeWorker(LiveSchedule(), 1.0)
-    nodes = [replace(node(1), stamp_ns=k) for k in range(50)]
-    for k, one in enumerate(nodes):
-        worker.take(Change(BAD, k + 1, 0, NodePut(one)))
-    worker.start()
-    assert worker.settle(30) and worker.settled
-    assert worker.answers.merged.maps[BAD].nodes[NodeId(*BAD, 1)] is nodes[-1]
-    assert worker._merger.counters.changes == 1
-    worker.close()

@@ -94,16 +94,25 @@ def test_recordings(tmp_path, capfd, recording):
     assert "camera's intrinsics" in complaint(capfd, "replay", recording)
 
 
-def test_an_image_of_a_recording_that_is_broken(tmp_path, capfd, recording):
-    (recording / "images" / "1.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 50)
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("images/1.png", b"\x89PNG\r\n\x1a\n" + b"\0" * 50, "1.png: not an image that can be read"),
+        ("odometry.csv", b"forward_m,turn_rad\n0,0\n0,0\n0,fa\n", "line 4: turn_rad"),
+    ],
+)
+def test_a_damaged_recording_is_mapped_as_far_as_it_can_be_read(
+    name, content, words, tmp_path, capfd, recording
+):
+    (recording / name).write_bytes(content)
     arguments = ["replay", recording, "--offline", "--data", tmp_path / "data", "--epoch", 1]
     assert main([str(a) for a in arguments]) == 1
     output = capfd.readouterr().err.splitlines()
     (line,) = [line for line in output if line.startswith("mapweave: ")]
-    assert "1.png: not an image that can be read" in line
+    assert words in line
     assert output[-1] == line
     assert not any("Traceback" in line for line in output)
-    assert (tmp_path / "data" / "walk.1.mapweave").exists(), "what was mapped before is kept"
+    assert (tmp_path / "data" / "walk.1.mapweave").exists(), "what was mapped is kept"
 
 
 def test_places_that_cannot_be_written(tmp_path, capfd, recording, closed):

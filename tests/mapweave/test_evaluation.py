@@ -15,11 +15,13 @@ import pytest
 import skimage.data
 
 from mapweave.cli import main
+from mapweave.evaluation.asking_again import Asked, trial_figures, trials_of
 from mapweave.evaluation.photographs import evidence
 from mapweave.evaluation.verdict import Verdict, figures
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import Certainty
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, Whereabouts
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
@@ -123,6 +125,8 @@ def test_a_drive(drive: Path, capfd, tmp_path: Path) -> None:
     assert values["nodes"] >= 1
     assert values["recall_at_1"] >= 0.8
     assert (values["precision"], values["false_accept"]) == (1.0, 0.0)
+    assert values["recall_within_2m"] >= values["recall_at_1"]
+    assert (values["found_wrong"], values["decided_wrong"], values["decided_precision"]) == (0, 0, 1.0)
     assert values["error_m_median"] < 0.1
     assert values["error_deg_median"] < 1.0
     with (tmp_path / "out" / "answers-depths.csv").open() as file:
@@ -180,6 +184,7 @@ def test_photographs(walk: Path, capfd, tmp_path: Path) -> None:
     assert (values["queries"], values["expected"], values["nodes"]) == (4, 3, 3)
     assert (values["recall_at_1"], values["precision"], values["unknown_share"]) == (1.0, 1.0, 0.25)
     assert (values["error_frames_median"], values["false_accept"]) == (0.0, 0.0)
+    assert (values["recall_within_2m"], values["decided"]) == (1.0, 3), "the last one is followed by nothing"
     assert (tmp_path / "out" / "answers-looks.csv").exists()
     # Two references changed over: what was right is wrong.
     table = (walk / "lap_truth.csv").read_text()
@@ -217,6 +222,25 @@ def test_figures_by_hand() -> None:
     assert outcome["error_m_median"] == 4.7
     assert outcome["answer_ms_p50"] == 20.0
     assert "error_frames_median" not in outcome
+
+
+def test_a_robot_asks_again_until_it_knows_or_has_driven_two_metres() -> None:
+    """Answers every metre: found at 3 m, rightly, and at 6 m, wrongly; nothing is certain elsewhere."""
+    node, here = NodeId("r0", 1, 1), PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
+    place = Whereabouts(node, here, None, NO_COMPONENT, 30, 0.9)
+    nothing = RelocalizeAnswer(Certainty.UNKNOWN, (), "")
+    found = RelocalizeAnswer(Certainty.FOUND, (place,), "")
+    asked = [
+        Asked(found if k in (3, 6) else nothing, Pose2(float(k), 0, 0), float(k), 0.0, expected=k < 5)
+        for k in range(8)
+    ]
+    trials = trials_of(asked, lambda k, given: k == 3)
+    assert [trial.decided for trial in trials] == [False, True, True, True, True, True, True, False]
+    assert [trial.right for trial in trials] == [None, True, True, True, False, False, False, None]
+    outcome = trial_figures(trials)
+    assert outcome == {
+        "recall_within_2m": 0.6, "decided": 6, "decided_wrong": 3, "decided_precision": 0.5,
+    }  # fmt: skip
 
 
 def test_evidence_bounds_chance() -> None:

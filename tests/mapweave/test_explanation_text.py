@@ -14,7 +14,7 @@ from mapweave.explanation_text import MOST_LINKS, WIDTH, pair_words
 from mapweave.hybridmap.explanation import LinkAgreement, PairExplanation
 from mapweave.hybridmap.node import NodeId
 from mapweave.merge.explanation.node_explanation import explain_nodes
-from tests.mapserver.desks import two_maps
+from tests.mapserver.stub_services import two_maps
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,29 @@ def test_the_noise_of_blurred_pixels_is_estimated() -> None:
     first, closer, squared = looks(1.0)
     assert np.median(closer) < 1.15 * np.median(first)
     assert np.mean(squared) < 4.5
+
+
+def test_a_refinement_that_leaves_most_landmarks_out_is_not_taken() -> None:
+    """Landmarks up to 100 m away, of which every third pixel is off by more than the others."""
+    street, rng = room(0, 0, 100, 80, 3000, np.random.default_rng(1)), np.random.default_rng(7)
+    first, closer = [], []
+    for number in range(60):
+        a = Pose2(50.0, 40.0, rng.uniform(-3.0, 3.0))
+        b = a @ Pose2(*rng.uniform([-6.0, -0.3, -0.03], [6.0, 0.3, 0.03]))
+        sensing = Sensing(pixel_sigma=0.3, reach=300.0, depth_share=0.1)
+        node = take_node(street, NodeId("r0", 1, number), a, HERE, rng, sensing)
+        view, _ = take_view(street, b, rng, Sensing(pixel_sigma=0.3, reach=300.0))
+        blurred = rng.random(len(view)) < 0.35
+        pixels = view.pixels + np.where(blurred[:, None], rng.normal(0.0, 1.5, view.pixels.shape), 0.0)
+        view = replace(view, pixels=pixels.astype(np.float32))
+        recognition = recognise(node, view, None, rng)
+        if recognition is None:
+            continue
+        best, true = refine_pose(node, view, recognition, PlanarPoseSettings()), a.inverse() @ b
+        first.append(recognition.node_from_robot.mean.distance(true))
+        closer.append(best.mean.distance(true))
+    assert len(first) > 40
+    assert np.max(closer) < 1.2 * np.max(first), "it was 2.2 times"
 
 
 def test_an_average_is_where_the_likelihood_is_highest() -> None:

@@ -23,7 +23,7 @@ def test_refusals_come_back(reason: str, retry_after: float) -> None:
 
 
 def test_as_bytes() -> None:
-    """As docs/wire.md has it; the first is also what programs of before send."""
+    """As docs/wire.md has it."""
     assert encode_refusal("no such node") == b"refused: no such node"
     assert encode_refusal("busy", 0.5) == b"refused: busy\0\x00\x00\x00\x3f"
     assert encode_refusal("") == b"refused: refused"

@@ -56,8 +56,8 @@ function to(parent, a, b, words) {
 function showPair(pair) {
   const box = add(result, "section", "", pair.standing === "linked" || pair.standing === "own" ? "good" : "");
   add(box, "p", `${pair.a.id} and ${pair.b.id}: ${pair.standing}: ${pair.reason}.`);
-  if (pair.evidence.doubles)
-    add(box, "p", `${pair.evidence.doubles} of the landmarks that agree are found at other places too.`);
+  if (pair.evidence.aliased)
+    add(box, "p", `${pair.evidence.aliased} of the landmarks that agree are found at other places too.`);
   if (pair.a_from_b) add(box, "p", "Seen from the first, the second is " + pose(pair.a_from_b) + ".");
   if (pair.misfit) add(box, "p", `In the map it is ${pose(pair.misfit.merged_a_from_b)}; off by ` +
     `${metres(pair.misfit.off)}, ${Math.sqrt(pair.misfit.strain2).toFixed(1)} standard deviations` +

@@ -34,14 +34,14 @@ def measured(start: NodeId, end: NodeId, start_from_end: Pose2, landmarks: int =
 
 
 class Notebook:
-    """A map into which surveyor are written."""
+    """A map into which traverses are written."""
 
     def __init__(self) -> None:
         self.map = HybridMap()
         self.numbers = iter(range(100, 200))
 
-    def note(self, *surveyor: Traverse) -> Edge:
-        for traverse in surveyor:
+    def note(self, *traverses: Traverse) -> Edge:
+        for traverse in traverses:
             edge = driven_edge(self.map, traverse, lambda: NodeId(*MAP, next(self.numbers)))
             self.map.apply(EdgePut(edge))
         return edge

@@ -45,7 +45,7 @@ class Drive:
 
     def __init__(self, seed: int = 0) -> None:
         self.rng = np.random.default_rng(seed)
-        self.surveyor = TraverseRecorder(ROBOT)
+        self.recorder = TraverseRecorder(ROBOT)
         self.pose = NODES[A]
         self.measured: list[Traverse] = []
 
@@ -64,7 +64,7 @@ class Drive:
             self.see(fix, odometry)
 
     def see(self, fix: Fix | None, odometry: Odometry = STEP) -> None:
-        traverse = self.surveyor.see(fix, Observation(0, odometry))
+        traverse = self.recorder.see(fix, Observation(0, odometry))
         if traverse is not None:
             self.measured.append(traverse)
 

@@ -29,9 +29,9 @@ class Stage:
     started: bool = True
 
 
-def tick(passenger: CarriedMapping) -> list[EpisodeRequest]:
+def tick(mapping: CarriedMapping) -> list[EpisodeRequest]:
     """What it asks of the mapper in a tick. The wheels are not its business."""
-    moves = list(iter(passenger.next_move, Command()))
+    moves = list(iter(mapping.next_move, Command()))
     assert all(isinstance(move, EpisodeRequest) for move in moves)
     return moves
 
@@ -68,37 +68,37 @@ def test_limits_are_heeded(monkeypatch):
 
 def test_without_an_image_it_waits():
     stage = Stage(started=False)
-    passenger = CarriedMapping(stage)
-    assert passenger.detail == "no image yet"
-    assert tick(passenger) == tick(passenger) == [EpisodeRequest.BEGIN]
+    mapping = CarriedMapping(stage)
+    assert mapping.detail == "no image yet"
+    assert tick(mapping) == tick(mapping) == [EpisodeRequest.BEGIN]
     stage.started = True
-    assert not tick(passenger)
+    assert not tick(mapping)
 
 
 def test_problems_of_the_view_are_reported():
-    passenger = CarriedMapping(Stage(anchor_features=3, anchored=2))
-    tick(passenger)
-    assert passenger.detail == "only 3 features in view"
+    mapping = CarriedMapping(Stage(anchor_features=3, anchored=2))
+    tick(mapping)
+    assert mapping.detail == "only 3 features in view"
 
 
 def carried(walls, description, poses):
     """The nodes that a carried robot makes, and its mapper."""
     mapper = Mapper(MapId("r0", 1), description)
-    passenger = CarriedMapping(mapper)
+    mapping = CarriedMapping(mapper)
     changes, before = [], poses[0]
     for number, pose in enumerate(poses):
         observation = walls.observe(before, pose, number)
         mapper.step(observation)
-        while isinstance(move := passenger.next_move(), EpisodeRequest):
+        while isinstance(move := mapping.next_move(), EpisodeRequest):
             mapper.meet(move, observation)
         changes += mapper.take_changes()
         before = pose
-    return changes, mapper, passenger
+    return changes, mapper, mapping
 
 
 def test_a_drive_along_the_walls_becomes_a_chain_of_nodes(walls, description):
     poses = [Pose2(x) for x in np.arange(0.0, 1.3, 0.025)]
-    changes, mapper, passenger = carried(walls, description, poses)
+    changes, mapper, mapping = carried(walls, description, poses)
     nodes = [change.node for change in changes if isinstance(change, NodePut)]
     assert len(nodes) >= 2
     assert len(mapper.map.components()) == 1
@@ -106,7 +106,7 @@ def test_a_drive_along_the_walls_becomes_a_chain_of_nodes(walls, description):
         true = poses[round(node.stamp_ns / 1e8)]
         assert node.map_from_robot.mean.distance(true) < 0.03
         assert abs(node.map_from_robot.mean.heading) < 0.02
-    assert "features left after" in passenger.detail
+    assert "features left after" in mapping.detail
 
 
 def test_a_robot_that_stands_still_makes_no_node(walls, description):
@@ -117,6 +117,6 @@ def test_a_robot_that_stands_still_makes_no_node(walls, description):
 
 def test_a_blank_wall_makes_no_node_and_is_reported(walls, description):
     poses = [Pose2(-x, 0, np.pi) for x in np.arange(0.0, 0.8, 0.05)]
-    changes, _, passenger = carried(walls, description, poses)
+    changes, _, mapping = carried(walls, description, poses)
     assert changes == []
-    assert passenger.detail == "only 0 features in view"
+    assert mapping.detail == "only 0 features in view"

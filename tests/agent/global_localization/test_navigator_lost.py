@@ -19,7 +19,7 @@ from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import RouteAnswer
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer
 from synthetic.world import take_map
 from tests.agent.scripted_fleet import (
     BODY,
@@ -71,6 +71,25 @@ def test_it_drives_elsewhere_to_tell_two_places_apart(home):
     assert trial.navigator.tally == DriveStatistics(relocalizations=1)
     turned = sum(abs(command.turn) for command in trial.commands) * BODY.tick
     assert turned > math.tau, "first it looked all around"
+
+
+@pytest.mark.parametrize("moves_along", [True, False])
+def test_views_that_prove_nothing_alone_are_a_place_once_they_agree(home, moves_along):
+    """The fleet is not sure. It is believed from the second view on if its answers turn with the wheels."""
+    start = Pose2(2.5, 2.0)
+    eyes = Eyes(home, start)
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhichWay):
+            return Answer(question.number, RouteAnswer(straight(bare(A), bare(C)), "a way"))
+        place = here(A, start.inverse() @ eyes.pose if moves_along else Pose2(0.1, 0.2, 0.3))
+        return Answer(question.number, RelocalizeAnswer(Certainty.UNKNOWN, (place,), "not sure"))
+
+    trial = Trial(navigator(eyes, NOWHERE, C), eyes, fleet)
+    trial.run(12.0, lambda: trial.navigator.fix is not None)
+    assert (trial.navigator.fix is not None) == moves_along
+    if moves_along:
+        assert sum(isinstance(question, WhereAmI) for question in trial.asked) == 2
 
 
 def test_without_room_it_stays_and_searches_on(home):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.localization import place_recognition
-from mapweave.agent.localization.place_recognition import lookalikes, recognise_places
+from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, NodeId
@@ -122,10 +122,10 @@ def test_two_similar_places_are_reported_and_neighbours_are_not(world, own_map):
     far, near = recalled(3.0), recalled(0.2)
     share = far[1][1].inliers / far[0][1].inliers
     assert 0.3 < share < 0.7
-    result = lookalikes(far, 0.9 * share, 0.5)
+    result = aliased_places(far, 0.9 * share, 0.5)
     assert result is not None
     assert [a.id.number for a in result] == [node.id.number, 99]
-    assert lookalikes(far, 1.1 * share, 0.5) is None, "it is not seen about as well"
-    assert lookalikes(near, 0.9 * share, 0.5) is None, "it is not elsewhere"
-    assert lookalikes(far[:1], 0.1, 0.5) is None
-    assert lookalikes([], 0.1, 0.5) is None
+    assert aliased_places(far, 1.1 * share, 0.5) is None, "it is not seen about as well"
+    assert aliased_places(near, 0.9 * share, 0.5) is None, "it is not elsewhere"
+    assert aliased_places(far[:1], 0.1, 0.5) is None
+    assert aliased_places([], 0.1, 0.5) is None

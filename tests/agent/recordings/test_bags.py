@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -19,7 +23,7 @@ from rosbags.typesys import Stores, get_typestore
 from mapweave.agent.drivers.recorded import RecordedRobot
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.recordings.mcap_writer import PART_S
+from mapweave.agent.recordings.mcap_writer import FLUSH_S, PART_S
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
@@ -154,14 +158,107 @@ def test_topics_are_named_by_the_person_or_guessed(drive: Drive, tmp_path: Path)
         open_recording(tmp_path / "drive", RecordingOptions(image_topic="/cam/camera_info"))
 
 
-def test_a_bag_cut_off_in_the_middle_is_refused_or_used_up_to_there(drive: Drive, tmp_path: Path) -> None:
-    write_bag(tmp_path / "drive.bag", drive, ros1=True)
-    whole = (tmp_path / "drive.bag").read_bytes()
-    for share in (0.1, 0.5, 0.9):
-        (tmp_path / "drive.bag").write_bytes(whole[: round(share * len(whole))])
-        with pytest.raises(DeviceError) as error:
-            open_recording(tmp_path / "drive.bag", RecordingOptions(camera_height=0.3))
-        assert "drive.bag" in str(error.value) and "\n" not in str(error.value)
+FORMATS = {"ros1": ("mono8", True), "mcap": ("png", False), "db3": ("bgra8", False)}
+"""Encodings of which `write_bag` makes a bag of that format."""
+
+
+@pytest.fixture(scope="session")
+def whole_bags(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The bytes of one bag of each format."""
+    out = {}
+    for name, (encoding, ros1) in FORMATS.items():
+        path = tmp_path_factory.mktemp(name) / ("drive.bag" if ros1 else "drive")
+        write_bag(path, drive, encoding, ros1)
+        (file,) = [path] if ros1 else [p for p in path.iterdir() if p.suffix != ".yaml"]
+        out[name] = file.read_bytes()
+    return out
+
+
+SUFFIX = {"ros1": ".bag", "mcap": ".mcap", "db3": ".db3"}
+OPTIONS = RecordingOptions(camera_height=0.3)
+
+
+def check_prefix(path: Path, drive: Drive) -> int:
+    """How many images a damaged bag still has; all are the first ones, and the loss is said in one line."""
+    try:
+        replay = Replay(path, options=OPTIONS)
+    except DeviceError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+        return 0
+    seen = list(iter(replay.sense, None))
+    assert [observation.stamp_ns for observation in seen] == drive.stamps_ns[: len(seen)]
+    for observation, grey, (forward, turn) in zip(seen, drive.images, drive.increments, strict=False):
+        assert np.array_equal(observation.image, grey)
+        assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx((forward, turn))
+    assert replay.damage and all("\n" not in line for line in replay.damage)
+    return len(seen)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(share=st.floats(0.0, 0.99))
+def test_a_bag_cut_off_anywhere_is_used_up_to_there(
+    name: str, share: float, whole_bags: dict[str, bytes], drive: Drive, tmp_path: Path
+) -> None:
+    path = tmp_path / f"drive{SUFFIX[name]}"
+    path.write_bytes(whole_bags[name][: int(share * len(whole_bags[name]))])
+    check_prefix(path, drive)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_longer_a_cut_bag_is_the_more_images_it_has(
+    name: str, whole_bags: dict[str, bytes], drive: Drive, tmp_path: Path
+) -> None:
+    whole, counts = whole_bags[name], list[int]()
+    for share in (0.02, 0.3, 0.6, 0.9):
+        path = tmp_path / f"drive{SUFFIX[name]}"
+        path.write_bytes(whole[: round(share * len(whole))])
+        counts.append(check_prefix(path, drive))
+    assert counts == sorted(counts) and counts[0] == 0
+    assert counts[2] >= 0.5 * 0.6 * COUNT and counts[3] >= 0.6 * COUNT
+
+
+def test_a_pose_that_is_no_number_ends_the_odometry(drive: Drive, tmp_path: Path) -> None:
+    spoiled = [*drive.poses[:6], *(Pose2(0.0, 0.0, 0.0) for _ in drive.poses[6:])]
+    object.__setattr__(spoiled[6], "x", math.nan)
+    write_bag(tmp_path / "drive", replace(drive, poses=spoiled))
+    replay = Replay(tmp_path / "drive", options=OPTIONS)
+    assert [o.stamp_ns for o in iter(replay.sense, None)] == drive.stamps_ns[:5]
+    (line,) = replay.damage
+    assert "of /odom is not finite; what comes before is used" in line
+
+
+def test_all_of_a_killed_recorder_but_the_last_seconds_is_there(drive: Drive, tmp_path: Path) -> None:
+    """A process records ten observations a second of its own clock; it is killed within a minute."""
+    program = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "import numpy as np\n"
+        "from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription\n"
+        "from mapweave.agent.recordings.mcap_writer import McapWriter\n"
+        "from mapweave.hybridmap.camera import Camera\n"
+        "camera = Camera(32, 24, 30.0, 30.0, 15.5, 11.5, mount_height=0.3)\n"
+        "writer = McapWriter(Path(sys.argv[1]), RobotDescription(camera=camera))\n"
+        "for k in range(95):\n"
+        f"    at, image = {BEGUN_NS} + k * 100_000_000, np.full((24, 32), k, np.uint8)\n"
+        "    writer.write(Observation(at, Odometry(0.02, 0.0), image), Command())\n"
+        "while writer.written < 95:\n"
+        "    pass\n"
+        "print('recorded', flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    folder = tmp_path / "walk"
+    command = [sys.executable, "-c", program, str(folder)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "recorded\n"
+        process.kill()
+    replay = Replay(folder)
+    stamps = [observation.stamp_ns for observation in iter(replay.sense, None)]
+    assert stamps == [BEGUN_NS + k * 100_000_000 for k in range(len(stamps))]
+    assert 95 - len(stamps) <= 10 * FLUSH_S and not replay.damage
+    with AnyReader([folder / "walk_0" / "walk_0.mcap"]) as reader:
+        assert {c.topic: c.msgcount for c in reader.connections}["/odom"] == len(stamps)
+        assert sum(1 for _ in reader.messages()) == reader.message_count
 
 
 class Driven:
@@ -263,8 +360,14 @@ def test_a_long_recording_is_a_row_of_files(drive: Drive, tmp_path: Path) -> Non
     record(slow, tmp_path / "walk")
     assert sorted(p.name for p in (tmp_path / "walk").iterdir()) == ["walk_0", "walk_1", "walk_2"]
     assert [o.stamp_ns for o in iter(Replay(tmp_path / "walk").sense, None)] == slow.stamps_ns
-    # The last file of a robot whose battery failed has no index.
+    # The last folder of a robot whose battery failed has no index.
     (tmp_path / "walk" / "walk_2" / "metadata.yaml").unlink()
+    assert len(Replay(tmp_path / "walk")) == COUNT
+    file = tmp_path / "walk" / "walk_2" / "walk_2.mcap"
+    file.write_bytes(file.read_bytes()[:-100])
+    replay = Replay(tmp_path / "walk")
+    assert len(replay) == COUNT and "walk_2.mcap: damaged or cut off" in replay.damage[0]
+    file.write_bytes(b"")
     assert len(Replay(tmp_path / "walk")) == 8
 
 

@@ -163,6 +163,20 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
         assert error.mean() < 3.0, "not the same frame"
 
 
+def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+    """The wheels go on for seven seconds. The map is of what was seen."""
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    tum_rgbd(drive, folder)
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    last = poses_file.read_text().splitlines()[-1].split(" ", 1)
+    at = drive.stamps_ns[-1] / 1e9 + 7.0
+    poses_file.write_text(poses_file.read_text() + f"{at:.9f} {last[1]}\n")
+    recording = open_recording(folder, RecordingOptions(camera=tmp_path / "camera.toml", odometry=poses_file))
+    assert len(recording) == COUNT
+    assert recording.notes == ("the camera is silent for 7.0 s, 1.6 s after its first image",)
+
+
 def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
     kitti(drive, tmp_path)
     with pytest.raises(DeviceError, match="do not overlap: they must be of one clock"):
@@ -191,7 +205,7 @@ def test_a_large_image_is_reduced_with_its_camera(drive: Drive) -> None:
     [
         ("1 2 3\n", "line 1: a pose is `stamp x y z qx qy qz qw`"),
         ("", "0 poses; there must be two or more"),
-        ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "all finite"),
+        ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "line 2: all numbers must be finite"),
         ("# only a comment\n1 0 0 0 0 0 0 1\n", "1 poses"),
     ],
 )

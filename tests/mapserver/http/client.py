@@ -8,7 +8,7 @@ import socket
 from email.message import Message
 
 from mapweave.mapserver.http.web import Web
-from tests.mapserver.desks import picture
+from tests.mapserver.stub_services import picture
 
 
 def ask(

@@ -7,15 +7,15 @@ from collections.abc import Iterator
 import pytest
 
 from mapweave.mapserver.http.web import Web
-from tests.mapserver.desks import Desk
+from tests.mapserver.stub_services import StubServices
 
 
 @pytest.fixture
-def desk() -> Desk:
-    return Desk()
+def services() -> StubServices:
+    return StubServices()
 
 
 @pytest.fixture
-def served(desk: Desk) -> Iterator[Web]:
-    with Web(("127.0.0.1", 0), desk) as served:
+def served(services: StubServices) -> Iterator[Web]:
+    with Web(("127.0.0.1", 0), services) as served:
         yield served

@@ -14,8 +14,8 @@ from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.mapserver.http import serving, web
 from mapweave.mapserver.http.serving import Limits
 from mapweave.mapserver.http.web import MOST_BYTES, Web, parse_address
-from tests.mapserver.desks import Desk
 from tests.mapserver.http.client import ask, post, raw
+from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
 
 
@@ -45,8 +45,8 @@ def test_a_too_long_request_gets_an_answer(served: Web) -> None:
 HALF = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nabc"
 
 
-def test_closed_or_slow_connections_block_no_other(desk: Desk) -> None:
-    with Web(("127.0.0.1", 0), desk, patience=0.5) as served:
+def test_closed_or_slow_connections_block_no_other(services: StubServices) -> None:
+    with Web(("127.0.0.1", 0), services, patience=0.5) as served:
         # No client is left to read an answer.
         assert raw(served, HALF, close=True) == b""
         slow = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(web.MOST_AT_ONCE)]
@@ -63,28 +63,28 @@ def test_closed_or_slow_connections_block_no_other(desk: Desk) -> None:
             connection.close()
 
 
-def test_a_byte_now_and_then_takes_no_longer_than_anything_else(desk: Desk) -> None:
+def test_a_byte_now_and_then_takes_no_longer_than_anything_else(services: StubServices) -> None:
     with (
-        Web(("127.0.0.1", 0), desk, patience=0.5) as served,
+        Web(("127.0.0.1", 0), services, patience=0.5) as served,
         socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
     ):
         slow.sendall(HALF)
         assert drip(slow, b"x").startswith(b"HTTP/1.1 408")
 
 
-def test_a_head_that_never_ends_is_dropped(desk: Desk) -> None:
+def test_a_head_that_never_ends_is_dropped(services: StubServices) -> None:
     with (
-        Web(("127.0.0.1", 0), desk, limits=Limits(head=0.5)) as served,
+        Web(("127.0.0.1", 0), services, limits=Limits(head=0.5)) as served,
         socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
     ):
         slow.sendall(b"GET /status HTTP/1.1\r\nHost: localhost\r\nX: ")
         assert drip(slow, b"x") == b""
 
 
-def test_a_client_that_reads_nothing_is_dropped(desk: Desk) -> None:
-    desk.happenings = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no" * 2000),) * 3000
+def test_a_client_that_reads_nothing_is_dropped(services: StubServices) -> None:
+    services.events = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no" * 2000),) * 3000
     with (
-        Web(("127.0.0.1", 0), desk, limits=Limits(stall=0.5)) as served,
+        Web(("127.0.0.1", 0), services, limits=Limits(stall=0.5)) as served,
         socket.socket() as slow,
     ):
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -159,15 +159,18 @@ def test_one_request_a_connection(served: Web) -> None:
     assert got.count(b"HTTP/1.1 200") == 1 and b"\r\nconnection: close\r\n" in got.lower()
 
 
-def test_a_server_that_is_closed_leaves_nothing_behind(desk: Desk) -> None:
-    with Web(("127.0.0.1", 0), desk) as served, socket.create_connection(("127.0.0.1", served.port)) as half:
+def test_a_server_that_is_closed_leaves_nothing_behind(services: StubServices) -> None:
+    with (
+        Web(("127.0.0.1", 0), services) as served,
+        socket.create_connection(("127.0.0.1", served.port)) as half,
+    ):
         half.sendall(HALF)
         eventually(lambda: served.connections == 1)
         begin = time.monotonic()
         served.close()
         assert time.monotonic() < begin + 5.0
         served.close()
-        with Web(("127.0.0.1", served.port), desk) as again:
+        with Web(("127.0.0.1", served.port), services) as again:
             assert ask(again, "GET", "/status")[0] == 200
 
 
@@ -197,8 +200,8 @@ def test_addresses_that_are_none(text: str) -> None:
         parse_address(text)
 
 
-def test_a_port_that_is_taken(served: Web, desk: Desk) -> None:
+def test_a_port_that_is_taken(served: Web, services: StubServices) -> None:
     with pytest.raises(NotConnected, match=r"cannot listen at http 127.0.0.1:\d+: the port is taken"):
-        Web(("127.0.0.1", served.port), desk)
+        Web(("127.0.0.1", served.port), services)
     with pytest.raises(NotConnected, match=r"cannot listen at http 192.0.2.1:8080: "):
-        Web(("192.0.2.1", 8080), desk)
+        Web(("192.0.2.1", 8080), services)

@@ -18,7 +18,7 @@ from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.desks import Desk, two_maps
+from tests.mapserver.stub_services import StubServices, two_maps
 from tests.waiting import eventually
 
 RESULT = "return document.getElementById('result').textContent"
@@ -71,8 +71,8 @@ def test_unknown_nodes_are_reported_in_one_line(served: Web, query: str, words: 
     assert status == 400 and words in result["error"] and "\n" not in result["error"]
 
 
-def test_a_busy_server_gives_a_retry_time(served: Web, desk: Desk) -> None:
-    desk.refusal = Busy(0.5)
+def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices) -> None:
+    services.refusal = Busy(0.5)
     status, result = ask(served, "")
     assert status == 503 and result["retry_after"] == 0.5
 
@@ -134,7 +134,7 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_the_history_is_listed_newest_first(
-    served: Web, desk: Desk, tmp_path_factory: pytest.TempPathFactory
+    served: Web, services: StubServices, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     shown = "return [...document.querySelectorAll('#past li')].map(one => one.textContent)"
     hidden = "return document.getElementById('past').hidden"
@@ -142,7 +142,7 @@ def test_the_history_is_listed_newest_first(
         page.open(f"http://127.0.0.1:{served.port}/why")
         eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(RESULT))
         assert page.run(hidden) and page.run(shown) == []
-        desk.happenings = (
+        services.events = (
             MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now"),
             MapEvent(10**18 + 7 * 10**9, MapEventKind.PARTED, "<b>x"),
         )
@@ -154,8 +154,8 @@ def test_the_history_is_listed_newest_first(
         ]
 
 
-def test_the_history_is_listed_with_times(served: Web, desk: Desk) -> None:
-    desk.happenings = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no"),)
+def test_the_history_is_listed_with_times(served: Web, services: StubServices) -> None:
+    services.events = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no"),)
     with urlopen(f"http://127.0.0.1:{served.port}/history", timeout=20) as reply:
         (event,) = json.load(reply)["history"]
     assert event == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "constrained", "words": "no"}

@@ -10,7 +10,7 @@ import pytest
 from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.mapserver.http.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.desks import PLACE, Desk, picture
+from tests.mapserver.stub_services import PLACE, StubServices, picture
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -27,13 +27,13 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @pytest.fixture
-def desk() -> Desk:
-    return Desk()
+def services() -> StubServices:
+    return StubServices()
 
 
 @pytest.fixture
-def page(browser: Browser, desk: Desk) -> Iterator[Browser]:
-    with Web(("127.0.0.1", 0), desk) as served:
+def page(browser: Browser, services: StubServices) -> Iterator[Browser]:
+    with Web(("127.0.0.1", 0), services) as served:
         browser.open(f"http://127.0.0.1:{served.port}/")
         yield browser
 
@@ -45,7 +45,7 @@ def image(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_picture_is_answered_on_the_page(page: Browser, desk: Desk, image: Path) -> None:
+def test_a_picture_is_answered_on_the_page(page: Browser, services: StubServices, image: Path) -> None:
     eventually(lambda: page.run(STATUS) == "The map: 12 nodes")
     page.type("#hfov", "90")
     page.type("#image", str(image))
@@ -57,18 +57,18 @@ def test_a_picture_is_answered_on_the_page(page: Browser, desk: Desk, image: Pat
         ["r0.1.7", "0.50 m", "-0.25 m", "6°", "99 %"],
     ]
     assert page.run("return document.getElementById('shown').naturalWidth") == 160
-    assert desk.views[-1].camera.fx == pytest.approx(80.0)
+    assert services.views[-1].camera.fx == pytest.approx(80.0)
 
 
-def test_no_unknown_distance_is_shown(page: Browser, desk: Desk, image: Path) -> None:
-    desk.answer = PLACE
+def test_no_unknown_distance_is_shown(page: Browser, services: StubServices, image: Path) -> None:
+    services.answer = PLACE
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "place")
     assert page.run(ROWS)[1] == ["r0.1.7", "not known", "not known", "6°", "90 %"]
 
 
-def test_errors_are_shown_on_the_page(page: Browser, desk: Desk, image: Path) -> None:
-    desk.refusal = InvalidValue("<b>this</b> is no place")
+def test_errors_are_shown_on_the_page(page: Browser, services: StubServices, image: Path) -> None:
+    services.refusal = InvalidValue("<b>this</b> is no place")
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "failed")
     # As text, with any content.
@@ -76,9 +76,9 @@ def test_errors_are_shown_on_the_page(page: Browser, desk: Desk, image: Path) ->
     assert page.run("return document.querySelector('#result b')") is None
 
 
-def test_a_busy_server_is_asked_again(page: Browser, desk: Desk, image: Path) -> None:
-    desk.refusal = Busy(0.2)
+def test_a_busy_server_is_asked_again(page: Browser, services: StubServices, image: Path) -> None:
+    services.refusal = Busy(0.2)
     page.type("#image", str(image))
     eventually(lambda: "waiting" in page.run(RESULT))
-    desk.refusal = None
+    services.refusal = None
     eventually(lambda: page.run(KIND) == "found")

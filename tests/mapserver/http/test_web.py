@@ -16,11 +16,11 @@ import pytest
 
 from mapweave.hybridmap.errors import Busy
 from mapweave.mapserver.http.web import Web
-from tests.mapserver.desks import ANSWER, Desk, picture
 from tests.mapserver.http.client import ask, post
+from tests.mapserver.stub_services import ANSWER, StubServices, picture
 
 
-def test_an_image_in_and_json_out(served: Web, desk: Desk) -> None:
+def test_an_image_in_and_json_out(served: Web, services: StubServices) -> None:
     for kind in (".png", ".jpg"):
         status, answer = post(served, body=picture(kind=kind))
         assert status == 200
@@ -32,37 +32,37 @@ def test_an_image_in_and_json_out(served: Web, desk: Desk) -> None:
         assert pose["sigma"] == pytest.approx([0.02, 0.02, 0.01])
         assert np.sqrt(np.diag(pose["covariance"])).tolist() == pose["sigma"]
         assert (place["merged_from_robot"], place["inliers"]) == (None, 31)
-    assert all(len(view) > 20 for view in desk.views)
+    assert all(len(view) > 20 for view in services.views)
 
 
-def test_the_camera_as_it_is_given(served: Web, desk: Desk) -> None:
+def test_the_camera_as_it_is_given(served: Web, services: StubServices) -> None:
     assert post(served, "?hfov=90&height_m=0.3&forward_m=0.1")[0] == 200
-    camera = desk.views[-1].camera
+    camera = services.views[-1].camera
     assert (camera.width, camera.height) == (160, 120)
     assert (camera.fx, camera.fy) == pytest.approx((80.0, 80.0))
     assert (camera.cx, camera.cy, camera.mount_height, camera.mount_forward) == (79.5, 59.5, 0.3, 0.1)
     assert post(served, "?fx=100&fy=101&cx=70&cy=60&mount_height=0.5")[0] == 200
-    camera = desk.views[-1].camera
+    camera = services.views[-1].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.mount_height) == (100, 101, 70, 60, 0.5)
     assert post(served)[0] == 200
-    camera = desk.views[-1].camera
+    camera = services.views[-1].camera
     assert camera.mount_height == 1.4
     # The longer side of an image of unknown origin, held upright or not.
     assert math.degrees(2 * math.atan(80 / camera.fx)) == pytest.approx(69.4)
     assert post(served, body=picture(120, 160))[0] == 200
-    assert desk.views[-1].camera.fx == pytest.approx(camera.fx)
+    assert services.views[-1].camera.fx == pytest.approx(camera.fx)
 
 
-def test_a_large_image_is_made_smaller_with_its_camera(served: Web, desk: Desk) -> None:
+def test_a_large_image_is_made_smaller_with_its_camera(served: Web, services: StubServices) -> None:
     assert (
         post(served, "?fx=1000&cx=800&cy=600&width=2048&height=1536", picture(2048, 1536, ".jpg"))[0] == 200
     )
-    camera = desk.views[-1].camera
+    camera = services.views[-1].camera
     assert (camera.width, camera.height) == (1024, 768)
     assert (camera.fx, camera.cx, camera.cy) == pytest.approx((500, 399.75, 299.75))
     # The same camera said for the full size of an image that was sent small.
     assert post(served, "?fx=1000&cx=800&cy=600&width=2048&height=1536", picture(512, 384))[0] == 200
-    assert desk.views[-1].camera.fx == pytest.approx(250)
+    assert services.views[-1].camera.fx == pytest.approx(250)
 
 
 def form(*parts: tuple[str, bytes], boundary: str = "frontier") -> tuple[bytes, dict[str, str]]:
@@ -77,20 +77,20 @@ def form(*parts: tuple[str, bytes], boundary: str = "frontier") -> tuple[bytes, 
     }
 
 
-def test_a_form_with_a_camera_file(served: Web, desk: Desk) -> None:
+def test_a_form_with_a_camera_file(served: Web, services: StubServices) -> None:
     toml = b"width = 160\nheight = 120\nfx = 99.0\nfy = 98.0\ncx = 80\ncy = 60\nheight_m = 0.3\n"
     as_json = json.dumps({"fx": 99.0, "fy": 98.0, "distortion": [0.1, 0, 0, 0, 0]}).encode()
     for camera in (toml, as_json):
         body, headers = form(("image", picture()), ("camera", camera), ("forward_m", b"0.2"))
         assert post(served, body=body, **headers)[0] == 200
-        camera_used = desk.views[-1].camera
+        camera_used = services.views[-1].camera
         assert (camera_used.fx, camera_used.fy, camera_used.mount_forward) == (99.0, 98.0, 0.2)
     # An image that holds the boundary's beginning and bare line ends comes whole.
     odd = picture() + b"\r\n--fro\r\n\n\r--\r\n"
     body, headers = form(("image", odd))
-    plain = desk.views[-1]
+    plain = services.views[-1]
     assert post(served, "?fx=99&fy=98", body=body, **headers)[0] == 200
-    assert np.array_equal(desk.views[-1].codes, plain.codes)
+    assert np.array_equal(services.views[-1].codes, plain.codes)
 
 
 @pytest.mark.parametrize(
@@ -198,11 +198,11 @@ def test_a_camera_is_flat(served: Web, camera: bytes) -> None:
     )
 
 
-def test_a_camera_with_remarks(served: Web, desk: Desk) -> None:
+def test_a_camera_with_remarks(served: Web, services: StubServices) -> None:
     toml = b"# phone\r\nfx = 99.0  # px\n\nfy = 1_00\ndistortion = [0.1, -2e-2, 0, 0, 0,]\n"
     body, headers = form(("image", picture()), ("camera", toml))
     assert post(served, body=body, **headers)[0] == 200
-    assert (desk.views[-1].camera.fx, desk.views[-1].camera.fy) == (99.0, 100.0)
+    assert (services.views[-1].camera.fx, services.views[-1].camera.fy) == (99.0, 100.0)
 
 
 def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
@@ -227,11 +227,11 @@ def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
     ],
 )
 def test_pages_of_other_sites_are_refused(
-    served: Web, desk: Desk, headers: dict[str, str], words: str
+    served: Web, services: StubServices, headers: dict[str, str], words: str
 ) -> None:
     status, answer = post(served, **headers)
     assert status == 403 and words in answer["error"]
-    assert not desk.views
+    assert not services.views
     for path in ("/", "/why", "/status", "/history", "/explain", "/nothing"):
         status, _, content = ask(served, "GET", path, headers=headers)
         assert status == 403 and words in json.loads(content)["error"]
@@ -249,15 +249,17 @@ def test_own_pages_ask_by_any_name_of_this_machine(served: Web, host: str) -> No
         assert post(served, **headers)[0] == 200
 
 
-def test_a_busy_server_gives_a_retry_time(served: Web, desk: Desk) -> None:
-    desk.refusal = Busy(1.26)
+def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices) -> None:
+    services.refusal = Busy(1.26)
     status, headers, content = ask(served, "POST", "/relocalize", picture())
     assert (status, headers["Retry-After"]) == (503, "2")
     assert json.loads(content) == {"error": "busy, retry after 1.3 s", "retry_after": 1.26}
 
 
-def test_a_defect_is_answered_and_logged(served: Web, desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
-    desk.refusal = ZeroDivisionError("a defect")
+def test_a_defect_is_answered_and_logged(
+    served: Web, services: StubServices, caplog: pytest.LogCaptureFixture
+) -> None:
+    services.refusal = ZeroDivisionError("a defect")
     assert post(served) == (500, {"error": "the server failed: a defect"})
     assert "ZeroDivisionError" in caplog.text
 

@@ -46,9 +46,9 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
         with_it[AnswerOutcome.RIGHT] >= 0.9 * alone[AnswerOutcome.RIGHT] and not with_it[AnswerOutcome.WRONG]
     )
     # Reported once, and the map counts again when a person has retired those that it contradicts.
-    before = history.happenings
+    before = history.events
     history.follow(merged)
-    assert history.happenings == before
+    assert history.events == before
     gone = [
         ManualConstraint((item, item), True, "anna", 1, "moved") for item in (MapId("r0", 1), MapId("r1", 1))
     ]

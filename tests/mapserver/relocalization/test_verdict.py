@@ -76,7 +76,9 @@ def test_each_outcome(
     assert decided.outcome is outcome
     answer = service.answer(view)
     assert words in answer.reason
-    assert (answer.certainty is Certainty.FOUND) == (outcome is Outcome.FOUND) == bool(answer.candidates)
+    assert (answer.certainty is Certainty.FOUND) == (outcome is Outcome.FOUND)
+    # What lacks nothing but landmarks is named: another view may confirm it.
+    assert bool(answer.candidates) == (outcome in (Outcome.FOUND, Outcome.ONE_WEAK_NODE))
 
 
 def test_retrieval_is_not_asked_about_a_view_that_cannot_be_registered() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import re
@@ -45,7 +46,7 @@ def test_invalid_figures_are_refused_in_one_line(change, word):
 
 @pytest.mark.parametrize("of", [Figures, RobotFigures])
 def test_every_figure_is_explained_and_has_a_unit_where_it_needs_one(of):
-    explained = set(re.findall(r"^        (\w+):", of.__doc__, re.MULTILINE))
+    explained = set(re.findall(r"^    (\w+):", inspect.getdoc(of), re.MULTILINE))
     assert explained == {f.name for f in fields(of)}
     for field in fields(of):
         if "float" in str(field.type):

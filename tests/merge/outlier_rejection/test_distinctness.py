@@ -115,7 +115,7 @@ def test_landmarks_of_one_bay_alone_are_counted(seed: int) -> None:
     between = [link for link in aisle.weighed(links) if not link.within]
     assert {aisle.true(link) for link in between} == {True, False}
     for link in between:
-        assert len(link.shared) - link.doubles == aisle.signs_shared(link), str(link.pair)
+        assert len(link.shared) - link.aliased == aisle.signs_shared(link), str(link.pair)
         assert link.telling <= aisle.true(link)
 
 
@@ -171,9 +171,9 @@ def test_aliasing_found_for_one_node_is_used_for_its_neighbours() -> None:
     first, second = aisle.maps[MapId("a", 1)].nodes
     links = [link for link in aisle.links(least=1) if not link.within]
     some = [link for link in links if link.a == first] + [link for link in links if link.a == second][:1]
-    assert [link.doubles for link in aisle.weighed(some)] == [CARTONS] * 3
+    assert [link.aliased for link in aisle.weighed(some)] == [CARTONS] * 3
     alone = [link for link in some if link.a == second]
-    assert [link.doubles for link in aisle.weighed(alone)] == [0]
+    assert [link.aliased for link in aisle.weighed(alone)] == [0]
 
 
 def test_without_aliasing_all_landmarks_count() -> None:
@@ -192,7 +192,7 @@ def test_measured_badly_is_not_another_place() -> None:
     links = [link for link in aisle.links() if not link.within]
     shifted = links[0].a_from_b.mean @ Pose2(0.2, 0.0, 0.0)
     links[0] = replace(links[0], a_from_b=PoseGaussian(shifted, links[0].a_from_b.covariance))
-    assert len(links) == 2 and not any(link.doubles for link in aisle.weighed(links))
+    assert len(links) == 2 and not any(link.aliased for link in aisle.weighed(links))
 
 
 def test_a_way_that_is_hardly_known_contradicts_nothing() -> None:
@@ -206,7 +206,7 @@ def test_a_way_that_is_hardly_known_contradicts_nothing() -> None:
     for sigma, doubles in ((0.01, SIGNS), (0.5, 0)):
         slid = PoseGaussian(step.a_from_b.mean @ Pose2(0.8, 0.0, 0.0), np.diag([sigma, sigma, 0.02]) ** 2)
         b.edges[step.id] = replace(step, a_from_b=slid)
-        assert [link.doubles for link in aisle.weighed(links)] == [doubles] * 2
+        assert [link.aliased for link in aisle.weighed(links)] == [doubles] * 2
 
 
 def test_order_does_not_matter() -> None:
@@ -214,8 +214,8 @@ def test_order_does_not_matter() -> None:
     aisle.drive("a", [0, 1, 2])
     aisle.drive("b", [1, 2, 3])
     links = aisle.links()
-    collected = {link.pair: link.doubles for link in aisle.weighed(links)}
+    collected = {link.pair: link.aliased for link in aisle.weighed(links)}
     aisle.rng.shuffle(links)  # type: ignore[arg-type]
     aisle.maps = dict(reversed(aisle.maps.items()))
     turned = [link.turned() if k % 2 else link for k, link in enumerate(links)]
-    assert {link.canonical().pair: link.doubles for link in aisle.weighed(turned)} == collected
+    assert {link.canonical().pair: link.aliased for link in aisle.weighed(turned)} == collected

@@ -39,7 +39,7 @@ PLACE = RelocalizeAnswer(
 )
 
 
-class Desk:
+class StubServices:
     """Answers everything alike and remembers what was asked, or does what the test says."""
 
     def __init__(self) -> None:
@@ -47,13 +47,13 @@ class Desk:
         self.refusal: Exception | None = None
         self.answer = ANSWER
         self.holds: dict[str, Scalar] = {"nodes": 12, "summary": "12 nodes"}
-        self.happenings: tuple[MapEvent, ...] = ()
+        self.events: tuple[MapEvent, ...] = ()
 
     def status(self) -> dict[str, Scalar]:
         return self.holds
 
     def history(self) -> tuple[MapEvent, ...]:
-        return self.happenings
+        return self.events
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         done: Future[RelocalizeAnswer] = Future()

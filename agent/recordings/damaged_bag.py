@@ -1,0 +1,203 @@
+"""Bags that were cut off or damaged: what stands before the damage, read record by record without an index.
+
+MCAP by its specification (https://mcap.dev/spec), ROS 1 by http://wiki.ros.org/Bags/Format/2.0, and the
+SQLite files of ROS 2 by their rows in the order in which they were written.
+"""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mapweave.hybridmap.errors import DeviceError
+
+Item = tuple[int, str, str] | tuple[int, int, bytes]
+"""A connection (its number, topic, type) or a message (of which connection, stamp in ns, bytes)."""
+
+MCAP_MAGIC, ROS1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
+MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_CHUNK, MCAP_DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
+ROS1_MESSAGE, ROS1_CHUNK, ROS1_CONNECTION = 0x02, 0x05, 0x07
+
+
+class DamagedBag:
+    """One file of a bag, as far as it can be read.
+
+    Attributes:
+        topics: by name: the type of its messages, and how many there are.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the file once, to see what is in it.
+
+        Raises:
+            DeviceError: there is no message in it.
+        """
+        from rosbags.typesys import Stores, get_typestore
+
+        self._path = path
+        self._items, ros1 = _format_of(path)
+        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+        self._decode: Callable[[bytes, str], Any] = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+        topics: dict[int, tuple[str, str]] = {}
+        counts: Counter[int] = Counter()
+        for connection, second, third in self._items(path):
+            if isinstance(second, str):
+                topics[connection] = second, str(third)
+            else:
+                counts[connection] += 1
+        self.topics = {topics[k][0]: (topics[k][1], count) for k, count in counts.items() if k in topics}
+        if not self.topics:
+            raise DeviceError(f"{path}: no message in it can be read")
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Stamps, ns, and messages of a topic, in the order in which they were recorded.
+
+        Raises:
+            Exception: whatever a message that cannot be decoded leads to.
+        """
+        kinds: dict[int, str] = {}
+        for connection, second, third in self._items(self._path):
+            if isinstance(second, str):
+                if second == topic:
+                    kinds[connection] = str(third)
+            elif connection in kinds:
+                assert isinstance(third, bytes)
+                yield second, self._decode(third, kinds[connection])
+
+
+def _format_of(path: Path) -> tuple[Callable[[Path], Iterator[Item]], bool]:
+    """How a file is read, and whether it is of ROS 1."""
+    with path.open("rb") as file:
+        begin = file.read(16)
+    if begin.startswith(MCAP_MAGIC):
+        return _mcap, False
+    if begin.startswith(ROS1_MAGIC):
+        return _ros1, True
+    if begin.startswith(b"SQLite format 3"):
+        return _sqlite, False
+    raise DeviceError(f"{path}: does not begin as a bag does")
+
+
+def _mcap(path: Path) -> Iterator[Item]:
+    from rosbags.rosbag2.storage_mcap import decompress
+
+    with path.open("rb") as file:
+        file.seek(len(MCAP_MAGIC))
+        schemas: dict[int, str] = {}
+        yield from _mcap_records(file, schemas, decompress)
+
+
+def _mcap_records(
+    file: BinaryIO, schemas: dict[int, str], decompress: Callable[..., bytes]
+) -> Iterator[Item]:
+    while len(head := file.read(9)) == 9 and head[0] != MCAP_DATA_END:
+        (size,) = struct.unpack("<Q", head[1:])
+        content = _read(file, size)
+        whole = len(content) == size
+        try:
+            if head[0] == MCAP_CHUNK:
+                yield from _mcap_records(_mcap_chunk(content, whole, decompress), schemas, decompress)
+            elif whole and head[0] == MCAP_SCHEMA:
+                schemas[struct.unpack_from("<H", content)[0]] = _text(content, 2)[0]
+            elif whole and head[0] == MCAP_CHANNEL:
+                number, schema = struct.unpack_from("<HH", content)
+                yield number, _text(content, 4)[0], schemas.get(schema, "")
+            elif whole and head[0] == MCAP_MESSAGE:
+                number, _, stamp, _ = struct.unpack_from("<HIQQ", content)
+                yield number, stamp, content[22:]
+        except Exception:  # noqa: BLE001  # what is damaged cannot be parsed: everything before it counts
+            return
+        if not whole:
+            return
+
+
+def _mcap_chunk(content: bytes, whole: bool, decompress: Callable[..., bytes]) -> BinaryIO:
+    _, _, size, crc = struct.unpack_from("<QQQI", content)
+    compression, at = _text(content, 28)
+    records = content[at + 8 :]
+    if not whole and not compression:
+        # What was written of a chunk that is not compressed can be read.
+        return io.BytesIO(records)
+    (length,) = struct.unpack_from("<Q", content, at)
+    return io.BytesIO(decompress(records[:length], compression, size, crc))
+
+
+def _text(content: bytes, at: int) -> tuple[str, int]:
+    """A string with its length before it, and where it ends."""
+    (length,) = struct.unpack_from("<I", content, at)
+    return content[at + 4 : at + 4 + length].decode(), at + 4 + length
+
+
+def _ros1(path: Path) -> Iterator[Item]:
+    from rosbags.rosbag1.reader import decompressors
+
+    with path.open("rb") as file:
+        file.seek(len(ROS1_MAGIC))
+        yield from _ros1_records(file, decompressors)
+
+
+def _ros1_records(file: BinaryIO, decompressors: Any) -> Iterator[Item]:
+    while len(length := file.read(4)) == 4:
+        try:
+            fields = _ros1_fields(_read(file, struct.unpack("<I", length)[0]))
+            (size,) = struct.unpack("<I", file.read(4))
+            content = _read(file, size)
+            whole, kind = len(content) == size, fields[b"op"][0]
+            if kind == ROS1_CHUNK:
+                compression = fields[b"compression"].decode()
+                if whole or compression == "none":
+                    inside = decompressors[compression](content) if whole else content
+                    yield from _ros1_records(io.BytesIO(inside), decompressors)
+            elif whole and kind == ROS1_CONNECTION:
+                name = _ros1_fields(content)[b"type"].decode().replace("/", "/msg/")
+                yield struct.unpack("<I", fields[b"conn"])[0], fields[b"topic"].decode(), name
+            elif whole and kind == ROS1_MESSAGE:
+                seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+                yield struct.unpack("<I", fields[b"conn"])[0], seconds * 10**9 + nanoseconds, content
+        except Exception:  # noqa: BLE001  # as above
+            return
+        if not whole:
+            return
+
+
+def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
+    fields, at = {}, 0
+    while at < len(header):
+        (length,) = struct.unpack_from("<I", header, at)
+        name, _, value = header[at + 4 : at + 4 + length].partition(b"=")
+        fields[name] = value
+        at += 4 + length
+    return fields
+
+
+def _sqlite(path: Path) -> Iterator[Item]:
+    file = sqlite3.connect(f"file:{path.resolve()}?mode=ro", uri=True)
+    try:
+        # Without this SQLite refuses a file that is shorter than its header says.
+        file.execute("PRAGMA writable_schema = ON")
+        yield from file.execute("SELECT id, name, type FROM topics")
+        last: Item | None = None
+        for row in file.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY rowid"):
+            if last is not None:
+                yield last
+            last = row
+        # Not reached after an error: SQLite fills up with zeros the page in which the file was cut off.
+        if last is not None:
+            yield last
+    except sqlite3.Error:
+        return
+    finally:
+        file.close()
+
+
+MOST_BYTES = 1 << 28
+"""Of one record: a damaged length would otherwise ask for all memory there is."""
+
+
+def _read(file: BinaryIO, size: int) -> bytes:
+    return file.read(min(size, MOST_BYTES))

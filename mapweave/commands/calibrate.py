@@ -1,0 +1,18 @@
+"""`mapweave calibrate WHAT`: measure the robot."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from mapweave.commands import calibrate_camera, calibrate_target
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command and its actions."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "calibrate", help="measure how camera and wheels of a robot are mounted"
+    )
+    actions = parser.add_subparsers(title="what", metavar="WHAT", required=True)
+    for action in (calibrate_camera, calibrate_target):
+        action.add_to(actions)

@@ -1,0 +1,82 @@
+"""`mapweave calibrate target`: print the target for `mapweave calibrate camera`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapweave.hybridmap.errors import InvalidValue
+
+if TYPE_CHECKING:
+    from mapweave.vision.calibration.target import CalibrationTarget
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "target",
+        help="print the target for the camera's calibration",
+        description="Write the calibration target as a PDF in its true size, with two rulers. Print it at "
+        "100 %, check the rulers, and glue it to something flat.",
+    )
+    add_target(parser)
+    parser.add_argument("--paper", choices=["a4", "a3", "letter", "legal"], default="a4")
+    parser.add_argument(
+        "--out", type=Path, default=Path("board.pdf"), metavar="FILE", help="(default: %(default)s)"
+    )
+    parser.set_defaults(run=run)
+
+
+def add_target(parser: argparse.ArgumentParser) -> None:
+    """Declare the target; the defaults fit on A4 and on letter paper."""
+    which = parser.add_argument_group("target")
+    which.add_argument("--pattern", choices=["charuco", "chessboard"], default="charuco")
+    which.add_argument(
+        "--squares", metavar="WxH", default="7x10", help="squares across and down (default: %(default)s)"
+    )
+    which.add_argument("--square-mm", type=float, metavar="MM", default=24.0, help="(default: %(default)s)")
+    which.add_argument(
+        "--marker-mm", type=float, metavar="MM", help="of ChArUco (default: three quarters of a square)"
+    )
+    which.add_argument("--dictionary", default="4X4_50", help="of ChArUco (default: %(default)s)")
+
+
+def target_of(arguments: argparse.Namespace) -> CalibrationTarget:
+    """The target that is declared.
+
+    Raises:
+        InvalidValue: it is none.
+    """
+    from mapweave.vision.calibration.target import CalibrationTarget, Pattern
+
+    a = arguments
+    columns, rows = size_of(a.squares, "--squares")
+    marker = 0.75 * a.square_mm if a.marker_mm is None else a.marker_mm
+    return CalibrationTarget(
+        Pattern(a.pattern), columns, rows, 1e-3 * a.square_mm, 1e-3 * marker, a.dictionary.upper()
+    )
+
+
+def size_of(text: str, option: str) -> tuple[int, int]:
+    """Two numbers, as in 7x10.
+
+    Raises:
+        InvalidValue: it is something else.
+    """
+    first, x, second = text.lower().partition("x")
+    if not (x and first.isdecimal() and second.isdecimal()):
+        raise InvalidValue(f"{option} {text}: give two numbers, for example 7x10")
+    return int(first), int(second)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the PDF."""
+    from mapweave.storage.atomic_file import write_whole
+    from mapweave.vision.calibration.target_pdf import target_pdf
+
+    target = target_of(arguments)
+    write_whole(arguments.out, target_pdf(target, arguments.paper))
+    print(f"{arguments.out}: {target}, on {arguments.paper}")
+    print("Print it at 100 % (not fitted to the page), hold a ruler to both scales, glue it to a flat board.")
+    return 0

@@ -1,0 +1,149 @@
+"""Videos without odometry: a simulated walk with known truth becomes a map up to scale, always the same."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapweave.cli import main
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, Node
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty
+from mapweave.offline_relocalization import relocalizer_of, view_of
+from mapweave.sim.camera import CAMERAS
+from mapweave.sim.photographer import walk
+from mapweave.sim.worlds.catalog import world_from_table
+from mapweave.storage.map_file import read_map_file
+
+COUNT, SPACING, RATE, PHONE = 30, 0.1, 10.0, CAMERAS["phone"]
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Pose2]]:
+    """A walk around a bend as a video, with its camera beside it, and where each frame was taken."""
+    folder = tmp_path_factory.mktemp("video")
+    world = world_from_table({"kind": "office", "rooms": 2}, 4, Path())
+    taken = walk(world, PHONE, COUNT, SPACING, 4)
+    write(folder / "walk.avi", [photograph.image for photograph in taken])
+    c = PHONE.intrinsics
+    (folder / "camera.toml").write_text(
+        f"width = {c.width}\nheight = {c.height}\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
+        f"height_m = {c.mount_height}\ndistortion = {list(PHONE.distortion)}\n"
+    )
+    return folder / "walk.avi", [photograph.world_from_camera for photograph in taken]
+
+
+def write(path: Path, images: list[np.ndarray]) -> None:
+    height, width = images[0].shape
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, (width, height), isColor=True)
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+
+
+def frames(path: Path) -> list[np.ndarray]:
+    capture, out = cv2.VideoCapture(str(path)), []
+    while (read := capture.read())[0]:
+        out.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY))
+    return out
+
+
+def replayed(path: Path, camera: Path, data: Path, status: int = 0) -> list[Path]:
+    """The map files that a replay writes."""
+    arguments = ["replay", path, "--camera", camera, "--offline", "--epoch", 1, "--data", data]
+    assert main([str(argument) for argument in arguments]) == status
+    return sorted(data.glob("*.mapweave"))
+
+
+def contents(path: Path) -> tuple[list[Node], list[Edge]]:
+    changes = read_map_file(path).changes
+    nodes = [change.node for change in changes if isinstance(change, NodePut)]
+    return nodes, [change.edge for change in changes if isinstance(change, EdgePut)]
+
+
+@pytest.fixture(scope="module")
+def made(video: tuple[Path, list[Pose2]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of the walk."""
+    path, _ = video
+    (file,) = replayed(path, path.with_name("camera.toml"), tmp_path_factory.mktemp("map"))
+    return file
+
+
+def test_a_video_becomes_one_map_that_is_right_up_to_one_scale(video, made: Path) -> None:
+    _, truth = video
+    nodes, edges = contents(made)
+    assert len(nodes) > 6, "more than one window"
+    assert [(edge.a, edge.b) for edge in edges] == [(a.id, b.id) for a, b in pairwise(nodes)]
+    at = [truth[round(node.stamp_ns * RATE / 1e9)] for node in nodes]
+    steps = [a.distance(b) for a, b in pairwise(at)]
+    mapped = [float(np.hypot(e.a_from_b.mean.x, e.a_from_b.mean.y)) for e in edges]
+    ratios = np.array(steps) / np.array(mapped)
+    assert np.abs(ratios / np.median(ratios) - 1.0).max() < 0.15, "one scale goes through"
+    turns = [(a.inverse() @ b).heading for a, b in pairwise(at)]
+    assert np.abs(np.array(turns) - [edge.a_from_b.mean.heading for edge in edges]).max() < 0.05
+    assert all(edge.evidence["shared"] == len(edge.shared) >= 12 for edge in edges)
+
+
+def test_a_lost_robot_gets_the_place_but_not_the_distance(video, made: Path) -> None:
+    path, truth = video
+    relocalizer, (nodes, _) = relocalizer_of(read_map_file(made)), contents(made)
+    where = {node.id: truth[round(node.stamp_ns * RATE / 1e9)] for node in nodes}
+    way, mapped = (
+        sum(a.distance(b) for a, b in pairwise(poses))
+        for poses in (list(where.values()), [node.map_from_robot.mean for node in nodes])
+    )
+    errors = []
+    for k, image in list(enumerate(frames(path)))[::3]:
+        answer = relocalizer.answer(view_of(image, PHONE.intrinsics, PHONE.distortion))
+        if answer.certainty is Certainty.PLACE:
+            place = answer.candidates[0]
+            found = place.node_from_robot.mean
+            scaled = Pose2(found.x * way / mapped, found.y * way / mapped, found.heading)
+            errors.append((where[place.node] @ scaled).distance(truth[k]))
+            assert not place.distance_known
+        assert answer.certainty is not Certainty.FOUND
+    assert len(errors) > 0.7 * COUNT / 3
+    assert np.median(errors) < 0.15 and max(errors) < 0.8, "right but for the scale"
+
+
+def test_the_same_video_gives_the_same_map(video, made: Path, tmp_path: Path) -> None:
+    path, _ = video
+    (again,) = replayed(path, path.with_name("camera.toml"), tmp_path)
+    assert again.read_bytes() == made.read_bytes()
+
+
+@pytest.mark.slow
+def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path: Path) -> None:
+    """The second half is mirrored; between the halves the camera turns by 60 degrees, by homographies."""
+    path, _ = video
+    images, c = frames(path), PHONE.intrinsics
+    matrix = np.array([[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]])
+    turns = [
+        matrix @ cv2.Rodrigues(np.array([0.0, 0.105 * k, 0.0]))[0] @ np.linalg.inv(matrix) for k in range(10)
+    ]
+    turning = [cv2.warpPerspective(images[14], turn, (c.width, c.height)) for turn in turns]
+    write(tmp_path / "cut.avi", [*images[:15], *turning, *(image[:, ::-1] for image in images[15:])])
+    files = replayed(tmp_path / "cut.avi", path.with_name("camera.toml"), tmp_path / "maps")
+    assert [file.name for file in files] == ["cut.1.mapweave", "cut.2.mapweave"]
+    first, second = (contents(file)[0] for file in files)
+    assert first[-1].stamp_ns < 2.5e9 <= second[0].stamp_ns
+
+
+def test_info_says_what_is_missing_and_damage_is_said(video, tmp_path: Path, capfd) -> None:
+    path, _ = video
+    camera = path.with_name("camera.toml")
+    assert main(["info", str(path), "--camera", str(camera), "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    assert facts["images"] == COUNT and facts["driven_m"] is None
+    assert "no scale" in facts["missing"][0]
+    blank = tmp_path / "blank.avi"
+    write(blank, [np.full((240, 320), 90, np.uint8)] * 10)
+    replayed(blank, camera, tmp_path / "none", status=1)
+    output = capfd.readouterr().err.splitlines()
+    assert output[-1].startswith(f"mapweave: {blank}: no two of its") and "Traceback" not in output
