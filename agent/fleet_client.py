@@ -179,7 +179,7 @@ class FleetClient:
 
     def _answer(self, question: Question) -> Answer:
         try:
-            key, payload = encode_query(self._keys, question)
+            key, payload = encode_query(self._keys, question, self._agent)
         except InvalidValue as unspeakable:
             return Answer(question.number, None, str(unspeakable))
         replies = self._bus.ask(key, payload, self._timeout)
