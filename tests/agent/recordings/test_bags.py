@@ -388,10 +388,9 @@ def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, t
 
     def sense() -> Observation | None:
         observation = whole()
-        wrong = observation is not None and observation.stamp_ns > drive.stamps_ns[4]
-        return (
-            replace(observation, proximity=np.ones(1)) if observation is not None and wrong else observation
-        )
+        if observation is None or observation.stamp_ns <= drive.stamps_ns[4]:
+            return observation
+        return replace(observation, proximity=np.ones(1))
 
     robot.sense = sense  # type: ignore[method-assign]
     assert len(list(iter(recorded.sense, None))) == COUNT
