@@ -83,7 +83,12 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[list[str
             )
             children.start("r0", ["agent", "r0", "--data", str(folder), *arguments])
             log = folder / "logs" / "r0.log"
-            eventually(lambda: children.check() or "standing still" in log.read_text())
+
+            def ready() -> bool:
+                children.check()
+                return "standing still" in log.read_text()
+
+            eventually(ready)
             said = " ".join(log.read_text().split())
             assert "`mapweave drive r0`" in said
             assert "--without-rangers" in said
