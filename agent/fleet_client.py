@@ -63,7 +63,7 @@ class FleetClient:
         self._server = server
         self._server_alive = False
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
-        self._stamp_ns = 0
+        self._stamp_ns = self._skipped = 0
         self._battery: float | None = None
         self._trouble, self._trouble_at = "", 0.0
         self._missions = missions
@@ -92,7 +92,12 @@ class FleetClient:
         return self._server_alive and self._bus.connected()
 
     def report(
-        self, status: Status, stamp_ns: int, battery: float | None = None, publish: bool = True
+        self,
+        status: Status,
+        stamp_ns: int,
+        battery: float | None = None,
+        publish: bool = True,
+        skipped: int = 0,
     ) -> None:
         """Publish the robot's status: on request and, best effort, to subscribers.
 
@@ -101,9 +106,10 @@ class FleetClient:
             stamp_ns: time of the observation that it describes.
             battery: charge, as a share, if it is known.
             publish: send it now; else only answer questions with it.
+            skipped: images that were skipped so far.
         """
         self._status = replace(status, doing=one_line(status.doing), detail=one_line(status.detail))
-        self._stamp_ns, self._battery = stamp_ns, battery
+        self._stamp_ns, self._battery, self._skipped = stamp_ns, battery, skipped
         if publish:
             self._bus.publish(self._keys.agent_status(self._agent), encode(self._now()))
 
@@ -147,6 +153,7 @@ class FleetClient:
             self._battery,
             self._trouble,
             time.monotonic() - self._trouble_at if self._trouble else 0.0,
+            self._skipped,
         )
 
     def _tell_status(self, request: Request) -> None:
@@ -172,7 +179,7 @@ class FleetClient:
 
     def _answer(self, question: Question) -> Answer:
         try:
-            key, payload = encode_query(self._keys, question)
+            key, payload = encode_query(self._keys, question, self._agent)
         except InvalidValue as unspeakable:
             return Answer(question.number, None, str(unspeakable))
         replies = self._bus.ask(key, payload, self._timeout)

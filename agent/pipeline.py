@@ -15,6 +15,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.camera_occupancy import CameraOccupancyGrid
 from mapweave.agent.cautious_driving import ALONG_EDGES, CautiousDriving, lacks_rangers, speed_for
 from mapweave.agent.exploration.camera_exploration import CameraExploration, with_readings
@@ -36,6 +40,7 @@ from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
 
@@ -67,6 +72,7 @@ class Pipeline:
         settings: AgentSettings | None = None,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
+        calibration: OnlineCalibration | None = None,
     ) -> None:
         """Start with nothing to do, and with an empty map or one that was begun.
 
@@ -78,6 +84,7 @@ class Pipeline:
             settings: of the parts.
             contents: of the map, as `Journal.resume` gives it.
             next_number: the first that no node or edge of the map has ever had.
+            calibration: what this robot has learnt of its geometry on an earlier map.
         """
         jit.load()  # a robot that drives must not wait for a compiler
         self._fisheye = Lens(description.camera, description.distortion)
@@ -85,11 +92,13 @@ class Pipeline:
             description = replace(description, distortion=NO_DISTORTION)
         self._map_id = map_id
         self._settings = settings or AgentSettings()
+        self.calibration = calibration or OnlineCalibration(description)
+        self.calibration.switched()
+        description, lens = self.calibration.description, self.calibration.lens
         self._description = description
-        lens = Lens(description.camera, description.distortion)
         self._lens = lens
         self._sift = Sift(lens, self._settings.sift)
-        self._mapper = Mapper(map_id, description, self._settings, contents, next_number)
+        self._mapper = Mapper(map_id, description, self._settings, contents, next_number, lens)
         self._caution = CautiousDriving(description) if lacks_rangers(description) else None
         self._floor = self._new_floor()
         self._changes: list[ChangeBody] = []
@@ -101,11 +110,28 @@ class Pipeline:
         self._navigator: Navigator | None = None
         self._resumption: Resumption | None = None
         self._direction = 1.0
+        self._lifted = self._put_elsewhere = False
 
     @property
     def map(self) -> HybridMap:
         """The robot's own map so far."""
         return self._mapper.map
+
+    @property
+    def map_from_robot(self) -> PoseGaussian | None:
+        """Where the robot is on its own map; None if it does not know."""
+        fix = self._navigator.fix if self._navigator is not None else None
+        match self._mission:
+            case Explore() | Carried() if self._located:
+                return self._mapper.map_from_robot
+            case GoTo() if fix is not None and fix.node in self.map.nodes:
+                return self.map.nodes[fix.node].map_from_robot @ fix.node_from_robot
+        return None
+
+    @property
+    def _located(self) -> bool:
+        """Whether the mapper knows where the robot is."""
+        return self._mapper.started and not (self._mapper.astray or self._mapper.doubtful)
 
     @property
     def mission(self) -> Mission:
@@ -114,12 +140,17 @@ class Pipeline:
 
     @property
     def lost(self) -> bool:
-        """Whether the robot shall map and has given up localizing on its own map.
+        """Whether the robot shall map and has given up localizing on its own map, or was lifted.
 
         It stands still then. The caller may begin a new map, in a new pipeline; another `set_mission`
         lets it try again.
         """
-        return self._resumption is not None and self._resumption.lost
+        return self._put_elsewhere or (self._resumption is not None and self._resumption.lost)
+
+    @property
+    def put_elsewhere(self) -> bool:
+        """Whether it is lost because its base has noticed that it was lifted."""
+        return self._put_elsewhere
 
     def set_mission(self, mission: Mission) -> None:
         """Begin another mission. Exploration that was interrupted goes on where it was.
@@ -128,7 +159,7 @@ class Pipeline:
         place of its own map.
         """
         self._mission = mission
-        self._resumption = None
+        self._resumption, self._put_elsewhere = None, False
         match mission:
             case Explore() if self._explorer is None and self._explores:
                 self._explorer = self._new_explorer()
@@ -154,10 +185,13 @@ class Pipeline:
         if self._fisheye.rectifies and observation.image is not None:
             # From here on the camera is a pinhole.
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
+        observation = self.calibration.correct(observation)
         self._rangers.see(observation.proximity)
         self._take_over(driven)
         self._feel(observation)
         match self._mission:
+            case _ if self._in_the_air(observation) or self._put_elsewhere:
+                pass
             case Idle() if self._mapper.started:
                 # Mapping that goes on later needs the motion of the wheels until then.
                 self._keep_up(observation)
@@ -168,7 +202,7 @@ class Pipeline:
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers, self._held)
                 self._mapper.drove(self._navigator.traverse, self._navigator.refined)
-        safe, warning = self._safe(command if driven is None else driven.command, observation)
+        safe, warning = self._safe(command if driven is None or self._lifted else driven.command, observation)
         if observation.bumped and safe.forward * self._direction > 0:
             safe, warning = Command(0.0, safe.turn), "stopped: the bumper is pressed"
         elif not observation.bumped and safe.forward:
@@ -192,6 +226,19 @@ class Pipeline:
     def _blind(self) -> str:
         """Why the rangers forbid an autonomous robot to drive; empty if it may."""
         return self._rangers.fault if isinstance(self._mission, Explore | GoTo) else ""
+
+    def _in_the_air(self, observation: Observation) -> bool:
+        """Whether the base says that it is lifted. Put down again, the robot is at an unknown place."""
+        if observation.kidnapped and not self._lifted:
+            self._mapper.lose()
+        elif self._lifted and not observation.kidnapped:
+            if isinstance(self._mission, GoTo):
+                self.set_mission(self._mission)
+            else:
+                self._put_elsewhere = bool(self.map.nodes) and not isinstance(self._mission, Idle)
+                self._restart()
+        self._lifted = observation.kidnapped
+        return self._lifted
 
     def _new_floor(self) -> OccupancyGrid:
         settings = self._settings.occupancy_grid
@@ -267,7 +314,10 @@ class Pipeline:
     def _map(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
         self._keep_up(observation)
         if self._mapper.doubtful or self._mapper.astray or self._blind:
+            self.calibration.pause()
             return Command(), []
+        if observation.image is not None and self._mapper.started:
+            self._calibrate(observation.image)
         pose = self._mapper.map_from_robot.mean
         if isinstance(self._floor, CameraOccupancyGrid):
             self._floor.drive(pose)
@@ -290,7 +340,20 @@ class Pipeline:
         while isinstance(move := behaviour.next_move(), EpisodeRequest):
             self._mapper.meet(move, observation)
             self._see_changes()
+            if self._mapper.between_episodes:
+                return Command()
         return move
+
+    def _calibrate(self, image: NDArray[np.uint8]) -> None:
+        """Hold the tracks against the wheels; what they show is used from the next node on."""
+        calibration = self.calibration
+        if calibration.pending is not None and self._mapper.description is calibration.pending[0]:
+            calibration.switched()
+            self._description, self._lens = calibration.description, calibration.lens
+            self._sift = Sift(self._lens, self._settings.sift)
+        calibration.watch(image, *self._mapper.tracks)
+        if calibration.pending is not None:
+            self._mapper.recalibrate(*calibration.pending)
 
     def _resume(self, observation: Observation) -> Command:
         """Find the robot on its own map; then map on from there."""
@@ -343,6 +406,8 @@ class Pipeline:
         if self._driven is not None:
             silence = self._driven.silence
             doing = "driven by a person" if not silence else "standing: nothing is heard of who drives it"
+        if self._lifted or self._put_elsewhere:
+            doing, detail = "lifted", "the robot begins a new map once it is on the floor"
         mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
         for more in (self._mapper.health if mapping else "", warning):
             detail = "; ".join(part for part in (detail, more) if part)
@@ -365,6 +430,6 @@ class Pipeline:
             astray=self._resumption is not None,
             given_up=given_up,
             progress=progress,
-            located=mapping and self._mapper.started and not self._mapper.astray,
+            located=mapping and self._located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )
