@@ -155,7 +155,8 @@ class CameraOccupancyGrid(OccupancyGrid):
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         rays = (self._description.radius + along)[None, :, None] * directions[:, None]
         cells = self.cells(np.array([map_from_robot.x, map_from_robot.y]) + rays)
-        readings = _first(self._occupied[cells[..., 0], cells[..., 1]], along)
+        at = cells[..., 0], cells[..., 1]
+        readings = _first((self._odds[at] > 0.3) | self._touched[at], along)
         for direction, beyond in ((0.0, DARED), (math.pi, SLACK)):
             beam = BEARINGS.index(direction)
             readings[beam] = min(readings[beam], self.known_ahead(map_from_robot, direction, REACH) + beyond)
@@ -176,8 +177,9 @@ class CameraOccupancyGrid(OccupancyGrid):
         start = np.array([map_from_robot.x, map_from_robot.y])
         way = along[:, None] * np.array([math.cos(angle), math.sin(angle)])
         cells = self.cells(start + way[:, None] + rim)
-        unknown = np.asarray(np.any(~self._free[cells[..., 0], cells[..., 1]], axis=1))
-        return float(_first(unknown[np.newaxis], along, reach)[0])
+        at = cells[..., 0], cells[..., 1]
+        known = ((self._odds[at] < -0.3) & ~self._touched[at]).all(axis=1)
+        return float(_first(np.logical_not(known)[None], along, reach)[0])
 
     def room(self) -> Array:
         """For each cell the distance to the nearest thing seen or touched, m."""

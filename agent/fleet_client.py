@@ -84,7 +84,7 @@ class FleetClient:
         self._asker.start()
 
     def driven(self) -> Driven | None:
-        """The command of a person who drives the robot now; None where no person does."""
+        """The command of a person who drives the robot now; None if no one does."""
         return self._teleoperation.driven()
 
     def server_in_reach(self) -> bool:

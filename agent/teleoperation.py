@@ -24,7 +24,7 @@ class Teleoperation:
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
-        """No person drives.
+        """No one drives.
 
         Args:
             clock: ns, of this process alone.
@@ -59,7 +59,7 @@ class Teleoperation:
             self._session = None
 
     def driven(self) -> Driven | None:
-        """The command that holds now; None where no person drives."""
+        """The command that holds now; None if no one drives."""
         with self._lock:
             if self._session is None:
                 return None

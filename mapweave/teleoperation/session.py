@@ -57,7 +57,7 @@ class Session:
         while self.answer is None and not self.refused:
             self._send(FIRST)
             if self.answer is None and time.monotonic() >= end:
-                raise DeviceError(self._unreached())
+                raise DeviceError(self._absent())
         if self.refused:
             raise DeviceError(f"{name}: {self.refused}")
 
@@ -111,7 +111,7 @@ class Session:
             except MapweaveError as error:
                 self.refused = str(error)
 
-    def _unreached(self) -> str:
+    def _absent(self) -> str:
         """That the agent does not answer, and who is there."""
         there: set[str] = set()
 

@@ -90,10 +90,14 @@ class Trial:
 
 
 def navigator(
-    eyes: Eyes, own: HybridMap, goal: NodeId, settings: NavigatorSettings | None = None
+    eyes: Eyes,
+    own: HybridMap,
+    goal: NodeId,
+    settings: NavigatorSettings | None = None,
+    body: RobotDescription = BODY,
 ) -> Navigator:
     every = AgentSettings(navigation=settings or NavigatorSettings())
-    return Navigator(BODY, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every)  # type: ignore[arg-type]
+    return Navigator(body, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every)  # type: ignore[arg-type]
 
 
 def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,7 +70,9 @@ def view(
     return Node(NodeId("r0", 1, 1), 1, PoseGaussian(pose, np.zeros((3, 3))), camera, landmarks)
 
 
-def looked_around(rng: np.random.Generator, places=PLACES, **other) -> CameraOccupancyGrid:
+def looked_around(
+    rng: np.random.Generator, places: Sequence[tuple[float, float]] = PLACES, **other: Any
+) -> CameraOccupancyGrid:
     """The grid after views all around some places, which were driven to and a little forth from."""
     floor = CameraOccupancyGrid(ROBOT, SETTINGS)
     for x, y in places:

@@ -83,8 +83,13 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[list[str
             )
             children.start("r0", ["agent", "r0", "--data", str(folder), *arguments])
             log = folder / "logs" / "r0.log"
-            eventually(lambda: children.check() or "no proximity sensors" in log.read_text())
-            said = log.read_text()
+
+            def ready() -> bool:
+                children.check()
+                return "standing still" in log.read_text()
+
+            eventually(ready)
+            said = " ".join(log.read_text().split())
             assert "`mapweave drive r0`" in said
             assert "--without-rangers" in said
             yield arguments, SimControl(bus, FLEET)
@@ -177,7 +182,7 @@ def test_a_robot_is_driven_by_a_gamepad_and_a_second_person_is_refused(
 
 @needs_simulator
 def test_who_is_not_there_is_named_in_one_line(
-    network: tuple[list[str], SimControl], closed: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    network: tuple[list[str], SimControl], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     arguments, _ = network
     person = Person("r7", *arguments)
@@ -189,4 +194,4 @@ def test_who_is_not_there_is_named_in_one_line(
     finally:
         person.end()
     assert "gamepad" in complaint(capfd, "drive", "r0", "--gamepad", str(tmp_path / "none"))
-    assert "needs a terminal" in complaint(capfd, "drive", "r0", "--connect", closed)
+    assert "needs a terminal" in complaint(capfd, "drive", "r0", "--connect", f"tcp/127.0.0.1:{free_port()}")

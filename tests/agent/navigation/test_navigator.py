@@ -14,7 +14,7 @@ from mapweave.agent.navigation.navigator import Stage
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.node import EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
 from synthetic.world import World
@@ -225,3 +225,48 @@ def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home):
 def test_a_tally_counts_nodes_that_were_left_before_they_were_reached():
     tally = DriveStatistics().passed([0.2]).passed([]).passed([0.9, 0.3]).passed([1.2])
     assert tally == DriveStatistics(edges=3, skipped=2)
+
+
+# Without proximity sensors
+
+BARE = replace(BODY, ranger_bearings=(), ranger_reach=0.0)
+NO_READINGS = np.zeros(0)
+
+
+def test_a_touch_blocks_the_edge_and_another_way_is_sought(home):
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9), BARE)
+    blocked: list[tuple[tuple[NodeId, NodeId], ...]] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        blocked.append(question.blocked)
+        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+
+    trial = Trial(nav, eyes, fleet, NO_READINGS)
+    trial.run(20.0, lambda: any(command.forward > 0.0 for command in trial.commands))
+    nav.touch("the bumper is pressed")
+    trial.run(20.0, lambda: len(blocked) == 2)
+    assert blocked == [(), ((A, B),)]
+    assert any("something was touched: the bumper is pressed" in detail for _, detail in trial.said)
+
+
+@pytest.mark.parametrize("body", [BODY, BARE], ids=["rangers", "no rangers"])
+def test_only_driven_edges_are_driven_without_rangers(home, body):
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9), body)
+    blocked: list[tuple[tuple[NodeId, NodeId], ...]] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        blocked.append(question.blocked)
+        start, last = straight(bare(A), bare(B))
+        return Answer(question.number, RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way"))
+
+    trial = Trial(nav, eyes, fleet, FREE if body is BODY else NO_READINGS)
+    trial.run(8.0, lambda: len(blocked) == 3 or any(c.forward > 0.0 for c in trial.commands))
+    drives = any(command.forward > 0.0 for command in trial.commands)
+    assert drives == (body is BODY)
+    assert blocked[-1] == (() if body is BODY else ((A, B),))
