@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
@@ -30,6 +29,7 @@ from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NUMBER, MapId, NodeId
+from mapweave.processes.agent_progress import AgentProgress
 from mapweave.processes.service_manager import ServiceManager
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.bus import Bus
@@ -336,7 +336,7 @@ def run_agent(
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
     console = Console(stderr=True)
-    show, manager = _progress(console, options), ServiceManager()
+    show, manager = AgentProgress(console, options.name, options.total), ServiceManager()
     describe = partial(_describe, robot, console.print, options.name)
 
     def stepped(observation: Observation, step: Step) -> None:
@@ -380,37 +380,3 @@ def _hand_over(console: Console, replicator: Replicator, bus: ZenohBus, options:
         console.print(
             f"server {options.server} has not acknowledged everything: the rest stays in the journal"
         )
-
-
-class _progress:
-    """Progress of a run: with a bar where the end is known, else a line when something changes."""
-
-    def __init__(self, console: Console, options: AgentOptions) -> None:
-        self._console = console
-        self._options = options
-        self._bar: Progress | None = None
-        self._last_line = ""
-
-    def __enter__(self) -> _progress:
-        if self._options.total is not None:
-            self._bar = Progress(
-                SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                TextColumn("{task.fields[detail]}"), console=self._console,
-            )  # fmt: skip
-            self._task = self._bar.add_task(self._options.name, total=self._options.total, detail="")
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def __call__(self, observation: Observation, step: Step) -> None:
-        status = step.status
-        if self._bar is not None:
-            self._bar.update(self._task, advance=1, detail=f"{status.nodes} nodes, {status.detail}")
-        elif status.doing != self._last_line:
-            self._last_line = status.doing
-            self._console.print(
-                f"{self._options.name}: {status.doing} ({status.nodes} nodes) {status.detail}"
-            )
