@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mapweave.agent.observation import Command
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import KnownAnswer, RelocalizeAnswer, RouteAnswer, View
@@ -32,6 +33,19 @@ class GoTo:
 
 
 Mission = Idle | Explore | Carried | GoTo
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A person drives the robot, whatever its mission.
+
+    Attributes:
+        command: of the person.
+        silence: s without a command, if that is too long: the command is then to stand; else 0.
+    """
+
+    command: Command
+    silence: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

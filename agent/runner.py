@@ -80,7 +80,7 @@ class Runner:
         if mission is not None:
             self._pipeline.set_mission(mission)
         answers, self._answers = (*self._answers, *self._fleet.answers()), ()
-        step = self._pipeline.step(observation, answers)
+        step = self._pipeline.step(observation, answers, self._fleet.driven())
         if step.changes:
             self._replicator.submit(step.changes, observation.stamp_ns)
             self._synchronization.changes_submitted(self._replicator, self._fleet)

@@ -12,6 +12,7 @@ from mapweave.commands import (
     calibrate,
     demo,
     doctor,
+    drive,
     evaluate,
     find_cameras,
     find_port,
@@ -66,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, status, missions, robots, doctor, find_port, find_cameras,
+        demo, server, router, sim, agent, drive, status, missions, robots, doctor, find_port, find_cameras,
         calibrate, map_file, record, replay, info, relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)

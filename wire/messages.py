@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
+from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
@@ -69,6 +70,8 @@ LIMITS: dict[type, Limit] = {
     ManualConstraint: Limit("manual constraint", 4096),
     History: Limit("history", 2**26, 1_000_000),
     AgentStatus: Limit("agent status", 2**15),
+    DriveRequest: Limit("drive request", 256),
+    DriveAnswer: Limit("drive answer", 2**15 + 256),
     FleetStatus: Limit("fleet status", 2**24, 200_000),
     MissionOrder: Limit("mission", 2048),
     MissionReport: Limit("mission report", 2**15),

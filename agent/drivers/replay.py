@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.agent.recordings.image_folder import read_split
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
@@ -44,6 +46,9 @@ class Replay:
         """
         self.recording: Recording = open_recording(path, options)
         folder = path if path.is_dir() else path.parent
+        settings = options.camera if options is not None and options.camera is not None else None
+        given = read_geometry(settings or folder / "camera.toml")
+        self._geometry = DriveGeometry(**given) if given else None
         self._frames = frames or read_split(folder / "splits.toml", robot, len(self.recording))
         if not 0 <= self._frames[0] <= self._frames[-1] < len(self.recording):
             raise DeviceError(f"{path}: {self._frames} is not within the {len(self.recording)} images")
@@ -66,6 +71,7 @@ class Replay:
             max_forward=0.0,
             max_turn=0.0,
             tick=tick,
+            geometry=self._geometry,
         )
 
     @property

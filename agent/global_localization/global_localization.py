@@ -19,6 +19,11 @@ from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Sift
 
+CARRIED_MOVING_VIEWS = 12
+"""A carried robot is lost after so many views without success between which it moves: six seconds of driving.
+A new map can be joined to the old one later, a stretch that is not mapped cannot."""
+MOVED = 0.02
+"""m or rad between two views."""
 STILL = 0.2
 """Seconds that the robot stands still before a view."""
 TURN_STEP = 0.5
@@ -126,13 +131,19 @@ class GlobalLocalization:
         return None
 
     def wait(self) -> Search:
-        """Take views while a person moves the robot; None after `carried_views` views without success."""
-        while self._views < self._policy.carried_views:
+        """Take views while a person moves the robot; None after `carried_views` views without success.
+
+        A drive goes on meanwhile: a few views between which the robot has moved are enough.
+        """
+        moving = 0
+        while self._views < self._policy.carried_views and moving < CARRIED_MOVING_VIEWS:
+            views, driven = self._views, self._motion.way + self._motion.turned
             candidate = yield from self.look()
             if candidate is not None:
                 return candidate
             self.detail = f"waiting to recognise a place of its own map: {self.detail}"
             yield from self._motion.stand(self._policy.carried_pause)
+            moving += self._views > views and self._motion.way + self._motion.turned - driven > MOVED
         self._give_up(f"in {self._views} images")
         return None
 

@@ -95,6 +95,10 @@ class KeyframeBuilder:
         self._new: list[ChangeBody] = []
         self._rng = np.random.default_rng(0)
 
+    def recalibrate(self, description: RobotDescription) -> None:
+        """Make nodes with another camera from now on; those made before keep theirs."""
+        self._description, self._camera = description, description.camera
+
     def take_changes(self) -> tuple[ChangeBody, ...]:
         """What was changed in the map since the last call, in order: it is to leave the robot."""
         new, self._new = tuple(self._new), []

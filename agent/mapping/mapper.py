@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.edge_measurement.traverse import Traverse
+from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.mapping.anchored_keyframe import HERE
 from mapweave.agent.mapping.episode import EpisodeRequest
@@ -49,13 +50,15 @@ class Mapper:
         settings: AgentSettings | None = None,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
+        lens: Lens | None = None,
     ) -> None:
         """Start an empty map at the robot's pose, or resume one; see KeyframeBuilder."""
         settings = settings or AgentSettings()
         self.typical_depth = DEPTHS_PER_HEIGHT * max(description.camera.mount_height, 0.05)
         self._description = description
         self._settings = settings
-        self._lens = Lens(description.camera, description.distortion)
+        self._lens = lens or Lens(description.camera, description.distortion)
+        self._pending: tuple[RobotDescription, Lens] | None = None
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
         self._cartographer = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
@@ -125,6 +128,16 @@ class Mapper:
         return self._cartographer.map_from_anchor @ self._tracking.pose
 
     @property
+    def description(self) -> RobotDescription:
+        """The robot as it is mapped with now."""
+        return self._description
+
+    @property
+    def tracks(self) -> tuple[object, NDArray[np.int64], Array]:
+        """Whose tracks, their (N,) ids and (N, 2) px in the real image."""
+        return (self._tracking, *self._tracking.raw_tracks)
+
+    @property
     def tracked(self) -> int:
         """Tracks alive."""
         return len(self._tracking.ids)
@@ -154,6 +167,11 @@ class Mapper:
         """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
         return self._tracking.converged_share
 
+    @property
+    def landmarks(self) -> LandmarkEstimates:
+        """The filter's landmarks, in robot."""
+        return self._tracking.landmarks()
+
     def take_changes(self) -> tuple[ChangeBody, ...]:
         """What was changed in the map since the last call; the only way by which nodes and edges leave."""
         return self._cartographer.take_changes()
@@ -173,6 +191,10 @@ class Mapper:
             self._tracking.step(observation)
         elif self._anchor is not None and not self.doubtful:
             self._wayside.step(observation, self._tracking.pose.mean)
+
+    def recalibrate(self, description: RobotDescription, lens: Lens) -> None:
+        """Know the robot's geometry better from the next node on."""
+        self._pending = description, lens
 
     def meet(self, request: EpisodeRequest, observation: Observation) -> None:
         """Do what a behaviour asks for, with the observation of the last step."""
@@ -196,6 +218,7 @@ class Mapper:
         With nodes it is astray and must `resume`; without any it may `begin` again.
         """
         self._cartographer.lose(self._tracking.pose)
+        self._take_up_pending()
         self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._leaves = None, []
         self._extracting, self._ended = None, False
@@ -261,7 +284,13 @@ class Mapper:
             else:
                 self._wayside.move_anchor(moved.mean)
             self._anchor, self._leaves = anchor, []
-            self._tracking.follow(anchor, self.typical_depth)
+            if self._take_up_pending():
+                # Tracks and features of another lens are of no use to a filter of this one.
+                self._tracking = Tracking(self._description, self._lens, self._settings)
+                self._tracking.step(observation)
+                self.begin(observation)
+            else:
+                self._tracking.follow(anchor, self.typical_depth)
 
         self._extracting, self._ended = (features, begin_next), True
         return node is not None
@@ -275,3 +304,12 @@ class Mapper:
         if self._extracting is not None:
             (features, take), self._extracting, self._ended = self._extracting, None, False
             take(features.result())
+
+    def _take_up_pending(self) -> bool:
+        """Change to another geometry, between two episodes; returns whether there was any."""
+        if self._pending is None:
+            return False
+        (self._description, self._lens), self._pending = self._pending, None
+        self._sift = Sift(self._lens, self._settings.sift)
+        self._cartographer.recalibrate(self._description)
+        return True

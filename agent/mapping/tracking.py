@@ -136,6 +136,11 @@ class Tracking:
         return self._tracker.pixels
 
     @property
+    def raw_tracks(self) -> tuple[NDArray[np.int64], Array]:
+        """(N,) ids of the tracks alive, and (N, 2) px where they are in the real image."""
+        return self._tracker.ids, self._tracker.raw
+
+    @property
     def report(self) -> TrackQuality:
         """Quality of the tracks after the last accepted image."""
         tracker = self._tracker

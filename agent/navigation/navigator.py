@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 from enum import StrEnum
+from itertools import pairwise
 
 import numpy as np
 
+from mapweave.agent.cautious_driving import lacks_rangers
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.global_localization.candidates import Candidate, FleetMap, OwnMap
@@ -25,7 +27,7 @@ from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.node import EdgeKind, Node, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.vision.lens import Lens
@@ -46,6 +48,9 @@ class Stage(StrEnum):
     GIVEN_UP = "gave up its goal"
 
 
+RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
+"""Edges between places that look alike, which no robot need have driven. A robot without proximity sensors
+avoids those that are longer than its radius."""
 TIGHT = 0.07
 """Something nearer than this counts as what is in the way, m."""
 ANSWER_PATIENCE = 100
@@ -112,6 +117,7 @@ class Navigator:
         self._failed_views = 0
         self._goal_hidden = False
         self._following = self._searching = self._parking_retried = False
+        self._touched = ""
         self._refused_since: float | None = None
         self._driven: set[tuple[NodeId, NodeId]] = set()
         self._progressed_at = 0.0
@@ -155,6 +161,14 @@ class Navigator:
             self.detail = self._localization.detail
         return command, self._motion.questions()
 
+    def touch(self, what: str) -> None:
+        """Something was touched: the present edge is blocked.
+
+        Args:
+            what: in words.
+        """
+        self._touched = what
+
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
 
     def _go(self) -> Behaviour:
@@ -163,7 +177,9 @@ class Navigator:
                 yield from self._find()
             assert self.fix is not None, "the search ends with a fix"
             route = yield from self._get_route(self.fix)
-            if route:
+            if (undriven := self._undriven(route)) is not None:
+                self._blocks.add(*undriven, self._motion.now)
+            elif route:
                 self._refused_since = None
                 yield from self._follow(route, self.fix)
             else:
@@ -220,6 +236,16 @@ class Navigator:
         self.legs = self.legs or len(content.legs)
         return content.legs
 
+    def _undriven(self, route: tuple[RouteLeg, ...]) -> tuple[NodeId, NodeId] | None:
+        """The first leg of a route that no robot has driven; None without one, or if there are rangers."""
+        if not lacks_rangers(self._description):
+            return None
+        for before, leg in pairwise(route):
+            way = math.hypot(leg.previous_from_node.mean.x, leg.previous_from_node.mean.y)
+            if leg.kind in RECOGNISED and way > self._description.radius:
+                return before.node.id, leg.node.id
+        return None
+
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""
         self.stage, now = Stage.WAITING, self._motion.now
@@ -235,7 +261,7 @@ class Navigator:
             self._description, self._lens, self._sift, route, fix, self._local_planner,
             self._settings, self._rng,
         )  # fmt: skip
-        self._following = True
+        self._following, self._touched = True, ""
         while True:
             leg = follower.leg
             if follower.blocked not in self._driven:
@@ -247,6 +273,8 @@ class Navigator:
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._failed_views = 0
+            if self._touched:
+                follower.progress = RouteProgress.BLOCKED
             if follower.progress not in (RouteProgress.DRIVING, RouteProgress.PARKING):
                 break
             yield command
@@ -308,6 +336,8 @@ class Navigator:
 
     def _obstacle(self) -> str:
         """The obstacle ahead, in words; empty if nothing is near."""
+        if self._touched:
+            return f"something was touched: {self._touched}"
         ranges = self._motion.observation.proximity
         bearings = self._description.ranger_bearings
         if len(ranges) == len(bearings) and len(bearings):

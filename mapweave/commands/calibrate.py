@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mapweave.commands import calibrate_camera, calibrate_target
+from mapweave.commands import calibrate_camera, calibrate_drive, calibrate_target
 
 
 def add_to(commands: Any) -> None:
@@ -14,5 +14,5 @@ def add_to(commands: Any) -> None:
         "calibrate", help="measure how camera and wheels of a robot are mounted"
     )
     actions = parser.add_subparsers(title="what", metavar="WHAT", required=True)
-    for action in (calibrate_camera, calibrate_target):
+    for action in (calibrate_camera, calibrate_target, calibrate_drive):
         action.add_to(actions)

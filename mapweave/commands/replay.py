@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.agent import add_calibration, calibration_of
 from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
 from mapweave.hybridmap.errors import DeviceError
 
@@ -34,14 +35,15 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
     )
+    add_calibration(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
+def add_recording(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     """Declare a recording, and what a person may have to say of it."""
     parser.add_argument(
-        "recording", type=Path,
+        "recording", type=Path, nargs="?" if optional else None,
         help="folder with images/, camera.toml and odometry.csv; ROS bag (.mcap, .bag, .db3, folder); video; "
         "sequence of KITTI odometry, EuRoC, TUM RGB-D or 4Seasons",
     )  # fmt: skip
@@ -78,10 +80,11 @@ def run(arguments: argparse.Namespace) -> int:
         return _map_images(arguments, missing.recording)
     for note in robot.recording.notes:
         print(note)
+    name = name_of(arguments)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     options = AgentOptions(
-        name=_name(arguments),
+        name=name,
         data=arguments.data,
         epoch=arguments.epoch,
         fresh=True,  # a recording begins where it began, not where another has ended
@@ -90,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
         total=len(robot),
         trajectories=True,
         patience=0.0 if arguments.offline else arguments.patience,
+        calibration=calibration_of(arguments, name),
     )
     stop = stop_on_signals()
     bus, keys = connect(network)
@@ -113,7 +117,7 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     from mapweave.storage.map_file import MapFile, write_map_file
     from mapweave.visual_mapping import keyframes, visual_maps
 
-    name, data, console = _name(arguments), arguments.data, Console(stderr=True)
+    name, data, console = name_of(arguments), arguments.data, Console(stderr=True)
     network = network_of(arguments, settings_of(arguments))
     print(f"{recording.path}: no odometry, so it is mapped by its images alone: the map has no scale")
     data.mkdir(parents=True, exist_ok=True)
@@ -145,8 +149,8 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     return _report([*recording.damage, *damage])
 
 
-def _name(arguments: argparse.Namespace) -> str:
-    """In the fleet."""
+def name_of(arguments: argparse.Namespace) -> str:
+    """Of the robot in the fleet: as given, else that of its splits.toml, else the file's or folder's."""
     import re
 
     from mapweave.hybridmap.node import check_name

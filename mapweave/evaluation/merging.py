@@ -157,7 +157,8 @@ def changes(name: str, robot: Replay, settings: AgentSettings) -> Iterator[list[
         if pipeline is None or pipeline.lost:
             epoch, sequence = epoch + 1, 0
             map_id = MapId(name, epoch)
-            pipeline = Pipeline(map_id, robot.describe(), settings)
+            calibration = pipeline.calibration if pipeline is not None else None
+            pipeline = Pipeline(map_id, robot.describe(), settings, calibration=calibration)
             pipeline.set_mission(Carried())
         made = []
         for change in pipeline.step(observation, ()).changes:

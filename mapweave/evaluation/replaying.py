@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.pipeline import Pipeline
@@ -169,7 +170,8 @@ def evaluate_replay(
     frames, wheels = list[Frame](), Pose2()
     while (observation := replay.sense()) is not None:
         if pipelines[-1].lost:
-            pipelines.append(_pipeline(len(pipelines), description, settings))
+            calibration = pipelines[-1].calibration
+            pipelines.append(_pipeline(len(pipelines), description, settings, calibration))
         status = pipelines[-1].step(observation).status
         wheels = wheels @ observation.odometry.motion()
         pose = status.map_from_robot if status.located else None
@@ -210,8 +212,10 @@ def true_poses(path: Path | None, stamps_ns: Stamps) -> Array:
     return out
 
 
-def _pipeline(number: int, description: Any, settings: AgentSettings) -> Pipeline:
-    pipeline = Pipeline(MapId("replay", number + 1), description, settings)
+def _pipeline(
+    number: int, description: Any, settings: AgentSettings, calibration: OnlineCalibration | None = None
+) -> Pipeline:
+    pipeline = Pipeline(MapId("replay", number + 1), description, settings, calibration=calibration)
     pipeline.set_mission(Carried())
     return pipeline
 

@@ -221,6 +221,53 @@ def test_a_robot_carried_off_before_the_first_node_restarts(walls):
     assert status.doing == "mapping while carried" and status.tracked > 20
 
 
+def lift(walls, pipeline: Pipeline, tick: int) -> list[Step]:
+    """A person lifts the robot, carries it, and puts it down where it sees something else."""
+    away = Pose2(0.3, 0.0, math.pi)
+    seen = [still(walls, tick=tick + k, kidnapped=True) for k in range(3)]
+    seen += [still(walls, away, tick=tick + 3 + k) for k in range(2)]
+    return [pipeline.step(observation) for observation in seen]
+
+
+@pytest.mark.parametrize("mission", [Explore(), Carried()])
+def test_a_robot_that_was_lifted_is_lost_once_it_is_put_down(walls, mission):
+    pipeline = on(Carried())
+    before = Pose2(-1.0)
+    for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
+        pipeline.step(walls.observe(before, Pose2(x), tick))
+        before = Pose2(x)
+    pipeline.set_mission(mission)
+    elements = set(pipeline.map.nodes) | set(pipeline.map.edges)
+    assert elements
+    steps = lift(walls, pipeline, 100)
+    assert [step.command for step in steps] == [Command()] * 5
+    assert [step.status.doing for step in steps] == ["lifted"] * 5
+    assert [step.status.lost for step in steps] == [False] * 3 + [True] * 2
+    assert set(pipeline.map.nodes) | set(pipeline.map.edges) == elements
+    # A person may know better.
+    pipeline.set_mission(Carried())
+    assert not pipeline.lost
+
+
+def test_a_robot_that_was_lifted_before_the_first_node_maps_on(walls):
+    pipeline = on(Carried())
+    pipeline.step(still(walls))
+    steps = lift(walls, pipeline, 1)
+    assert steps[-1].status.doing == "mapping while carried"
+    assert not pipeline.lost
+
+
+def test_a_robot_that_was_lifted_on_its_way_asks_where_it_is(walls):
+    pipeline = on(GoTo(NodeId("r1", 1, 1)))
+    first = [question for tick in range(10) for question in pipeline.step(still(walls, tick=tick)).questions]
+    steps = lift(walls, pipeline, 20)
+    assert not any(step.questions for step in steps[:3])
+    again = [q for tick in range(30, 40) for q in pipeline.step(still(walls, tick=tick)).questions]
+    assert first
+    assert again
+    assert not pipeline.lost
+
+
 # Questions
 
 

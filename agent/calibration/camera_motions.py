@@ -1,0 +1,162 @@
+"""Motions of the camera, as the wheels and the parameters of a drive predict them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mapweave.agent.drive_geometry import Parameter
+from mapweave.hybridmap.pose import Array
+
+SUBSTEPS = 8
+"""Into which the wheels' way between two images is cut; over a second, chords of 0.1 s."""
+
+
+@dataclass(frozen=True, eq=False)
+class WheelTrack:
+    """What the wheels have counted, on their own clock.
+
+    Attributes:
+        stamps: (K,) s, ascending.
+        way: (K,) m since the beginning, backwards negative.
+        turn: (K,) rad since the beginning.
+    """
+
+    stamps: Array
+    way: Array
+    turn: Array
+
+    def between(self, first: Array, last: Array) -> tuple[Array, Array]:
+        """Ways (N, SUBSTEPS) m and turns (N, SUBSTEPS) rad in equal parts of (N,) intervals of time, s.
+
+        The wheels go on as they did at the ends of what was counted: a delay reaches beyond it.
+        """
+        share = np.linspace(0.0, 1.0, SUBSTEPS + 1)
+        times = first[:, None] + (last - first)[:, None] * share
+        return np.diff(self._at(times, self.way), axis=1), np.diff(self._at(times, self.turn), axis=1)
+
+    def smooth(self, seconds: float) -> WheelTrack:
+        """The same averaged over a time about each reading."""
+        way, turn = (self._mean(self.stamps, counted, seconds) for counted in (self.way, self.turn))
+        return WheelTrack(self.stamps, way, turn)
+
+    def _at(self, times: Array, counted: Array) -> Array:
+        """What was counted, averaged over one reading's time about each of the times.
+
+        Plain interpolation halves the noise of a reading in its middle, and a fit of the delay goes there.
+        """
+        return self._mean(times, counted, float(np.median(np.diff(self.stamps))))
+
+    def _mean(self, times: Array, counted: Array, width: float) -> Array:
+        stamps, steps = self.stamps, np.diff(self.stamps)
+        rate = np.diff(counted) / steps
+        area = np.concatenate([[0.0], np.cumsum(0.5 * (counted[1:] + counted[:-1]) * steps)])
+
+        def integral(t: Array) -> Array:
+            i = np.clip(np.searchsorted(stamps, t, side="right") - 1, 0, len(steps) - 1)
+            after = t - stamps[i]
+            return np.asarray(area[i] + counted[i] * after + 0.5 * rate[i] * after**2)
+
+        return (integral(times + 0.5 * width) - integral(times - 0.5 * width)) / width
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMotions:
+    """Motions of a camera between pairs of images, and the floor as the first image's camera sees it.
+
+    A point at depth z of the first camera, with normalised coordinates x = (u, v, 1), lies in the direction
+    `rotation @ x + translation / z` of the second.
+
+    Attributes:
+        rotation: (N, 3, 3) `second_from_first`.
+        translation: (N, 3) m.
+        floor: (N, 3) 1/m; a point of the floor has the inverse depth floor . x.
+    """
+
+    rotation: Array
+    translation: Array
+    floor: Array
+
+    def since(self, other: CameraMotions) -> Array:
+        """(N, 6) small step from another motion to this: translation m, rotation rad.
+
+        A step (tau, omega) turns y = R x + rho t into y + omega x y + rho tau.
+        """
+        apart = self.rotation @ np.swapaxes(other.rotation, -1, -2)
+        skew = 0.5 * (apart - np.swapaxes(apart, -1, -2))
+        sine = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+        size = np.linalg.norm(sine, axis=-1, keepdims=True)
+        cosine = 0.5 * (np.trace(apart, axis1=-2, axis2=-1)[..., None] - 1.0)
+        omega = sine * np.where(size > 1e-12, np.arctan2(size, cosine) / np.maximum(size, 1e-300), 1.0)
+        tau = self.translation - np.einsum("...ij,...j->...i", apart, other.translation)
+        return np.concatenate([tau, omega], axis=-1)
+
+    def stepped(self, step: Array) -> CameraMotions:
+        """These motions, each moved by a row of (N, 6) small steps; the inverse of `since`."""
+        turn = rotations(step[..., 3:6])
+        moved = np.einsum("...ij,...j->...i", turn, self.translation) + step[..., :3]
+        return CameraMotions(turn @ self.rotation, moved, self.floor)
+
+    def __getitem__(self, index: Any) -> CameraMotions:
+        """Some of them."""
+        return CameraMotions(self.rotation[index], self.translation[index], self.floor[index])
+
+
+def rotations(vectors: Array) -> Array:
+    """(..., 3, 3) rotations by (..., 3) rotation vectors, rad: Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    k = np.zeros((*vectors.shape[:-1], 3, 3))
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    k[..., 0, 1], k[..., 0, 2], k[..., 1, 0] = -z, y, z
+    k[..., 1, 2], k[..., 2, 0], k[..., 2, 1] = -x, -y, x
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+ROBOT_FROM_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Of a camera that looks straight ahead: x right, y down, z forward."""
+
+
+def robot_from_camera(heading: float, pitch: float, roll: float) -> Array:
+    """(3, 3) rotation of the mount, angles in rad as in `DriveGeometry`."""
+    about = np.array([[0.0, 0.0, heading], [0.0, pitch, 0.0], [roll, 0.0, 0.0]])
+    z, y, x = rotations(about)
+    return np.asarray(z @ y @ x @ ROBOT_FROM_LEVEL)
+
+
+def predict(
+    vector: Array, wheels: WheelTrack, first: Array, last: Array, slip: Array | None = None
+) -> CameraMotions:
+    """Camera motions between images by the wheels, for one set of parameters.
+
+    Args:
+        vector: (10,) in the order of `Parameter`.
+        wheels: what they counted.
+        first: (N,) s, stamps of the first images.
+        last: (N,) s, stamps of the second images.
+        slip: (3,) forward m, left m, turn rad that each robot moves besides at its end.
+    """
+    p = Parameter
+    delay = vector[p.DELAY]
+    ways, turns = wheels.between(first + delay, last + delay)
+    ways = math.exp(vector[p.WHEEL_SCALE]) * ways
+    turns = math.exp(vector[p.TURN_SCALE]) * turns + vector[p.DRIFT] * ways
+    heading = np.cumsum(turns, axis=1)
+    middle = heading - 0.5 * turns
+    x, y, turned = (ways * np.cos(middle)).sum(1), (ways * np.sin(middle)).sum(1), heading[:, -1]
+    if slip is not None:
+        c, s = np.cos(turned), np.sin(turned)
+        x, y = x + c * slip[0] - s * slip[1], y + s * slip[0] + c * slip[1]
+        turned = turned + slip[2]
+    mount = robot_from_camera(vector[p.HEADING], vector[p.PITCH], vector[p.ROLL])
+    centre = np.array([vector[p.FORWARD], vector[p.LEFT], 0.0])
+    back = rotations(np.stack([0.0 * turned, 0.0 * turned, -turned], axis=1))
+    moved = np.stack([x, y, 0.0 * x], axis=1)
+    rotation = mount.T @ back @ mount
+    translation = (np.einsum("nij,nj->ni", back, centre - moved) - centre) @ mount
+    floor = mount.T @ np.array([0.0, 0.0, -1.0]) * math.exp(-vector[p.HEIGHT])
+    return CameraMotions(rotation, translation, np.broadcast_to(floor, (len(first), 3)).copy())

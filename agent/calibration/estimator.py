@@ -1,0 +1,408 @@
+"""Least squares for the geometry of a drive over reduced image pairs.
+
+A pair says how the camera has moved (`pair_information.py`), the wheels and the parameters how it should have
+(`drive_geometry.py`). What is left between them is slip of the wheels, which every pair has of its own; its
+size is estimated along with the parameters (expectation maximisation), so that neither a drive on ice nor one
+on rails gets a false sigma. Gauss-Newton with pairs weighted by Student's t; the covariance is the larger of
+the model's and of what blocks of pairs scatter (sandwich), because slip has a memory that the model has not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, predict
+from mapweave.agent.calibration.pair_information import ImagePair, PairInformation, reduce_pair
+from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
+from mapweave.hybridmap.pose import Array
+
+P = Parameter
+PRIOR_SIGMAS = {
+    P.WHEEL_SCALE: 0.15, P.TURN_SCALE: 0.15, P.DRIFT: 0.05, P.FORWARD: 1.5, P.LEFT: 0.5, P.HEADING: 0.15,
+    P.PITCH: 0.15, P.ROLL: 0.05, P.HEIGHT: 0.01, P.DELAY: 0.15,
+}  # fmt: skip
+"""How far a declared value may be off before anything is seen. Floor and wheels show the height only as a
+multiple of the way: the height, which a tape measures to a percent, is held; the wheels' scale follows."""
+USEFUL_SIGMAS = {
+    P.WHEEL_SCALE: 0.02, P.TURN_SCALE: 0.02, P.DRIFT: 0.005, P.FORWARD: 0.15, P.LEFT: 0.05, P.HEADING: 0.01,
+    P.PITCH: 0.01, P.ROLL: 0.01, P.HEIGHT: 0.02, P.DELAY: 0.02,
+}  # fmt: skip
+"""A drive shows a parameter if its sigma is below this: smaller errors do not show in a map of a room."""
+MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.035, 0.002, 0.001, 0.001, 0.002, 0.002])
+"""Errors of the estimator itself, in the order of `Parameter`: depths are not Gaussian, pairs short. Measured
+on synthetic drives, where turns come out up to 0.5 % short and the camera up to 5 cm
+aside; no sigma is smaller."""
+DELAY_SHARE = 0.12
+"""And of the delay, as a share of the time between two readings: nothing is known of what happens within."""
+STEP = np.array([1e-5, 1e-5, 1e-6, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
+"""Of the numeric derivative."""
+SLIP_STEP = 1e-5
+NOISE_STEPS = 4
+"""Of expectation maximisation in each Gauss-Newton step."""
+STALE_PITCH = 0.004
+"""Pairs that were reduced with another pitch than the present, rad, tell nothing of the floor."""
+DELAY_SMOOTH_S = 0.5
+"""Over which the wheels' speed is averaged where it serves as an instrument for the delay."""
+NO_FLOOR_SIGMA = 1e-3
+"""Of the wheels' scale while no floor is seen: epipolar lines know no scale."""
+STUDENT = 5.0
+"""Degrees of freedom of the pairs' weights."""
+BLOCK = 4
+"""Pairs in a row whose errors may go together."""
+FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
+"""Variances before any is estimated, per metre or per pair: see `_noise_basis`."""
+ROUNDS = 3
+"""Of a batch: reductions of all pairs."""
+FLOOR_WIDTHS = (0.1, 0.06)
+"""Widths of the mode of floor ratios, ever narrower: what stands on the floor is left out."""
+FLOOR_FLAT = 0.03
+"""Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
+FLOOR_CONTRAST = 3.0
+"""The mode must be so many times as dense as what seems to lie below it, else it is not the floor."""
+FLOOR_SIGMA = 0.005
+"""Least standard deviation of a scale by the floor: contact edges, mats, slopes."""
+LEAST_BLOCKS = 8
+"""Blocks of pairs that see the floor; the scatter of fewer tells no sigma."""
+LEAST_FLOOR = 60
+"""Points on the floor; with fewer nothing is said of it."""
+INNER = 6
+"""Gauss-Newton steps between two reductions of the pairs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters with their covariance.
+
+    Attributes:
+        vector: (10,) in the order of `Parameter`.
+        covariance: (10, 10).
+        declared: (10,) before anything was seen.
+        pairs: how many image pairs it is made of.
+        floor_tracks: tracks on the floor in all of them.
+        keep_wheels: whether the wheels' scale was held instead of the height.
+    """
+
+    vector: Array
+    covariance: Array
+    declared: Array
+    pairs: int
+    floor_tracks: int
+    keep_wheels: bool = False
+
+    @property
+    def geometry(self) -> DriveGeometry:
+        """All estimated values, shown or not."""
+        return DriveGeometry.of(self.vector)
+
+    @property
+    def sigmas(self) -> Array:
+        """(10,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def shown(self) -> NDArray[np.bool_]:
+        """(10,) which parameters the drive shows: better than useful, and much better than assumed.
+
+        Without the floor nothing tells a scale.
+        """
+        useful = np.array([USEFUL_SIGMAS[p] for p in P])
+        assumed = np.array([PRIOR_SIGMAS[p] for p in P])
+        if self.keep_wheels:
+            assumed[[P.WHEEL_SCALE, P.HEIGHT]] = assumed[[P.HEIGHT, P.WHEEL_SCALE]]
+        shown = np.asarray((self.sigmas < useful) & (self.sigmas < 0.5 * assumed))
+        shown[[P.WHEEL_SCALE, P.HEIGHT, P.LEFT]] &= self.floor_tracks >= LEAST_FLOOR
+        return shown
+
+    @property
+    def usable(self) -> DriveGeometry:
+        """What the drive shows; all else as declared."""
+        return DriveGeometry.of(np.where(self.shown, self.vector, self.declared))
+
+
+class Estimator:
+    """Takes image pairs, one after the other or many, and estimates the geometry from all of them.
+
+    Attributes:
+        vector: (10,) parameters as they are estimated now.
+        pairs: that are kept.
+        informations: what they are reduced to.
+        reduced_at: (10,) parameters at which each was reduced.
+        floor_tracks: tracks that lie on the floor.
+    """
+
+    def __init__(self, declared: DriveGeometry, sigma: float, keep_wheels: bool = False) -> None:
+        """Begin with what is declared.
+
+        Args:
+            declared: the geometry.
+            sigma: standard deviation of a track, in normalised coordinates.
+            keep_wheels: hold the wheels' scale to a percent instead of the height.
+        """
+        self.declared = declared.vector
+        self.vector = self.declared.copy()
+        prior = np.array([PRIOR_SIGMAS[p] for p in P])
+        if keep_wheels:
+            prior[[P.WHEEL_SCALE, P.HEIGHT]] = prior[[P.HEIGHT, P.WHEEL_SCALE]]
+        self._prior = np.diag(1.0 / prior**2)
+        self._sigma, self._keep_wheels = sigma, keep_wheels
+        self._noise: Array = FIRST_NOISE.copy()
+        self._depth = (0.3, 0.5)
+        self.reduced_at: list[Array] = []
+        self._floor: tuple[float, float] | None = None
+        self.floor_tracks = 0
+        self.pairs: list[ImagePair] = []
+        self.informations: list[PairInformation] = []
+        self._covariance = np.diag(prior**2)
+
+    def add(self, pair: ImagePair, wheels: WheelTrack) -> PairInformation:
+        """Reduce a pair at the present parameters and keep it."""
+        self.pairs.append(pair)
+        self.informations.append(self._reduced(pair, wheels))
+        self.reduced_at.append(self.vector.copy())
+        return self.informations[-1]
+
+    def drop(self, index: int) -> None:
+        """Forget a pair."""
+        del self.pairs[index], self.informations[index], self.reduced_at[index]
+
+    def refresh(self, index: int, wheels: WheelTrack) -> None:
+        """Reduce a pair again at the present parameters."""
+        self.informations[index] = self._reduced(self.pairs[index], wheels)
+        self.reduced_at[index] = self.vector.copy()
+
+    def _reduced(self, pair: ImagePair, wheels: WheelTrack) -> PairInformation:
+        first, last = np.array([pair.first_s]), np.array([pair.last_s])
+        predicted = predict(self.vector, wheels, first, last)
+        noise = self._noises(self.vector, wheels, first, last, predicted)[0]
+        return reduce_pair(pair, predicted[0], noise, self._sigma, self._depth)
+
+    def solve(self, wheels: WheelTrack, iterations: int = INNER) -> Estimate:
+        """Estimate from the pairs as they are reduced now."""
+        first = np.array([pair.first_s for pair in self.pairs])
+        last = np.array([pair.last_s for pair in self.pairs])
+        information = self._prior.copy()
+        floor = np.zeros(COUNT)
+        if self._floor is None:
+            information[P.WHEEL_SCALE, P.WHEEL_SCALE] = 1.0 / NO_FLOOR_SIGMA**2
+        else:
+            floor[[P.WHEEL_SCALE, P.HEIGHT]] = 1.0, -1.0
+        at = CameraMotions(
+            *(np.stack([getattr(i.at, name) for i in self.informations])
+              for name in ("rotation", "translation", "floor"))
+        )  # fmt: skip
+        a = np.stack([i.matrix for i in self.informations])
+        b = np.stack([i.vector for i in self.informations])
+        measured, spread = self._floor or (0.0, 1.0)
+        fixed = np.outer(floor, floor) / spread**2
+        for _ in range(iterations):
+            predicted = predict(self.vector, wheels, first, last)
+            off = predicted.since(at)
+            jacobian = self._jacobian(wheels, first, last, at, off)
+            rest = b - np.einsum("nij,nj->ni", a, off)
+            basis, growth = self._noise_basis(self.vector, wheels, first, last, predicted)
+            for _ in range(NOISE_STEPS):
+                noise = np.einsum("nik,nk,njk->nij", basis, growth * self._noise, basis)
+                inverse = np.linalg.inv(noise)
+                posterior = np.asarray(np.linalg.inv(a + inverse), np.float64)
+                slip: Array = np.einsum("nij,nj->ni", posterior, rest)
+                weight = _weights(np.einsum("ni,nij,nj->n", slip, inverse, slip))
+                self._learn_noise(basis, growth, slip, posterior, weight)
+            keep = np.eye(6) - a @ posterior
+            marginal = keep @ a
+            pull = np.einsum("nij,nj->ni", keep, rest)
+            scores = weight[:, None] * np.einsum("nji,nj->ni", jacobian, pull)
+            data = np.einsum("n,nji,njk,nkl->il", weight, jacobian, marginal, jacobian)
+            hessian = data + information + fixed
+            gradient: Array = scores.sum(0) - information @ (self.vector - self.declared)
+            gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
+            self.vector = self.vector + np.linalg.solve(hessian, gradient)
+        self._learn_scene()
+        # What is not known of the scale is not known of all that is measured by it.
+        inverse_hessian = np.linalg.inv(hessian - information + self._prior)
+        self._covariance = _wider(inverse_hessian, self._scatter(inverse_hessian, scores))
+        model = MODEL_SIGMAS.copy()
+        model[P.DELAY] = max(model[P.DELAY], DELAY_SHARE * float(np.median(np.diff(wheels.stamps))))
+        self._covariance = self._covariance + np.diag(model**2)
+        if self._floor is None:
+            self._covariance[P.WHEEL_SCALE, P.WHEEL_SCALE] = 1.0 / self._prior[P.WHEEL_SCALE, P.WHEEL_SCALE]
+        floor_tracks = self.floor_tracks if self._floor else 0
+        return Estimate(
+            self.vector.copy(),
+            self._covariance,
+            self.declared,
+            len(self.pairs),
+            floor_tracks,
+            self._keep_wheels,
+        )
+
+    def batch(self, pairs: Sequence[ImagePair], wheels: WheelTrack) -> Estimate:
+        """Estimate from many pairs at once, all reduced again in each round."""
+        self.pairs, self.informations, self.reduced_at, self._floor = [], [], [], None
+        for pair in pairs:
+            self.add(pair, wheels)
+        estimate = self.solve(wheels)
+        for _ in range(ROUNDS):
+            for index in range(len(pairs)):
+                self.refresh(index, wheels)
+            self.find_floor()
+            estimate = self.solve(wheels)
+        return estimate
+
+    def find_floor(self) -> None:
+        """Take the mode of depths below the horizon for the floor: it ties the way's scale to the height.
+
+        Nothing else is learnt from the floor: a pavement or a carpet must not bend the rest.
+        """
+        used = self.vector[P.WHEEL_SCALE] - self.vector[P.HEIGHT]
+        counts = [len(i.floor_ratios) for i in self.informations]
+        which = np.repeat(np.arange(len(counts)), counts)
+        at = np.array(self.reduced_at).reshape(-1, COUNT)
+        scales = [
+            i.floor_ratios + v[P.WHEEL_SCALE] - v[P.HEIGHT]
+            for i, v in zip(self.informations, at, strict=True)
+        ]
+        fresh = np.repeat(np.abs(at[:, P.PITCH] - self.vector[P.PITCH]) < STALE_PITCH, counts)
+        logs = np.concatenate([*scales, np.zeros(0)]) - used
+        sigmas = np.hypot(
+            np.concatenate([*(i.floor_sigmas for i in self.informations), np.zeros(0)]), FLOOR_FLAT
+        )
+        which, logs, sigmas = which[fresh], logs[fresh], sigmas[fresh]
+        self.floor_tracks = 0
+        if len(logs) < LEAST_FLOOR or len(np.unique(which // BLOCK)) < LEAST_BLOCKS:
+            self._floor = None
+            return
+        centres = np.arange(-0.6, 0.6, 0.02)
+        density = _kernel(logs - centres[:, None], sigmas, FLOOR_WIDTHS[0]).sum(1)
+        # Things stand on the floor and nothing is below it: it is where the density rises.
+        below = _kernel(logs - (centres[:, None] - 4.0 * FLOOR_WIDTHS[0]), sigmas, FLOOR_WIDTHS[0]).sum(1)
+        plausible = np.exp(-0.5 * (centres / PRIOR_SIGMAS[P.WHEEL_SCALE]) ** 2)
+        mode = centres[int(((density - below) * plausible).argmax())]
+        for width in FLOOR_WIDTHS:
+            for _ in range(10):
+                weight = _kernel(logs - mode, sigmas, width) / (width**2 + sigmas**2)
+                mode = float((weight * logs).sum() / weight.sum())
+        off = logs - mode
+        pulls = np.bincount(which // BLOCK, weight * off)
+        stiffness = (weight * (1.0 - off**2 / (width**2 + sigmas**2))).sum()
+        sigma = math.sqrt(float((pulls**2).sum())) / max(float(stiffness), 1e-9)
+        self.floor_tracks = int((np.abs(off) < 2.0 * width).sum())
+        heights = _kernel(logs - np.array([[mode], [mode - 4.0 * width]]), sigmas, width).sum(1)
+        clear = (
+            self.floor_tracks >= LEAST_FLOOR and stiffness > 0.0 and heights[0] > FLOOR_CONTRAST * heights[1]
+        )
+        self._floor = (float(used + mode), max(sigma, FLOOR_SIGMA)) if clear else None
+
+    def _jacobian(
+        self, wheels: WheelTrack, first: Array, last: Array, at: CameraMotions, off: Array
+    ) -> Array:
+        """(N, 6, 10) of the predicted motions with respect to the parameters, numeric."""
+        columns = []
+        for k in range(COUNT):
+            moved = self.vector.copy()
+            moved[k] += STEP[k]
+            if k == P.DELAY:
+                columns.append(self._delay_column(moved, wheels, first, last, at))
+                continue
+            columns.append((predict(moved, wheels, first, last).since(at) - off) / STEP[k])
+        return np.stack(columns, axis=-1)
+
+    def _delay_column(
+        self, moved: Array, wheels: WheelTrack, first: Array, last: Array, at: CameraMotions
+    ) -> Array:
+        """(N, 6) of the predicted motions with respect to the delay.
+
+        It is the change of speed from the first image to the last. That of turning is taken from the images
+        instead of from the wheels: noise of single readings would pass for the motion that shows a delay,
+        since what they add to the prediction they also add to its error.
+        """
+        smooth = wheels.smooth(DELAY_SMOOTH_S)
+        here = predict(self.vector, smooth, first, last)
+        column = (predict(moved, smooth, first, last).since(at) - here.since(at)) / STEP[P.DELAY]
+        slip = np.array([0.0, 0.0, SLIP_STEP])
+        turning = predict(self.vector, smooth, first, last, slip).since(here) / SLIP_STEP
+        span = last - first
+        still = CameraMotions(np.broadcast_to(np.eye(3), at.rotation.shape), 0.0 * at.floor, 0.0 * at.floor)
+        up = -here.floor / np.linalg.norm(here.floor, axis=1, keepdims=True)
+        seen = -(at.since(still)[:, 3:6] * up).sum(1) / span
+        reckoned = -(here.since(still)[:, 3:6] * up).sum(1) / span
+        middle, order = 0.5 * (first + last), np.argsort(first)
+        apart = (seen - reckoned)[order]
+        ends = (np.interp(t, middle[order], apart) for t in (first, last))
+        begins, finishes = ends
+        return np.asarray(column + turning * (finishes - begins)[:, None])
+
+    def _noise_basis(
+        self, vector: Array, wheels: WheelTrack, first: Array, last: Array, predicted: CameraMotions
+    ) -> tuple[Array, Array]:
+        """Directions (N, 6, 6) in which a pair errs by itself, and how their variances grow (N, 6).
+
+        Slip ahead, aside and in turning grow with the way; a vehicle pitches and rolls on its springs
+        however far it goes.
+        """
+        n = len(first)
+        basis = np.zeros((n, 6, 6))
+        for k in range(3):
+            slip = np.zeros(3)
+            slip[k] = SLIP_STEP
+            moved = predict(vector, wheels, first, last, slip)
+            basis[:, :, k] = moved.since(predicted) / SLIP_STEP
+        basis[:, 3, 3] = basis[:, 5, 4] = basis[:, 1, 5] = 1.0
+        ways, turns = wheels.between(first, last)
+        moving = np.abs(ways).sum(1) + 0.3 * np.abs(turns).sum(1) + 0.01
+        growth = np.ones((n, 6))
+        growth[:, :3] = moving[:, None]
+        growth[:, 5] = moving**2 + 1e-4
+        return basis, growth
+
+    def _noises(
+        self, vector: Array, wheels: WheelTrack, first: Array, last: Array, predicted: CameraMotions
+    ) -> Array:
+        basis, growth = self._noise_basis(vector, wheels, first, last, predicted)
+        return np.asarray(np.einsum("nik,nk,njk->nij", basis, growth * self._noise, basis))
+
+    def _learn_noise(self, basis: Array, growth: Array, slip: Array, posterior: Array, weight: Array) -> None:
+        """One step of expectation maximisation for the variances of slip and springs."""
+        solved = np.linalg.inv(basis)
+        own = np.einsum("nij,nj->ni", solved, slip)
+        spread = np.einsum("nij,njk,nik->ni", solved, posterior, solved)
+        share = (weight[:, None] * own**2 + spread) / growth
+        learned = (share.sum(0) + 5.0 * FIRST_NOISE * 0.01) / (len(share) + 5.0)
+        self._noise = np.clip(learned, 1e-4 * FIRST_NOISE, 4.0 * FIRST_NOISE)
+
+    def _learn_scene(self) -> None:
+        """How far things are, and how exactly they are followed."""
+        depths = np.array([i.inverse_depths for i in self.informations if i.tracks > 5])
+        if len(depths):
+            mean, spread = np.median(depths, axis=0)
+            self._depth = (float(mean), float(max(spread, 0.5 * mean)))
+
+    def _scatter(self, inverse_hessian: Array, scores: Array) -> Array:
+        """(10, 10) covariance by how blocks of pairs pull apart."""
+        blocks = np.add.reduceat(scores, np.arange(0, len(scores), BLOCK))
+        prior = inverse_hessian @ self._prior @ inverse_hessian
+        return np.asarray(inverse_hessian @ (blocks.T @ blocks) @ inverse_hessian + prior)
+
+
+def _weights(cost: Array) -> Array:
+    """(N,) of pairs by what their slip costs: what others do not bear out counts less.
+
+    What even slip does not explain is what tracks refuse, and these have weights of their own.
+    """
+    return np.asarray((STUDENT + 6.0) / (STUDENT + np.maximum(cost, 0.0) + 4.0))
+
+
+def _kernel(off: Array, sigmas: Array, width: float) -> Array:
+    """Weights of ratios at a distance from the mode."""
+    variance = width**2 + sigmas**2
+    return np.asarray(np.exp(-0.5 * off**2 / variance) / np.sqrt(variance))
+
+
+def _wider(one: Array, other: Array) -> Array:
+    """The first covariance with each sigma at least that of the second; its correlations stay."""
+    ratio = np.sqrt(np.maximum(np.diag(other) / np.diag(one), 1.0))
+    return np.asarray(one * np.outer(ratio, ratio))

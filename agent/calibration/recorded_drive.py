@@ -1,0 +1,104 @@
+"""Calibration from a whole drive: image pairs, wheels, and whether the drive is one to learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapweave.agent.calibration.camera_motions import WheelTrack, predict
+from mapweave.agent.calibration.correction import geometry_of
+from mapweave.agent.calibration.estimator import Estimate, Estimator
+from mapweave.agent.calibration.image_pairs import ImagePairs, sigma_of
+from mapweave.agent.calibration.pair_information import ImagePair
+from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array
+from mapweave.vision.lens import Lens
+
+FEWEST_PAIRS = 20
+LEAST_S = 10.0
+"""Of driving, s; half a minute is better."""
+LEAST_TURN = 0.5
+"""rad, either way, in all."""
+HELD_OUT = 4
+"""Each so-manieth pair is held out of the estimate that is checked on it."""
+
+
+@dataclass(frozen=True)
+class DriveCalibration:
+    """What a drive shows.
+
+    Attributes:
+        estimate: from all pairs.
+        declared_px: median distance by which the wheels, with the declared geometry, misplace far points in
+            the second images of pairs that were held out, px.
+        estimated_px: the same with what the other pairs show.
+    """
+
+    estimate: Estimate
+    declared_px: float
+    estimated_px: float
+
+
+def calibrate(
+    description: RobotDescription, observations: Iterable[Observation], keep_wheels: bool = False
+) -> DriveCalibration:
+    """Estimate the geometry of a robot.
+
+    Args:
+        description: what it declares.
+        observations: of the drive, in order.
+        keep_wheels: hold the wheels' scale instead of the height.
+
+    Raises:
+        InvalidValue: the drive is too short, or never turns; one line says so.
+    """
+    camera = description.camera
+    lens = Lens(camera, description.distortion)
+    images = ImagePairs(camera, Lens(camera) if lens.rectifies else lens)
+    stamps, ways, turns = list[float](), list[float](), list[float]()
+    pairs = []
+    for observation in observations:
+        stamps.append(1e-9 * observation.stamp_ns)
+        ways.append(observation.odometry.forward)
+        turns.append(observation.odometry.turn)
+        if observation.image is not None:
+            pair = images.step(stamps[-1], lens.rectified(observation.image))
+            if pair is not None:
+                pairs.append(pair)
+    driven = sum(pair.last_s - pair.first_s for pair in pairs)
+    if len(pairs) < FEWEST_PAIRS or driven < LEAST_S:
+        raise InvalidValue(
+            f"too short: {driven:.0f} s in which the robot moves and points can be followed; "
+            "drive for half a minute, with turns to both sides, where there is something to see"
+        )
+    turned = float(np.abs(turns).sum())
+    if turned < LEAST_TURN:
+        raise InvalidValue(
+            f"the drive turns by {np.degrees(turned):.0f} degrees in all, and only turns show where the "
+            "camera stands; drive curves to both sides"
+        )
+    wheels = WheelTrack(np.array(stamps), np.cumsum([0.0, *ways[1:]]), np.cumsum([0.0, *turns[1:]]))
+    declared, sigma = geometry_of(description), sigma_of(camera)
+    held = pairs[HELD_OUT - 1 :: HELD_OUT]
+    others = [pair for k, pair in enumerate(pairs) if k % HELD_OUT != HELD_OUT - 1]
+    part = Estimator(declared, sigma, keep_wheels)
+    trained = part.batch(others, wheels)
+    misses = (_miss(part, held, wheels, v) for v in (declared.vector, trained.usable.vector))
+    before, after = (camera.fx * miss for miss in misses)
+    return DriveCalibration(Estimator(declared, sigma, keep_wheels).batch(pairs, wheels), before, after)
+
+
+def _miss(estimator: Estimator, pairs: list[ImagePair], wheels: WheelTrack, vector: Array) -> float:
+    """Median angle between where the wheels expect a point ahead of typical depth and where it is, rad."""
+    estimator.vector = vector
+    misses = []
+    for pair in pairs:
+        seen = estimator.add(pair, wheels)
+        predicted = predict(vector, wheels, np.array([pair.first_s]), np.array([pair.last_s]))
+        off = predicted.since(seen.at[None])[0]
+        rho = seen.inverse_depths[0]
+        misses.append(np.hypot(off[4] + rho * off[0], -off[3] + rho * off[1]))
+    return float(np.median(misses))

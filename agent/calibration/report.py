@@ -1,0 +1,108 @@
+"""Estimates in words: a table, and which parameter is likely to be declared wrongly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapweave.agent.calibration.estimator import USEFUL_SIGMAS, Estimate
+from mapweave.agent.drive_geometry import Parameter
+from mapweave.hybridmap.pose import Array
+
+P = Parameter
+SIGNIFICANT = 3.5
+"""Sigmas from the declared value at which a parameter is declared wrongly."""
+NAMES = {
+    P.WHEEL_SCALE: "wheel scale", P.TURN_SCALE: "turn scale", P.DRIFT: "drift, deg/m",
+    P.FORWARD: "camera forward, m", P.LEFT: "camera left, m", P.HEADING: "camera heading, deg",
+    P.PITCH: "camera pitch, deg", P.ROLL: "camera roll, deg", P.HEIGHT: "camera height, m",
+    P.DELAY: "delay, s",
+}  # fmt: skip
+LOGARITHMIC = (P.WHEEL_SCALE, P.TURN_SCALE, P.HEIGHT)
+ANGLES = (P.DRIFT, P.HEADING, P.PITCH, P.ROLL)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A parameter that is declared wrongly.
+
+    Attributes:
+        parameter: which.
+        declared: value in people's units.
+        estimated: likewise.
+        sigma: of the estimate, likewise.
+        sigmas: how many sigmas the two are apart.
+    """
+
+    parameter: Parameter
+    declared: float
+    estimated: float
+    sigma: float
+    sigmas: float
+
+    def __str__(self) -> str:
+        """One line."""
+        d, e = self.declared, self.estimated
+        times = e / d if self.parameter in LOGARITHMIC else 1.0
+        texts = {
+            P.WHEEL_SCALE: f"the floor moves as if the wheels went {times:.3f} times as far as they report "
+            "(or the camera were lower by as much)",
+            P.TURN_SCALE: f"in turns the image turns {times:.3f} times as far as the wheels report: axle or "
+            "wheel sizes",
+            P.DRIFT: f"driving ahead, the image turns by {e - d:+.2f} deg/m that the wheels do not report: "
+            "one wheel is larger",
+            P.FORWARD: f"in turns the image moves as if the camera were {e:.2f} m ahead of the axle; "
+            f"declared {d:.2f}",
+            P.LEFT: f"in turns the image moves as if the camera were {e:.2f} m left of the axle's middle; "
+            f"declared {d:.2f}",
+            P.HEADING: f"driving ahead, the image moves as if the camera looked {e:.1f} deg to the left; "
+            f"declared {d:.1f}",
+            P.PITCH: f"driving ahead, the image moves as if the camera looked {e:.1f} deg down; "
+            f"declared {d:.1f}",
+            P.ROLL: f"in turns the image moves as if the camera were rolled by {e:.1f} deg; declared {d:.1f}",
+            P.HEIGHT: f"the floor moves as if the camera were {e:.2f} m high; declared {d:.2f}",
+            P.DELAY: f"where turns begin and end the wheels are {1e3 * (e - d):+.0f} ms late to the images",
+        }
+        return f"{texts[self.parameter]}; run `mapweave calibrate drive`"
+
+
+def readable(vector: Array) -> Array:
+    """(10,) parameters in people's units: shares, m, degrees, s."""
+    values = vector.copy()
+    for p in LOGARITHMIC:
+        values[p] = math.exp(vector[p])
+    for p in ANGLES:
+        values[p] = math.degrees(vector[p])
+    return values
+
+
+def readable_sigmas(estimate: Estimate) -> Array:
+    """(10,) sigmas in people's units."""
+    sigmas = estimate.sigmas.copy()
+    for p in LOGARITHMIC:
+        sigmas[p] *= math.exp(estimate.vector[p])
+    for p in ANGLES:
+        sigmas[p] = math.degrees(sigmas[p])
+    return sigmas
+
+
+def causes(estimate: Estimate, declared: Array | None = None) -> list[Cause]:
+    """Which parameters that the drive shows are declared wrongly, the surest first.
+
+    Args:
+        estimate: of the drive.
+        declared: (10,) instead of what the estimate began with.
+    """
+    declared = estimate.declared if declared is None else declared
+    off = np.abs(estimate.vector - declared)
+    useful = np.array([USEFUL_SIGMAS[p] for p in P])
+    wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > useful)
+    value, was, sigma = readable(estimate.vector), readable(declared), readable_sigmas(estimate)
+    found = [
+        Cause(p, float(was[p]), float(value[p]), float(sigma[p]), float(off[p] / estimate.sigmas[p]))
+        for p in P
+        if wrong[p]
+    ]
+    return sorted(found, key=lambda cause: -cause.sigmas)

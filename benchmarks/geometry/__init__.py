@@ -1,0 +1,1 @@
+"""What a wrongly declared geometry costs a map."""

@@ -1,0 +1,178 @@
+"""`mapweave calibrate drive`: where the camera stands, and how wheels and clock are scaled, from a drive."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.agent import add_calibration, calibration_of, close_on, open_robot
+from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.replay import add_recording, name_of, options_of
+
+if TYPE_CHECKING:
+    from mapweave.agent.calibration.estimator import Estimate
+    from mapweave.agent.calibration.recorded_drive import DriveCalibration
+    from mapweave.agent.observation import Observation, RobotDescription
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "drive",
+        help="mount, wheels and delay, from half a minute of driving",
+        description="Estimate the wheels' scales, the camera's mount and the delay between camera and wheels "
+        "from a drive, each with its standard deviation and whether the drive shows it, and keep them under "
+        "the robot's name for `mapweave agent` and `mapweave replay`. Drive for half a minute, with turns to "
+        "both sides. The drive is a recording, or with --robot what a robot senses now; it gets no commands.",
+    )
+    add_recording(parser, optional=True)
+    parser.add_argument(
+        "--robot", metavar="NAME|DRIVER",
+        help="of a recording: one of the robots in its splits.toml; without one: the driver, as for `agent`",
+    )  # fmt: skip
+    parser.add_argument("--name", help="the robot's name in the fleet (default: as `replay` names it)")
+    parser.add_argument(
+        "--seconds", type=float, default=40.0, metavar="S", help="how long to watch a robot (default: 40)"
+    )
+    parser.add_argument(
+        "--keep-wheels", action="store_true",
+        help="the declared wheel scale is right: estimate the camera's height (default: the other way round)",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
+    add_calibration(parser)
+    add_network(parser)
+    parser.set_defaults(run=run, body=None)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate, print, write."""
+    import os
+
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import cv2
+    from rich.console import Console
+
+    from mapweave.agent.calibration.recorded_drive import calibrate
+    from mapweave.agent.recordings.geometry_file import write_geometry
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.processes.agent import measured
+
+    if arguments.recording is None and not (arguments.robot and arguments.name):
+        raise InvalidValue("give a recording, or --robot DRIVER and --name NAME of a robot")
+    cv2.setNumThreads(1)
+    name = name_of(arguments)
+    file = calibration_of(arguments, name)
+    console = Console(stderr=arguments.json)
+    drive = _recorded if arguments.recording is not None else _live
+    description, observations = drive(arguments, name, console)
+    try:
+        found = calibrate(measured(description, file), observations, arguments.keep_wheels)
+    except InvalidValue as error:
+        print(f"mapweave: {arguments.recording or name}: {error}", file=sys.stderr)
+        return 1
+    notes = _print(console, found)
+    worse = found.estimated_px > found.declared_px
+    if worse:
+        console.print("The declared geometry predicts the pairs held out better: nothing is written.")
+    else:
+        write_geometry(file, found.estimate.usable, notes)
+        console.print(f"Written to {file}: `mapweave agent {name}` and `mapweave replay` use it.")
+    if arguments.json:
+        print(json.dumps(_figures(found, written=not worse)))
+    return 0
+
+
+def _recorded(
+    arguments: argparse.Namespace, name: str, console: Any
+) -> tuple[RobotDescription, Iterator[Observation]]:
+    """A recording."""
+    from rich.progress import track
+
+    from mapweave.agent.drivers.replay import Replay
+
+    robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
+    observed = iter(robot.sense, None)
+    shown = track(observed, name, total=len(robot), console=console, transient=True)
+    return robot.describe(), iter(shown)
+
+
+def _live(
+    arguments: argparse.Namespace, name: str, console: Any
+) -> tuple[RobotDescription, Iterator[Observation]]:
+    """What a robot senses from now on, for some seconds."""
+    import threading
+
+    from mapweave.agent.drivers.checked import CheckedRobot
+
+    settings = settings_of(arguments)
+    network = network_of(arguments, settings)
+    stop = stop_on_signals()
+    bus, _ = connect(network)
+    opened, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
+    threading.Thread(target=close_on, args=(stop, opened), name="stop", daemon=True).start()
+    robot = CheckedRobot(opened)
+
+    def observations() -> Iterator[Observation]:
+        began = 0
+        try:
+            with console.status(f"{name}: drive it now, with turns to both sides") as status:
+                while (observation := robot.sense()) is not None and not stop.is_set():
+                    began = began or observation.stamp_ns
+                    passed = 1e-9 * (observation.stamp_ns - began)
+                    status.update(f"{name}: {passed:.0f} of {arguments.seconds:.0f} s; turn to both sides")
+                    yield observation
+                    if passed >= arguments.seconds:
+                        break
+        finally:
+            opened.close()
+            bus.close()
+
+    return robot.describe(), observations()
+
+
+def _print(console: Any, found: DriveCalibration) -> dict[str, str]:
+    """Print a table of an estimate and what it finds wrong; returns a comment by field."""
+    from rich.table import Table
+
+    from mapweave.agent.calibration.report import NAMES, causes, readable, readable_sigmas
+    from mapweave.agent.drive_geometry import Parameter
+
+    estimate, notes = found.estimate, {}
+    declared, value, sigma = readable(estimate.declared), readable(estimate.vector), readable_sigmas(estimate)
+    table = Table("parameter", "declared", "estimated", "sigma", "shown by this drive")
+    for p in Parameter:
+        shown = bool(estimate.shown[p])
+        table.add_row(
+            NAMES[p], f"{declared[p]:.3f}", f"{value[p]:.3f}", f"{sigma[p]:.3f}", "yes" if shown else "no"
+        )
+        notes[p.name.lower()] = f"sigma {sigma[p]:.2g}" if shown else "as declared, not shown by the drive"
+    console.print(table)
+    console.print(
+        f"{estimate.pairs} image pairs, {estimate.floor_tracks} points on the floor. Points in pairs "
+        f"that were held out are {found.declared_px:.2f} px off as declared, "
+        f"{found.estimated_px:.2f} px as estimated.",
+        soft_wrap=True,
+    )
+    for cause in causes(estimate):
+        console.print(str(cause).removesuffix("; run `mapweave calibrate drive`"), soft_wrap=True)
+    return notes
+
+
+def _figures(found: DriveCalibration, written: bool) -> dict[str, object]:
+    from mapweave.agent.calibration.report import readable, readable_sigmas
+    from mapweave.agent.drive_geometry import Parameter
+
+    estimate: Estimate = found.estimate
+    columns = {
+        "declared": readable(estimate.declared).tolist(), "estimated": readable(estimate.vector).tolist(),
+        "sigma": readable_sigmas(estimate).tolist(), "shown": estimate.shown.tolist(),
+    }  # fmt: skip
+    return {
+        "parameters": {p.name.lower(): {key: columns[key][p] for key in columns} for p in Parameter},
+        "declared_px": found.declared_px,
+        "estimated_px": found.estimated_px,
+        "written": written,
+    }

@@ -1,0 +1,87 @@
+"""Camera motions by the wheels: against points that are projected by hand, and their small steps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mapweave.agent.calibration.camera_motions import (
+    CameraMotions,
+    WheelTrack,
+    predict,
+    robot_from_camera,
+    rotations,
+)
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
+
+TRUE = DriveGeometry(1.04, 0.97, 0.01, 0.3, -0.1, 0.05, 0.12, -0.03, 0.4, 0.03)
+
+
+def motion(rng: np.random.Generator) -> CameraMotions:
+    """Any motion."""
+    return CameraMotions(
+        rotations(rng.normal(0.0, 0.5, (3, 3))), rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
+    )
+
+
+def test_a_vector_is_a_geometry():
+    again = DriveGeometry.of(TRUE.vector)
+    assert np.allclose(again.vector, TRUE.vector, atol=1e-15)
+    assert math.isclose(math.exp(TRUE.vector[Parameter.HEIGHT]), 0.4)
+
+
+@given(arrays(np.float64, (3, 6), elements=st.floats(-0.6, 0.6)), st.integers(0, 1000))
+@settings(max_examples=50, deadline=None)
+def test_steps_are_undone(step: np.ndarray, seed: int):
+    at = motion(np.random.default_rng(seed))
+    assert np.allclose(at.stepped(step).since(at), step, atol=1e-9)
+
+
+def test_the_mount_has_its_signs():
+    """To the left, down, right side low."""
+    ahead, right = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+    assert (robot_from_camera(0.1, 0.0, 0.0) @ ahead)[1] > 0.09
+    assert (robot_from_camera(0.0, 0.1, 0.0) @ ahead)[2] < -0.09
+    assert (robot_from_camera(0.0, 0.0, 0.1) @ right)[2] < -0.09
+    assert np.allclose(robot_from_camera(0.0, 0.0, 0.0) @ right, [0.0, -1.0, 0.0])
+
+
+def test_points_are_seen_where_the_motion_says():
+    """A robot on a circle at constant speeds: the pose in closed form, points transformed one by one."""
+    speed, rate = 0.4, 0.5
+    stamps = np.arange(0.0, 5.0, 0.05)
+    reported = WheelTrack(
+        stamps, speed * stamps / TRUE.wheel_scale, (rate - TRUE.drift * speed) * stamps / TRUE.turn_scale
+    )
+    first, last = np.array([1.0]), np.array([1.9])
+    predicted = predict(TRUE.vector, reported, first, last)
+    mount = robot_from_camera(TRUE.heading, TRUE.pitch, TRUE.roll)
+    centre = np.array([TRUE.forward, TRUE.left, TRUE.height])
+    world = np.array([[2.0, 0.5, 0.0], [3.0, -1.0, 1.0], [1.5, 1.0, 0.0]])
+    seen = []
+    for t in (first[0], last[0]):
+        turned = rate * t
+        at = speed / rate * np.array([math.sin(turned), 1.0 - math.cos(turned), 0.0])
+        robot = np.array(
+            [[math.cos(turned), -math.sin(turned), 0], [math.sin(turned), math.cos(turned), 0], [0, 0, 1]]
+        )
+        seen.append(((world - at) @ robot - centre) @ mount)
+    before, after = seen
+    there = before @ predicted.rotation[0].T + predicted.translation[0]
+    assert np.allclose(there, after, atol=2e-4)
+    on_floor = world[:, 2] == 0.0
+    normalised = before / before[:, 2:]
+    assert np.allclose((normalised @ predicted.floor[0])[on_floor], 1.0 / before[on_floor, 2])
+
+
+def test_a_smooth_track_goes_as_far():
+    rng = np.random.default_rng(0)
+    stamps = np.arange(0.0, 10.0, 0.1)
+    noisy = WheelTrack(stamps, 0.3 * stamps + 0.001 * rng.normal(size=100).cumsum(), 0.1 * stamps)
+    smooth = noisy.smooth(0.5)
+    assert abs((smooth.way[80] - smooth.way[20]) - (noisy.way[80] - noisy.way[20])) < 0.01
+    assert np.allclose(smooth.turn[10:90], noisy.turn[10:90])

@@ -1,0 +1,112 @@
+"""`mapweave calibrate drive` on rendered drives; `replay` takes what it has written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
+from mapweave.agent.recordings.geometry_file import read_geometry
+from mapweave.cli import main
+from synthetic.room_drive import CAMERA, drive, write
+from tests.mapweave.command_line import complaint
+
+SMALL = replace(CAMERA, width=160, height=120, fx=138.5, fy=138.5, cx=79.5, cy=59.5)
+TRUE = DriveGeometry(forward=0.3, heading=0.04, height=0.25)
+DECLARED = {"forward_m = 0.3": "forward_m = 0.08"}
+OWN_ROBOT = """\
+from pathlib import Path
+from mapweave.agent.drivers.replay import Replay
+
+class Recorded(Replay):
+    def __init__(self, settings):
+        super().__init__(Path({folder!r}))
+"""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """14 s in small images; the camera is 22 cm further ahead than declared, and looks 2.3 degrees aside."""
+    folder = tmp_path_factory.mktemp("recordings") / "Room-1"
+    write(drive(np.random.default_rng(0), TRUE, 14.0, camera=SMALL), folder)
+    text = (folder / "camera.toml").read_text()
+    for true, declared in DECLARED.items():
+        assert true in text
+        text = text.replace(true, declared)
+    (folder / "camera.toml").write_text(text)
+    return folder
+
+
+@pytest.fixture
+def folder(recording: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    return Path(shutil.copytree(recording, tmp_path / "Room-1"))
+
+
+def calibrated(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    """Figures of a calibration that succeeds."""
+    assert main(["calibrate", "drive", *map(str, arguments), "--json"]) == 0
+    figures: dict[str, Any] = json.loads(capfd.readouterr().out.splitlines()[-1])
+    return figures
+
+
+def test_a_drive_is_calibrated_under_the_robots_name(
+    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    figures = calibrated(capfd, recording, "--calibration", tmp_path)
+    parameters = figures["parameters"]
+    assert set(parameters) == {p.name.lower() for p in Parameter}
+    truth = {"forward": TRUE.forward, "heading": np.degrees(TRUE.heading), "pitch": 0.0, "delay": 0.0}
+    for name, true in truth.items():
+        found = parameters[name]
+        assert found["shown"], name
+        assert abs(found["estimated"] - true) < 3.0 * found["sigma"], name
+    assert parameters["forward"]["declared"] == pytest.approx(0.08)
+    assert figures["written"]
+    assert figures["estimated_px"] < figures["declared_px"]
+    written = read_geometry(tmp_path / "room-1.toml")
+    assert written["forward"] == pytest.approx(parameters["forward"]["estimated"], rel=1e-4)
+    # What replay is given by that name it must read.
+    (tmp_path / "room-1.toml").write_text("pitch_deg = 80")
+    line = complaint(
+        capfd, "replay", recording, "--offline", "--data", tmp_path / "maps", "--calibration", tmp_path
+    )
+    assert "pitch_deg is 80" in line
+
+
+def test_a_robot_is_watched_while_it_is_driven(
+    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    driver = tmp_path / "own.py"
+    driver.write_text(OWN_ROBOT.format(folder=str(recording)))
+    robot = f"{driver}:Recorded"
+    # A later calibration begins with what an earlier one has found.
+    (tmp_path / "r7.toml").write_text("forward_m = 0.2\nheading_deg = 2.0\n")
+    given = ["--robot", robot, "--name", "r7", "--calibration", tmp_path, "--seconds", 13]
+    forward = calibrated(capfd, *given)["parameters"]["forward"]
+    assert forward["declared"] == pytest.approx(0.2)
+    assert forward["estimated"] == pytest.approx(TRUE.forward, abs=0.06)
+    assert read_geometry(tmp_path / "r7.toml")["forward"] == pytest.approx(forward["estimated"], rel=1e-4)
+    assert "too short" in complaint(capfd, "calibrate", "drive", *given[:-1], 3)
+
+
+def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    command = ["calibrate", "drive", folder, "--calibration", tmp_path]
+    assert "--robot DRIVER" in complaint(capfd, "calibrate", "drive")
+    assert "--name" in complaint(capfd, "calibrate", "drive", "--robot", "koala")
+    assert "nowhere" in complaint(capfd, "calibrate", "drive", tmp_path / "nowhere")
+    odometry = (folder / "odometry.csv").read_text()
+    lines = [line.split(",") for line in odometry.splitlines()]
+    straight = [",".join([*line[:-1], "0" if k else line[-1]]) for k, line in enumerate(lines)]
+    (folder / "odometry.csv").write_text("\n".join(straight) + "\n")
+    assert "turns by 0 degrees" in complaint(capfd, *command)
+    (folder / "odometry.csv").write_text(odometry)
+    (folder / "splits.toml").write_text('[[robot]]\nname = "a"\nfirst = 0\nlast = 40\n')
+    assert "too short" in complaint(capfd, *command, "--robot", "a")
+    assert not list(tmp_path.glob("*.toml"))
