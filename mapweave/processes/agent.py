@@ -141,8 +141,7 @@ class Agent:
         self._options = options
         self._on_step = on_step
         self._causes = 0
-        self._print = print_line
-        self._server_watch = ServerWatch(options.server)
+        self._print, self._server_watch = print_line, ServerWatch(options.server)
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
