@@ -176,7 +176,8 @@ class CameraOccupancyGrid(OccupancyGrid):
         start = np.array([map_from_robot.x, map_from_robot.y])
         way = along[:, None] * np.array([math.cos(angle), math.sin(angle)])
         cells = self.cells(start + way[:, None] + rim)
-        return float(_first((~self._free)[cells[..., 0], cells[..., 1]].any(axis=1)[None], along, reach)[0])
+        unknown = np.asarray(np.any(~self._free[cells[..., 0], cells[..., 1]], axis=1))
+        return float(_first(unknown[np.newaxis], along, reach)[0])
 
     def room(self) -> Array:
         """For each cell the distance to the nearest thing seen or touched, m."""

@@ -84,7 +84,7 @@ class FleetClient:
         self._asker.start()
 
     def driven(self) -> Driven | None:
-        """The command of a person who drives the robot now; None where nobody does."""
+        """The command of a person who drives the robot now; None where no person does."""
         return self._teleoperation.driven()
 
     def server_in_reach(self) -> bool:
@@ -179,7 +179,7 @@ class FleetClient:
 
     def _answer(self, question: Question) -> Answer:
         try:
-            key, payload = encode_query(self._keys, question)
+            key, payload = encode_query(self._keys, question, self._agent)
         except InvalidValue as unspeakable:
             return Answer(question.number, None, str(unspeakable))
         replies = self._bus.ask(key, payload, self._timeout)

@@ -179,7 +179,7 @@ class Pipeline:
         Args:
             observation: what the robot senses now.
             answers: to questions of earlier steps.
-            driven: a person's command, which comes before the mission's; None where nobody drives.
+            driven: a person's command, which comes before the mission's; None where no person drives.
         """
         command, questions = Command(), list[Question]()
         if self._fisheye.rectifies and observation.image is not None:

@@ -24,7 +24,7 @@ class Teleoperation:
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
-        """Nobody drives.
+        """No person drives.
 
         Args:
             clock: ns, of this process alone.
@@ -59,7 +59,7 @@ class Teleoperation:
             self._session = None
 
     def driven(self) -> Driven | None:
-        """The command that holds now; None where nobody drives."""
+        """The command that holds now; None where no person drives."""
         with self._lock:
             if self._session is None:
                 return None

@@ -25,6 +25,8 @@ from mapweave.hybridmap.query import (
     KnownAnswer,
     KnownRequest,
     RelocalizeAnswer,
+    ReserveAnswer,
+    ReserveRequest,
     RouteAnswer,
     RouteRequest,
     View,
@@ -61,6 +63,8 @@ LIMITS: dict[type, Limit] = {
     RouteRequest: Limit("route request", 2**16),
     # 16 kB a leg; a node takes about 3 kB.
     RouteAnswer: Limit("route", 2**23),
+    ReserveRequest: Limit("reserve request", 2**16),
+    ReserveAnswer: Limit("reservation", 2**14),
     KnownRequest: Limit("known request", 256),
     KnownAnswer: Limit("known", 16 * MAX_KNOWN + 2**13),
     ExplainRequest: Limit("explain request", 2**16),

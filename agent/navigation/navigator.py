@@ -22,6 +22,7 @@ from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.navigation.blocked_edges import BlockedEdges
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.right_of_way import RightOfWay
 from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteProgress
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
@@ -44,6 +45,8 @@ class Stage(StrEnum):
     ASKING = "asking for a route"
     BLOCKED = "waiting at an obstacle"
     WAITING = "waiting for a route"
+    YIELDING = "waiting for another robot"
+    ASIDE = "stepping aside for another robot"
     ARRIVED = "parked at the goal"
     GIVEN_UP = "gave up its goal"
 
@@ -59,6 +62,10 @@ PAUSE = 2.0
 """How long it waits before what is in its way, and before it asks again for a route, s."""
 REFUSED = 20.0
 """A fleet that answers for so long that there is no way is believed, s: it may first have to merge."""
+YIELDED = 30.0
+"""How long it waits for another robot before it looks for another way, s."""
+THERE = 0.3
+"""It has stepped aside within this distance of the node, m."""
 TRUSTED = 1.0
 """After a block it still knows where it is if it has driven less than this blindly, m."""
 
@@ -122,6 +129,7 @@ class Navigator:
         self._driven: set[tuple[NodeId, NodeId]] = set()
         self._progressed_at = 0.0
         self._refusing = False
+        self._aside: NodeId | None = None
         self._trouble = "it does not know where it is"
         self._behaviour = self._go()
 
@@ -176,12 +184,14 @@ class Navigator:
             if self.fix is None:
                 yield from self._find()
             assert self.fix is not None, "the search ends with a fix"
-            route = yield from self._get_route(self.fix)
+            route = yield from self._get_route(self.fix, self.goal)
             if (undriven := self._undriven(route)) is not None:
                 self._blocks.add(*undriven, self._motion.now)
             elif route:
                 self._refused_since = None
                 yield from self._follow(route, self.fix)
+                if self._aside is not None and self.fix is not None:
+                    yield from self._step_aside(self.fix, self._aside)
             else:
                 yield from self._wait_for_a_way()
         yield from self._stand()
@@ -219,16 +229,16 @@ class Navigator:
             )  # fmt: skip
             self.fix = Fix.of(localizer)
 
-    def _get_route(self, fix: Fix) -> Generator[Command, None, tuple[RouteLeg, ...]]:
+    def _get_route(self, fix: Fix, goal: NodeId) -> Generator[Command, None, tuple[RouteLeg, ...]]:
         """Ask the fleet's map; without an answer use the own map."""
         self.stage = Stage.ASKING
         node_from_robot, blocked = fix.node_from_robot.mean, self._blocks.at(self._motion.now)
-        question = WhichWay(self._motion.number(), fix.node, self.goal, node_from_robot, blocked)
+        question = WhichWay(self._motion.number(), fix.node, goal, node_from_robot, blocked)
         answer = yield from self._motion.ask(question)
         content, trouble = answer.content, ""
         if not isinstance(content, RouteAnswer):
             trouble = f"{answer.error or 'no answer'}; "
-            content = onboard_route(self._own_map, fix.node, self.goal, blocked)
+            content = onboard_route(self._own_map, fix.node, goal, blocked)
         self.detail = f"{trouble}{content.reason}"
         if not content.legs:
             self._trouble = self.detail
@@ -255,14 +265,20 @@ class Navigator:
             self._give_up(self._trouble)
         yield from self._motion.stand(PAUSE)
 
-    def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
-        """Follow a route until it is driven, or blocked, or the robot is lost."""
-        follower = RouteFollower(
+    def _follower(self, route: tuple[RouteLeg, ...], fix: Fix) -> RouteFollower:
+        return RouteFollower(
             self._description, self._lens, self._sift, route, fix, self._local_planner,
             self._settings, self._rng,
         )  # fmt: skip
+
+    def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
+        """Follow a route until it is driven, or blocked, or the robot is lost."""
+        follower = self._follower(route, fix)
+        right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
         self._following, self._touched = True, ""
         while True:
+            if not (yield from self._let_pass(right_of_way, follower)):
+                return
             leg = follower.leg
             if follower.blocked not in self._driven:
                 self._driven.add(follower.blocked)
@@ -299,6 +315,41 @@ class Navigator:
                 # By landmarks seen a moment ago it is at the goal, yet it sees none of the goal's landmarks.
                 self._goal_hidden = follower.fix.blind < self._settings.navigation.blind_distance
                 yield from self._relocalize()
+
+    def _let_pass(self, right_of_way: RightOfWay, follower: RouteFollower) -> Generator[Command, None, bool]:
+        """Stand while another robot holds the way ahead; returns whether to go on then."""
+        began, self._following, go_on = self._motion.now, False, True
+        while go_on and not right_of_way.may_drive(follower.leg, follower.fix):
+            if right_of_way.holder:
+                self.stage, self.detail = Stage.YIELDING, f"{right_of_way.holder} drives there"
+                self._trouble = f"{right_of_way.holder} is in the way"
+            self._aside = right_of_way.aside
+            go_on = self._aside is None
+            if go_on and self._motion.now - began > YIELDED:
+                # It is stuck, or stands there: another way may be free.
+                self._blocks.add(*follower.blocked, self._motion.now)
+                go_on = False
+            if go_on:
+                yield Command()
+        self._following = go_on
+        return go_on
+
+    def _step_aside(self, fix: Fix, node: NodeId) -> Behaviour:
+        """Drive to a node off another robot's way; then the way to the goal is asked for again."""
+        self._aside = None
+        route = yield from self._get_route(fix, node)
+        if not route:
+            yield from self._motion.stand(PAUSE)
+            return
+        follower = self._follower(route, fix)
+        right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
+        while follower.to_goal > THERE and follower.progress is RouteProgress.DRIVING:
+            if not (yield from self._let_pass(right_of_way, follower)):
+                return
+            command = follower.step(self._motion.observation)
+            self.fix, self.stage, self.detail = follower.fix, Stage.ASIDE, follower.detail
+            yield command
+        self._following = False
 
     def _report_block(self, a: NodeId, b: NodeId) -> Behaviour:
         """Something is in the way: report it, wait, then plan another route."""

@@ -50,14 +50,14 @@ class Session:
         self._bus, self._keys, self._name = bus, keys, name
         self._number = secrets.randbits(52)
         self._shares = (0.0, 0.0)
-        self._wake = threading.Event()
+        self._changed = threading.Event()
         self._closing = False
         self._sender = threading.Thread(target=self._send_all, name="commands", daemon=True)
         end = time.monotonic() + FIRST
         while self.answer is None and not self.refused:
             self._send(FIRST)
             if self.answer is None and time.monotonic() >= end:
-                raise DeviceError(self._nobody())
+                raise DeviceError(self._unreached())
         if self.refused:
             raise DeviceError(f"{name}: {self.refused}")
 
@@ -71,7 +71,7 @@ class Session:
     ) -> None:
         """Give the wheels back."""
         self._closing = True
-        self._wake.set()
+        self._changed.set()
         self._sender.join()
 
     def want(self, forward: float, turn: float) -> None:
@@ -79,7 +79,7 @@ class Session:
         changed = (forward, turn) != self._shares
         self._shares = forward, turn
         if changed:
-            self._wake.set()
+            self._changed.set()
 
     @property
     def command(self) -> Command:
@@ -91,10 +91,10 @@ class Session:
 
     def _send_all(self) -> None:
         while not self._closing and not self.refused:
-            self._wake.clear()
+            self._changed.clear()
             began = time.monotonic()
             self._send(DEAD_MAN)
-            self._wake.wait(max(began + PERIOD - time.monotonic(), 0.0))
+            self._changed.wait(max(began + PERIOD - time.monotonic(), 0.0))
         if not self.refused:
             self._send(DEAD_MAN, release=True)
 
@@ -111,7 +111,7 @@ class Session:
             except MapweaveError as error:
                 self.refused = str(error)
 
-    def _nobody(self) -> str:
+    def _unreached(self) -> str:
         """That the agent does not answer, and who is there."""
         there: set[str] = set()
 

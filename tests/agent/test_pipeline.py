@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import Lens
 from mapweave.wire.codec import encode_body
 from tests.agent.ranged_body import BEARINGS, BODY, MAP, ROOM, essence, live, on, rangers, still
 
@@ -55,6 +58,19 @@ def test_the_same_observations_give_the_same_steps(drive):
         assert essence(again.step(observation)) == essence(step)
     assert sum(len(step.changes) for step in steps) >= 3
     assert len({step.command for step in steps}) > 10
+
+
+def test_behind_a_fisheye_the_camera_is_a_pinhole(drive):
+    observations, _, _ = drive
+    lens = Equidistant(115.0, 115.4, 158.6, 120.9, (-0.02, 0.004, -0.003, 0.0005))
+    ideal = lens.ideal(320, 240, 0.3)
+    fisheye = on(Carried(), body=replace(BODY, camera=ideal, distortion=lens))
+    pinhole = on(Carried(), body=replace(BODY, camera=ideal))
+    for observation in observations[:40]:
+        image = Lens(ideal, lens).rectified(observation.image)
+        step = fisheye.step(observation)
+        assert essence(step) == essence(pinhole.step(replace(observation, image=image)))
+    assert step.status.tracked > 10
 
 
 def test_observations_are_not_modified(drive):

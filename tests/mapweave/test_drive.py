@@ -177,7 +177,7 @@ def test_a_robot_is_driven_by_a_gamepad_and_a_second_person_is_refused(
 
 @needs_simulator
 def test_who_is_not_there_is_named_in_one_line(
-    network: tuple[list[str], SimControl], nobody: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    network: tuple[list[str], SimControl], closed: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     arguments, _ = network
     person = Person("r7", *arguments)
@@ -189,4 +189,4 @@ def test_who_is_not_there_is_named_in_one_line(
     finally:
         person.end()
     assert "gamepad" in complaint(capfd, "drive", "r0", "--gamepad", str(tmp_path / "none"))
-    assert "needs a terminal" in complaint(capfd, "drive", "r0", "--connect", nobody)
+    assert "needs a terminal" in complaint(capfd, "drive", "r0", "--connect", closed)

@@ -121,13 +121,16 @@ def test_both_sides_see_and_hear_each_other(ros: RosPeer, node: Ros2Node) -> Non
     assert got[0].published_ns > 1e18
     assert got[1].published_ns > 1e18
     # What `ros2 node list` and `ros2 topic list` show, and a publisher that waits for subscribers.
-    parts = [token.split("/")[5:] for token in ros.tokens() if ros.zid not in token]
-    assert ["NN", "%", "%bot", "mapweave"] in parts
     who = ["%", "%bot", "mapweave"]
     twist = ["%bot%cmd_vel", "geometry_msgs::msg::dds_::Twist_", HASHES[TWIST], "1:2:1,10:,:,:,,"]
-    assert ["MP", *who, *twist] in parts
     odometry = ["%bot%odom", "nav_msgs::msg::dds_::Odometry_", ANY_HASH, "1:2:1,10:,:,:,,"]
-    assert ["MS", *who, *odometry] in parts
+    wanted = [["NN", *who], ["MP", *who, *twist], ["MS", *who, *odometry]]
+
+    def seen() -> bool:
+        parts = [token.split("/")[5:] for token in ros.tokens() if ros.zid not in token]
+        return all(one in parts for one in wanted)
+
+    eventually(seen)
     assert not ros.failures
 
 
