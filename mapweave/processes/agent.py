@@ -236,7 +236,7 @@ class Agent:
         self._on_step(observation, step)
         # A geometry that is found to be declared wrongly is reported once.
         for cause in self.pipeline.calibration.causes[self._causes :]:
-            self._say(cause)
+            self._say(str(cause))
             self._causes += 1
 
     @property
