@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
 from mapweave.agent.calibration.correction import declaring, geometry_of
 from mapweave.agent.calibration.online import OnlineCalibration
@@ -36,7 +35,9 @@ from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NUMBER, MapId, NodeId
+from mapweave.processes.agent_progress import AgentProgress
 from mapweave.processes.ros2_publisher import Ros2Publisher
+from mapweave.processes.server_watch import ServerWatch
 from mapweave.processes.service_manager import ServiceManager
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.bus import Bus
@@ -50,9 +51,6 @@ FIRST_PATIENCE = 3.0
 
 SILENCE = 2.0
 """s; a longer wait for the robot is reported."""
-
-SERVER_PATIENCE = 20.0
-"""s without the map server after which that is reported."""
 
 
 @dataclass(frozen=True)
@@ -143,8 +141,7 @@ class Agent:
         self._options = options
         self._on_step = on_step
         self._causes = 0
-        self._print = print_line
-        self._server_missing, self._server_ns = False, 0
+        self._print, self._server_watch = print_line, ServerWatch(options.server)
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
@@ -194,9 +191,9 @@ class Agent:
         pipeline = Pipeline(map_id, self._description, self._settings, kept.contents, kept.next_number)
         self.journal.open_map(map_id.epoch)
         nodes = len(pipeline.map.nodes)
-        self._print(f"{self._options.name}: takes up map {map_id} with {nodes} nodes")
+        self._say(f"takes up map {map_id} with {nodes} nodes")
         if kept.complaint:
-            self._print(f"{self._options.name}: {kept.complaint}")
+            self._say(kept.complaint)
             self._set_aside(map_id)
         self._start(map_id, pipeline)
 
@@ -233,31 +230,14 @@ class Agent:
     def _stepped(self, observation: Observation, step: Step) -> None:
         if self._trajectory is not None and step.status.located:
             self._trajectory.add(observation.stamp_ns, step.status.map_from_robot)
-        self._look_for_server(observation.stamp_ns)
+        line = self._server_watch.see(self._fleet.server_in_reach(), observation.stamp_ns)
+        if line and self._options.patience > 0.0:
+            self._say(line)
         self._on_step(observation, step)
         # A geometry that is found to be declared wrongly is reported once.
-        causes = self.pipeline.calibration.causes
-        for cause in causes[self._causes :]:
-            self._print(f"{self._options.name}: {cause}")
-        self._causes = len(causes)
-
-    def _look_for_server(self, stamp_ns: int) -> None:
-        """Say once that the map server is missing, and when it is there."""
-        if self._options.patience <= 0.0:
-            return
-        server = self._options.server
-        if self._fleet.server_in_reach():
-            if self._server_missing:
-                self._say(f"map server {server} is in reach")
-            self._server_missing, self._server_ns = False, stamp_ns
-        elif not self._server_ns:
-            self._server_ns = stamp_ns
-        elif not self._server_missing and stamp_ns - self._server_ns > SERVER_PATIENCE * 1e9:
-            self._server_missing = True
-            self._say(
-                f"no map server {server} in reach for {SERVER_PATIENCE:g} s: what is mapped stays on this "
-                "disk; start `mapweave server`, with the same --fleet"
-            )
+        for cause in self.pipeline.calibration.causes[self._causes :]:
+            self._say(str(cause))
+            self._causes += 1
 
     @property
     def map_id(self) -> MapId:
@@ -273,10 +253,10 @@ class Agent:
             self.write_map()
         except InvalidFile as error:
             # The journal has it all.
-            self._print(f"{self._options.name}: {error}")
+            self._say(str(error))
         self._begin(calibration)
         self.pipeline.set_mission(mission)
-        self._print(f"{self._options.name}: {cause}; it begins map {self.map_id}, and the old one stays")
+        self._say(f"{cause}; it begins map {self.map_id}, and the old one stays")
 
     def tick(self, observation: Observation) -> Step:
         """One tick; see Runner.tick. Begins a fresh map where that is needed."""
@@ -312,7 +292,7 @@ class Agent:
         aside = path.with_name(f"{map_id}.before-damage{path.suffix}")
         if path.exists() and not aside.exists():
             path.rename(aside)
-            self._print(f"{self._options.name}: the map file written before is kept as {aside}")
+            self._say(f"the map file written before is kept as {aside}")
 
     def _unknown_goal(self, node: NodeId) -> str:
         on_own_map = node.map == self.map_id and node not in self.pipeline.map.nodes
@@ -368,7 +348,7 @@ def run_agent(
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
     console = Console(stderr=True)
-    show, manager = _progress(console, options), ServiceManager()
+    show, manager = AgentProgress(console, options.name, options.total), ServiceManager()
     describe = partial(_describe, robot, console.print, options.name)
     publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
 
@@ -418,37 +398,3 @@ def _hand_over(console: Console, replicator: Replicator, bus: ZenohBus, options:
         console.print(
             f"server {options.server} has not acknowledged everything: the rest stays in the journal"
         )
-
-
-class _progress:
-    """Progress of a run: with a bar where the end is known, else a line when something changes."""
-
-    def __init__(self, console: Console, options: AgentOptions) -> None:
-        self._console = console
-        self._options = options
-        self._bar: Progress | None = None
-        self._last_line = ""
-
-    def __enter__(self) -> _progress:
-        if self._options.total is not None:
-            self._bar = Progress(
-                SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                TextColumn("{task.fields[detail]}"), console=self._console,
-            )  # fmt: skip
-            self._task = self._bar.add_task(self._options.name, total=self._options.total, detail="")
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def __call__(self, observation: Observation, step: Step) -> None:
-        status = step.status
-        if self._bar is not None:
-            self._bar.update(self._task, advance=1, detail=f"{status.nodes} nodes, {status.detail}")
-        elif status.doing != self._last_line:
-            self._last_line = status.doing
-            self._console.print(
-                f"{self._options.name}: {status.doing} ({status.nodes} nodes) {status.detail}"
-            )

@@ -150,7 +150,7 @@ class Slow:
     def clock(self) -> float:
         return self.now
 
-    def step(self, observation: Observation, answers: object) -> Step:
+    def step(self, observation: Observation, answers: object, driven: object) -> Step:
         self.now += self.durations.pop(0)
         return Step(Command(), (), (), Status("mapping", "", 0, 0, Pose2(), False))
 
@@ -163,6 +163,9 @@ class Fleet:
 
     def server_in_reach(self) -> bool:
         return True
+
+    def driven(self) -> None:
+        pass
 
     def answers(self) -> tuple[object, ...]:
         return ()

@@ -1,0 +1,29 @@
+"""Says when an agent's map server is missing, and when it is there again."""
+
+from __future__ import annotations
+
+PATIENCE = 20.0
+"""s without the map server after which that is reported."""
+
+
+class ServerWatch:
+    """Of one agent."""
+
+    def __init__(self, server: str) -> None:
+        """Take the server's name."""
+        self._server = server
+        self._missing, self._seen_ns = False, 0
+
+    def see(self, in_reach: bool, stamp_ns: int) -> str:
+        """Take in one tick; returns a line for people, or nothing."""
+        if in_reach:
+            missing, self._missing, self._seen_ns = self._missing, False, stamp_ns
+            return f"map server {self._server} is in reach" if missing else ""
+        self._seen_ns = self._seen_ns or stamp_ns
+        if self._missing or stamp_ns - self._seen_ns <= PATIENCE * 1e9:
+            return ""
+        self._missing = True
+        return (
+            f"no map server {self._server} in reach for {PATIENCE:g} s: what is mapped stays on this disk; "
+            "start `mapweave server`, with the same --fleet"
+        )
