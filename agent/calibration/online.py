@@ -42,7 +42,7 @@ STALE = 0.25
 """A pair is reduced again when a parameter has moved by this share of a useful sigma since."""
 KEPT_NEW = 40
 """Of these the newest stay; of the others those go that turn least."""
-STEPS = 2
+STEPS = 1
 """Gauss-Newton steps of a solution."""
 SETTLED = 0.5
 """Two solutions in a row must agree to this share of a useful sigma."""
