@@ -8,10 +8,12 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission import Answer, Driven, Question
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.queries import decode_answer, encode_query
+from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.agent_status import AgentStatus, Status, one_line
+from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.hybridmap.mission_order import MissionOrder
 from mapweave.hybridmap.node import MapId
@@ -37,6 +39,8 @@ class FleetClient:
         server: str = "s0",
         unsent: Callable[[], int] = lambda: 0,
         placed: Callable[[], int] = lambda: 0,
+        teleoperation: Teleoperation | None = None,
+        limits: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """Announce the agent and listen for missions.
 
@@ -49,6 +53,8 @@ class FleetClient:
             server: the map server of `server_in_reach`.
             unsent: counts the changes that it has not acknowledged; called from any thread.
             placed: counts the nodes of the map with a merged pose; likewise.
+            teleoperation: takes the commands of a person who drives; it outlives this map.
+            limits: of the robot's speeds, m/s and rad/s, for that person.
         """
         self._bus = bus
         self._keys = keys
@@ -57,17 +63,19 @@ class FleetClient:
         self._server = server
         self._server_alive = False
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
-        self._stamp_ns = 0
+        self._stamp_ns = self._skipped = 0
         self._battery: float | None = None
         self._trouble, self._trouble_at = "", 0.0
         self._missions = missions
         self._unsent, self._placed = unsent, placed
         self._timeout = answer_timeout
+        self._teleoperation, self._limits = teleoperation or Teleoperation(), limits
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
         self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._open_questions = 0
         self._closing = [
             bus.serve(keys.mission(map_id.agent), self._take_mission),
+            bus.serve(keys.drive(map_id.agent), self._take_drive),
             bus.serve(keys.agent_status(map_id.agent), self._tell_status),
             bus.watch(keys.server_alive(server), self._see_server),
             bus.announce(keys.agent_alive(map_id)),
@@ -75,12 +83,21 @@ class FleetClient:
         self._asker = threading.Thread(target=self._ask_all, name="questions", daemon=True)
         self._asker.start()
 
+    def driven(self) -> Driven | None:
+        """The command of a person who drives the robot now; None where no person does."""
+        return self._teleoperation.driven()
+
     def server_in_reach(self) -> bool:
         """Whether the map server is known to be reachable in both directions."""
         return self._server_alive and self._bus.connected()
 
     def report(
-        self, status: Status, stamp_ns: int, battery: float | None = None, publish: bool = True
+        self,
+        status: Status,
+        stamp_ns: int,
+        battery: float | None = None,
+        publish: bool = True,
+        skipped: int = 0,
     ) -> None:
         """Publish the robot's status: on request and, best effort, to subscribers.
 
@@ -89,9 +106,10 @@ class FleetClient:
             stamp_ns: time of the observation that it describes.
             battery: charge, as a share, if it is known.
             publish: send it now; else only answer questions with it.
+            skipped: images that were skipped so far.
         """
         self._status = replace(status, doing=one_line(status.doing), detail=one_line(status.detail))
-        self._stamp_ns, self._battery = stamp_ns, battery
+        self._stamp_ns, self._battery, self._skipped = stamp_ns, battery, skipped
         if publish:
             self._bus.publish(self._keys.agent_status(self._agent), encode(self._now()))
 
@@ -135,6 +153,7 @@ class FleetClient:
             self._battery,
             self._trouble,
             time.monotonic() - self._trouble_at if self._trouble else 0.0,
+            self._skipped,
         )
 
     def _tell_status(self, request: Request) -> None:
@@ -145,7 +164,14 @@ class FleetClient:
         self._server_alive = alive
 
     def _take_mission(self, request: Request) -> None:
-        request.reply(encode(self._missions.take(decode(request.payload, MissionOrder))))
+        report = self._missions.take(decode(request.payload, MissionOrder))
+        # A mission ends the wait for a person who has fallen silent.
+        self._teleoperation.release()
+        request.reply(encode(report))
+
+    def _take_drive(self, request: Request) -> None:
+        answer_ns = self._teleoperation.take(decode(request.payload, DriveRequest))
+        request.reply(encode(DriveAnswer(self._now(), answer_ns, *self._limits)))
 
     def _ask_all(self) -> None:
         while (question := self._asked.get()) is not None:
@@ -153,7 +179,7 @@ class FleetClient:
 
     def _answer(self, question: Question) -> Answer:
         try:
-            key, payload = encode_query(self._keys, question)
+            key, payload = encode_query(self._keys, question, self._agent)
         except InvalidValue as unspeakable:
             return Answer(question.number, None, str(unspeakable))
         replies = self._bus.ask(key, payload, self._timeout)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mapweave.agent.observation import Command
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import KnownAnswer, RelocalizeAnswer, RouteAnswer, View
+from mapweave.hybridmap.query import KnownAnswer, RelocalizeAnswer, ReserveAnswer, RouteAnswer, View
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,19 @@ class GoTo:
 
 
 Mission = Idle | Explore | Carried | GoTo
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A person drives the robot, whatever its mission.
+
+    Attributes:
+        command: of the person.
+        silence: s without a command, if that is too long: the command is then to stand; else 0.
+    """
+
+    command: Command
+    silence: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +94,24 @@ class WhatIsKnown:
     reach: float
 
 
-Question = WhereAmI | WhichWay | WhatIsKnown
+@dataclass(frozen=True)
+class MayIDrive:
+    """Question to the fleet: is the way ahead free of other robots?
+
+    Attributes:
+        number: of the question; the answer repeats it.
+        start: node by which the robot is localized.
+        start_from_robot: where it is exactly.
+        route: the nodes ahead, in order.
+    """
+
+    number: int
+    start: NodeId
+    start_from_robot: Pose2
+    route: tuple[NodeId, ...]
+
+
+Question = WhereAmI | WhichWay | WhatIsKnown | MayIDrive
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +126,6 @@ class Answer:
     """
 
     number: int
-    content: RelocalizeAnswer | RouteAnswer | KnownAnswer | None
+    content: RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer | None
     error: str = ""
     retry_after: float = 0.0

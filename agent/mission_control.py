@@ -33,6 +33,7 @@ FIRST = "start"
 MAPPING = (MissionKind.EXPLORE, MissionKind.CARRIED)
 
 Keep = Callable[[Sequence[MissionReport]], None]
+Defer = Callable[[Callable[[], None]], object]
 
 
 def as_mission(order: MissionOrder) -> Mission:
@@ -57,6 +58,7 @@ class MissionControl:
         kept: Iterable[MissionReport] = (),
         keep: Keep = lambda reports: None,
         alone: WithoutServer = WithoutServer.GO_ON,
+        defer: Defer = lambda save: save(),
     ) -> None:
         """Go on with what was kept.
 
@@ -65,12 +67,16 @@ class MissionControl:
             kept: reports from the disk.
             keep: puts reports on the disk.
             alone: what the robot does while no server is in reach.
+            defer: calls a function, at once or in another thread: the robot's loop, which calls `follow`,
+                must not wait for the disk.
         """
         self.unknown_goal: Callable[[NodeId], str] = lambda node: ""
         self._robot = robot
         self._keep = keep
-        self._alone = alone
-        self._lock = threading.Lock()
+        self._alone, self._defer = alone, defer
+        # The robot's loop waits for the first of these, and never for the second.
+        self._lock, self._saving = threading.Lock(), threading.Lock()
+        self._unsaved: list[MissionReport] = []
         self._reports = {report.order.id: report for report in kept}
         ranked = sorted(self._reports.values(), key=lambda report: report.order.rank)
         held = [report for report in ranked if report.state is not MissionState.REFUSED]
@@ -103,22 +109,27 @@ class MissionControl:
         if order.robot != self._robot:
             raise InvalidValue(f"a mission of {order.robot} came to {self._robot}")
         with self._lock:
-            known = self._reports.get(order.id)
-            if known is not None:
-                return known
-            current = None if self._current is None else self._reports[self._current]
-            if current is not None and order.rank < current.order.rank:
-                newer = f"mission {current.order.id} by {current.order.by} is newer"
-                return self._note(MissionReport(order, MissionState.REPLACED, 0.0, newer))
-            if order.node is not None and (reason := self.unknown_goal(order.node)):
-                return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reason))
-            report = MissionReport(order, MissionState.RUNNING)
-            replaced = []
-            if current is not None and current.open:
-                by = f"by mission {order.id} of {order.by}"
-                replaced = [replace(current, state=MissionState.REPLACED, reason=by)]
-            self._current = order.id
-            return self._note(*replaced, report)
+            report = self._taken(order)
+        self.save()
+        return report
+
+    def _taken(self, order: MissionOrder) -> MissionReport:
+        known = self._reports.get(order.id)
+        if known is not None:
+            return known
+        current = None if self._current is None else self._reports[self._current]
+        if current is not None and order.rank < current.order.rank:
+            newer = f"mission {current.order.id} by {current.order.by} is newer"
+            return self._note(MissionReport(order, MissionState.REPLACED, 0.0, newer))
+        if order.node is not None and (reason := self.unknown_goal(order.node)):
+            return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reason))
+        report = MissionReport(order, MissionState.RUNNING)
+        replaced = []
+        if current is not None and current.open:
+            by = f"by mission {order.id} of {order.by}"
+            replaced = [replace(current, state=MissionState.REPLACED, reason=by)]
+        self._current = order.id
+        return self._note(*replaced, report)
 
     def next(self, linked: bool, now: float, home: NodeId | None) -> Mission | None:
         """What the pipeline shall do from now on; None if it goes on.
@@ -166,7 +177,8 @@ class MissionControl:
                 self._reports[report.order.id] = report
                 return False
             self._note(report)
-            return True
+        self._defer(self.save)
+        return True
 
     def _active(self, order: MissionOrder) -> bool:
         """Whether the pipeline is still to do it. A goal that was reached is held, and not sought again."""
@@ -174,14 +186,23 @@ class MissionControl:
         return self._reports[order.id].open or order.kind in MAPPING or applied
 
     def _note(self, *reports: MissionReport) -> MissionReport:
-        """Keep reports; returns the last."""
+        """Take note of reports, which are to be saved; returns the last."""
         self._reports.update({report.order.id: report for report in reports})
         while len(self._reports) > MAX_KEPT:
             others = (report.order for report in self._reports.values() if report.order.id != self._current)
             del self._reports[min(others, key=lambda order: order.rank).id]
-        try:
-            self._keep(reports)
-        except InvalidFile as error:
-            # A robot must obey a stop, also with a full disk.
-            log.warning("mission %s is not on the disk: %s", reports[-1].order.id, error)
+        self._unsaved += reports
         return reports[-1]
+
+    def save(self) -> None:
+        """Put on the disk what is not there yet. Waits for it, and for another thread that saves."""
+        with self._saving:
+            with self._lock:
+                reports, self._unsaved = self._unsaved, []
+            if not reports:
+                return
+            try:
+                self._keep(reports)
+            except InvalidFile as error:
+                # A robot must obey a stop, also with a full disk.
+                log.warning("mission %s is not on the disk: %s", reports[-1].order.id, error)

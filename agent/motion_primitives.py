@@ -66,6 +66,14 @@ class MotionPrimitives:
         self._next_number += 1
         return self._next_number - 1
 
+    def post(self, question: Question) -> None:
+        """Ask without waiting; `answer` has the answer later."""
+        self._questions.append(question)
+
+    def answer(self, number: int) -> Answer | None:
+        """The answer to a question, once; None if it has not come."""
+        return self._answers.pop(number, None)
+
     # Behaviours
 
     def ask(self, question: Question) -> Generator[Command, None, Answer]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -39,6 +41,14 @@ class Odometry:
     forward: float
     turn: float
 
+    @staticmethod
+    def between(before: Sequence[float], after: Sequence[float]) -> Odometry:
+        """Motion between two poses, each x m, y m, heading rad; inverse of `motion`."""
+        turn = (after[2] - before[2] + math.pi) % math.tau - math.pi
+        middle = before[2] + turn / 2
+        dx, dy = after[0] - before[0], after[1] - before[1]
+        return Odometry(dx * math.cos(middle) + dy * math.sin(middle), turn)
+
     def motion(self) -> Pose2:
         """`before_from_after`, a chord at half the turn as in the paper's prediction."""
         return Pose2(
@@ -61,6 +71,8 @@ class Observation:
             ranger's maximum where nothing is in reach. Empty if the robot has none.
         bumped: whether the bumper is pressed.
         battery: charge, as a share; None if the robot does not tell.
+        kidnapped: whether the robot notices that it has been lifted. The wheels have not measured how it is
+            moved; once this ends, it is at an unknown place.
     """
 
     stamp_ns: int
@@ -69,6 +81,7 @@ class Observation:
     proximity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     bumped: bool = False
     battery: float | None = None
+    kidnapped: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ r"""One robot's whole pipeline: observation in, command and map changes out. Rea
                                -> floor                        \
     lost on the own map ------> global localization -> mapper   |
     mission ------------------> explorer | carried   | navigator -> guard -> command
+    a person's command --------------------------------------------/
 
 It knows no network, no disk and no clock: live robots, recordings, simulation and tests run this very code.
 """
@@ -18,24 +19,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.calibration.online import OnlineCalibration
+from mapweave.agent.camera_occupancy import CameraOccupancyGrid
+from mapweave.agent.cautious_driving import ALONG_EDGES, CautiousDriving, lacks_rangers, speed_for
+from mapweave.agent.exploration.camera_exploration import CameraExploration, with_readings
 from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.random_exploration import RandomExploration
 from mapweave.agent.global_localization.resumption import Resumption
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
+from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
-from mapweave.agent.ranger_monitor import RangerMonitor
+from mapweave.agent.ranger_monitor import RangerMonitor, not_exploring
 from mapweave.agent.servo.proximity import guard
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
-from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
 
@@ -94,19 +99,39 @@ class Pipeline:
         self._lens = lens
         self._sift = Sift(lens, self._settings.sift)
         self._mapper = Mapper(map_id, description, self._settings, contents, next_number, lens)
-        self._floor = OccupancyGrid(description, self._settings.occupancy_grid)
+        self._caution = CautiousDriving(description) if lacks_rangers(description) else None
+        self._floor = self._new_floor()
+        self._changes: list[ChangeBody] = []
+        self._driven: Driven | None = None
         self._rangers = RangerMonitor(description)
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
-        self._passenger: CarriedMapping | None = None
+        self._passenger = CarriedMapping(self._mapper)
         self._navigator: Navigator | None = None
         self._resumption: Resumption | None = None
         self._direction = 1.0
+        self._lifted = self._put_elsewhere = False
 
     @property
     def map(self) -> HybridMap:
         """The robot's own map so far."""
         return self._mapper.map
+
+    @property
+    def map_from_robot(self) -> PoseGaussian | None:
+        """Where the robot is on its own map; None if it does not know."""
+        fix = self._navigator.fix if self._navigator is not None else None
+        match self._mission:
+            case Explore() | Carried() if self._located:
+                return self._mapper.map_from_robot
+            case GoTo() if fix is not None and fix.node in self.map.nodes:
+                return self.map.nodes[fix.node].map_from_robot @ fix.node_from_robot
+        return None
+
+    @property
+    def _located(self) -> bool:
+        """Whether the mapper knows where the robot is."""
+        return self._mapper.started and not (self._mapper.astray or self._mapper.doubtful)
 
     @property
     def mission(self) -> Mission:
@@ -115,12 +140,17 @@ class Pipeline:
 
     @property
     def lost(self) -> bool:
-        """Whether the robot shall map and has given up localizing on its own map.
+        """Whether the robot shall map and has given up localizing on its own map, or was lifted.
 
         It stands still then. The caller may begin a new map, in a new pipeline; another `set_mission`
         lets it try again.
         """
-        return self._resumption is not None and self._resumption.lost
+        return self._put_elsewhere or (self._resumption is not None and self._resumption.lost)
+
+    @property
+    def put_elsewhere(self) -> bool:
+        """Whether it is lost because its base has noticed that it was lifted."""
+        return self._put_elsewhere
 
     def set_mission(self, mission: Mission) -> None:
         """Begin another mission. Exploration that was interrupted goes on where it was.
@@ -129,12 +159,10 @@ class Pipeline:
         place of its own map.
         """
         self._mission = mission
-        self._resumption = None
+        self._resumption, self._put_elsewhere = None, False
         match mission:
-            case Explore() if self._explorer is None:
+            case Explore() if self._explorer is None and self._explores:
                 self._explorer = self._new_explorer()
-            case Carried() if self._passenger is None:
-                self._passenger = CarriedMapping(self._mapper)
             case GoTo(goal):
                 self._mapper.lose()
                 self._restart()
@@ -143,12 +171,15 @@ class Pipeline:
                     self._settings.seed,
                 )  # fmt: skip
 
-    def step(self, observation: Observation, answers: tuple[Answer, ...] = ()) -> Step:
+    def step(
+        self, observation: Observation, answers: tuple[Answer, ...] = (), driven: Driven | None = None
+    ) -> Step:
         """Take one observation and decide.
 
         Args:
             observation: what the robot senses now.
             answers: to questions of earlier steps.
+            driven: a person's command, which comes before the mission's; None where no person drives.
         """
         command, questions = Command(), list[Question]()
         if self._fisheye.rectifies and observation.image is not None:
@@ -156,7 +187,11 @@ class Pipeline:
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
         observation = self.calibration.correct(observation)
         self._rangers.see(observation.proximity)
+        self._take_over(driven)
+        self._feel(observation)
         match self._mission:
+            case _ if self._in_the_air(observation) or self._put_elsewhere:
+                pass
             case Idle() if self._mapper.started:
                 # Mapping that goes on later needs the motion of the wheels until then.
                 self._keep_up(observation)
@@ -165,24 +200,109 @@ class Pipeline:
             case Explore() | Carried():
                 command, questions = self._map(observation, answers)
             case GoTo() if self._navigator is not None:
-                command, questions = self._navigator.step(observation, answers, bool(self._blind))
+                command, questions = self._navigator.step(observation, answers, self._held)
                 self._mapper.drove(self._navigator.traverse, self._navigator.refined)
-        safe, warning = guard(command, observation.proximity, self._description)
+        safe, warning = self._safe(command if driven is None or self._lifted else driven.command, observation)
         if observation.bumped and safe.forward * self._direction > 0:
             safe, warning = Command(0.0, safe.turn), "stopped: the bumper is pressed"
         elif not observation.bumped and safe.forward:
             self._direction = math.copysign(1.0, safe.forward)
-        return Step(safe, self._mapper.take_changes(), tuple(questions), self._status(warning))
+        self._see_changes()
+        changes, self._changes = tuple(self._changes), []
+        return Step(safe, changes, tuple(questions), self._status(warning))
+
+    @property
+    def _explores(self) -> bool:
+        """Whether it may explore by itself."""
+        return self._caution is None or self._settings.exploration.without_rangers
+
+    @property
+    def _held(self) -> bool:
+        """Whether the mission must not move the robot now."""
+        backing_off = self._caution is not None and self._caution.backing_off
+        return bool(self._blind) or self._driven is not None or backing_off
 
     @property
     def _blind(self) -> str:
         """Why the rangers forbid an autonomous robot to drive; empty if it may."""
         return self._rangers.fault if isinstance(self._mission, Explore | GoTo) else ""
 
+    def _in_the_air(self, observation: Observation) -> bool:
+        """Whether the base says that it is lifted. Put down again, the robot is at an unknown place."""
+        if observation.kidnapped and not self._lifted:
+            self._mapper.lose()
+        elif self._lifted and not observation.kidnapped:
+            if isinstance(self._mission, GoTo):
+                self.set_mission(self._mission)
+            else:
+                self._put_elsewhere = bool(self.map.nodes) and not isinstance(self._mission, Idle)
+                self._restart()
+        self._lifted = observation.kidnapped
+        return self._lifted
+
+    def _new_floor(self) -> OccupancyGrid:
+        settings = self._settings.occupancy_grid
+        if self._caution is None:
+            return OccupancyGrid(self._description, settings)
+        floor = CameraOccupancyGrid(self._description, settings)
+        for node in self.map.nodes.values():
+            floor.see_node(node)
+        return floor
+
     def _new_explorer(self) -> Explorer:
-        settings, parts = self._settings, (self._map_id, self._description, self._mapper, self._floor)
+        settings, parts = self._settings, (self._map_id, self._description, self._mapper)
+        more = settings.exploration, settings.seed
+        if isinstance(self._floor, CameraOccupancyGrid):
+            return CameraExploration(*parts, self._floor, *more)
         kind = RandomExploration if settings.exploration.random else Explorer
-        return kind(*parts, settings.exploration, settings.seed)
+        return kind(*parts, self._floor, *more)
+
+    def _take_over(self, driven: Driven | None) -> None:
+        """A person takes the wheels, or gives them back: the mission goes on from where the robot is then."""
+        changed = (driven is None) != (self._driven is None)
+        self._driven = driven
+        if changed:
+            self._resumption = None
+        if changed and driven is None and self._explorer is not None:
+            self._explorer.restart()
+
+    def _feel(self, observation: Observation) -> None:
+        """Whether a robot without rangers has touched something: it is entered, and a route is given up."""
+        if self._caution is None:
+            return
+        mapping = isinstance(self._mission, Explore | Carried) and self._mapper.started
+        pose = self._mapper.map_from_robot.mean
+        self._caution.see(observation, pose if mapping else None)
+        if not self._caution.touched:
+            return
+        if mapping and isinstance(self._floor, CameraOccupancyGrid):
+            self._floor.touch(pose, self._caution.heading)
+        if self._navigator is not None:
+            self._navigator.touch(self._caution.touched)
+
+    def _safe(self, command: Command, observation: Observation) -> tuple[Command, str]:
+        """The command as far as it is safe, and why it is not the one that was wanted."""
+        if self._caution is None:
+            return guard(command, observation.proximity, self._description)
+        if self._driven:
+            return self._caution.command(command, self._description.max_forward, follow=True), ""
+        floor, warning, most = self._floor, "", ALONG_EDGES
+        if isinstance(self._mission, Explore) and isinstance(floor, CameraOccupancyGrid):
+            pose = self._mapper.map_from_robot.mean
+            command, warning = guard(command, floor.readings(pose), with_readings(self._description))
+            direction = 0.0 if command.forward >= 0.0 else math.pi
+            most = speed_for(floor.known_ahead(pose, direction, 0.5))
+        safe = self._caution.command(command, most)
+        return safe, "backing off from a touch" if self._caution.backing_off else warning
+
+    def _see_changes(self) -> None:
+        """Take what was changed in the map; nodes show a robot without rangers where the floor is free."""
+        new = self._mapper.take_changes()
+        self._changes += new
+        if isinstance(self._floor, CameraOccupancyGrid):
+            for change in new:
+                if isinstance(change, NodePut):
+                    self._floor.see_node(change.node)
 
     def _keep_up(self, observation: Observation) -> None:
         """Pass the observation to the mapper; it may detect that the robot was carried off."""
@@ -198,11 +318,17 @@ class Pipeline:
             return Command(), []
         if observation.image is not None and self._mapper.started:
             self._calibrate(observation.image)
-        if isinstance(self._mission, Carried):
-            assert self._passenger is not None
+        pose = self._mapper.map_from_robot.mean
+        if isinstance(self._floor, CameraOccupancyGrid):
+            self._floor.drive(pose)
+            self._floor.see_landmarks(pose, self._mapper.landmarks)
+            observation = replace(observation, proximity=self._floor.readings(pose))
+        else:
+            self._floor.see(pose, observation.proximity)
+        if self._explorer is None or isinstance(self._mission, Carried) or self._driven:
             return self._act(self._passenger, observation), []
-        assert self._explorer is not None
-        self._floor.see(self._mapper.map_from_robot.mean, observation.proximity)
+        if self._held:
+            return Command(), []
         self._explorer.see(observation, answers)
         return self._act(self._explorer, observation), self._explorer.questions
 
@@ -213,6 +339,9 @@ class Pipeline:
         """
         while isinstance(move := behaviour.next_move(), EpisodeRequest):
             self._mapper.meet(move, observation)
+            self._see_changes()
+            if self._mapper.between_episodes:
+                return Command()
         return move
 
     def _calibrate(self, image: NDArray[np.uint8]) -> None:
@@ -229,7 +358,7 @@ class Pipeline:
     def _resume(self, observation: Observation) -> Command:
         """Find the robot on its own map; then map on from there."""
         if self._resumption is None:
-            drives, settings = isinstance(self._mission, Explore), self._settings
+            drives, settings = isinstance(self._mission, Explore) and not self._driven, self._settings
             self._resumption = Resumption(self._description, self._sift, self.map, drives, settings.seed)
         command = self._resumption.step(observation, bool(self._blind))
         recognized, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot
@@ -249,7 +378,7 @@ class Pipeline:
                 self._explorer.restart()
             return
         # The map may begin anywhere, and all that was found out on the way to it is void.
-        self._floor = OccupancyGrid(self._description, self._settings.occupancy_grid)
+        self._floor = self._new_floor()
         if self._explorer is not None:
             self._explorer = self._new_explorer()
 
@@ -261,10 +390,12 @@ class Pipeline:
                 detail = "" if self._resumption is None else self._resumption.detail
             case Explore() | Carried() if self._mapper.doubtful:
                 doing, detail = "standing still", self._mapper.doubt
-            case Explore() if self._explorer is not None:
+            case Explore() if self._explorer is not None and not self._driven:
                 doing, detail = str(self._explorer.phase), self._explorer.detail
                 finished = self._explorer.finished
-            case Carried() if self._passenger is not None:
+            case Explore() if not self._driven:
+                doing, detail = "standing still", not_exploring(self._map_id.agent)
+            case Carried() | Explore():
                 doing, detail = "mapping while carried", self._passenger.detail
             case GoTo() if self._navigator is not None:
                 doing, detail = str(self._navigator.stage), self._navigator.detail
@@ -272,6 +403,11 @@ class Pipeline:
                 progress = self._navigator.progress
         if self._blind:
             doing, detail = "standing still", self._blind
+        if self._driven is not None:
+            silence = self._driven.silence
+            doing = "driven by a person" if not silence else "standing: nothing is heard of who drives it"
+        if self._lifted or self._put_elsewhere:
+            doing, detail = "lifted", "the robot begins a new map once it is on the floor"
         mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
         for more in (self._mapper.health if mapping else "", warning):
             detail = "; ".join(part for part in (detail, more) if part)
@@ -294,6 +430,6 @@ class Pipeline:
             astray=self._resumption is not None,
             given_up=given_up,
             progress=progress,
-            located=mapping and self._mapper.started and not self._mapper.astray,
+            located=mapping and self._located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )

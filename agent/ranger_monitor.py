@@ -4,8 +4,36 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapweave.agent.cautious_driving import ALONG_EDGES, CREEP, SLOW, lacks_rangers
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.pose import Array
+
+
+def not_exploring(name: str) -> str:
+    """Why an agent without proximity sensors does not explore, and what to do."""
+    return (
+        f"without proximity sensors it does not explore by itself: drive it with `mapweave drive {name}`, "
+        "or allow it with --without-rangers"
+    )
+
+
+def announcement(description: RobotDescription, name: str, explores: bool) -> list[str]:
+    """What a robot without proximity sensors will not do, one line each; nothing for one that has some.
+
+    Args:
+        description: of the robot.
+        name: of its agent.
+        explores: whether a person allows it to explore by its camera alone.
+    """
+    if not lacks_rangers(description):
+        return []
+    return [
+        "no proximity sensors: it does not stop before obstacles; a touch (bumper, wheels) stops it",
+        f"it explores at {CREEP:g} to {SLOW:g} m/s by its camera; expect it to touch things"
+        if explores
+        else not_exploring(name),
+        f"to a goal it drives at {ALONG_EDGES:g} m/s, only along edges of the map that a robot has driven",
+    ]
 
 
 class RangerMonitor:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from collections.abc import Callable
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission import Answer, Question
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation
@@ -14,12 +17,21 @@ from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 
+log = logging.getLogger(__name__)
+
 REPORT_EVERY = 5
 """Ticks between two status reports."""
 
 
 class Runner:
-    """Runs one robot until its driver ends, it is stopped, or it must begin a new map."""
+    """Runs one robot until its driver ends, it is stopped, or it must begin a new map.
+
+    A robot's driver gives its newest image. Images that come while a tick takes too long are skipped, so that
+    the robot never acts on old ones.
+
+    Attributes:
+        skipped: images that were skipped so far.
+    """
 
     def __init__(
         self,
@@ -27,8 +39,11 @@ class Runner:
         fleet: FleetClient,
         replicator: Replicator,
         missions: MissionControl,
+        monitor: MappingMonitor,
         synchronization: Synchronization | None = None,
         on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
+        print_line: Callable[[str], None] = lambda line: None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Put the parts together.
 
@@ -37,9 +52,17 @@ class Runner:
             fleet: questions and status.
             replicator: where changes go: to the own disk, then to the server.
             missions: what the pipeline shall do.
+            monitor: says why there are no nodes.
             synchronization: what the loop waits for; nothing if not given.
             on_step: called after each tick, for progress.
+            print_line: takes lines for people.
+            clock: s, only grows.
         """
+        self.skipped = 0
+        self._monitor = monitor
+        self._print = print_line
+        self._clock = clock
+        self._previous: tuple[int, float] | None = None
         self._pipeline = pipeline
         self._fleet = fleet
         self._replicator = replicator
@@ -57,14 +80,18 @@ class Runner:
         if mission is not None:
             self._pipeline.set_mission(mission)
         answers, self._answers = (*self._answers, *self._fleet.answers()), ()
-        step = self._pipeline.step(observation, answers)
+        step = self._pipeline.step(observation, answers, self._fleet.driven())
         if step.changes:
             self._replicator.submit(step.changes, observation.stamp_ns)
             self._synchronization.changes_submitted(self._replicator, self._fleet)
         self._questions = step.questions
+        line = self._monitor.see(observation, step.status, step.command)
+        if line:
+            self._print(line)
         changed = self._missions.follow(step.status)
         now = self._ticks % REPORT_EVERY == 0 or bool(step.questions) or changed
-        self._fleet.report(step.status, observation.stamp_ns, observation.battery, publish=now)
+        status = self._monitor.explained(step.status)
+        self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
         self._ticks += 1
         self._on_step(observation, step)
         return step
@@ -88,12 +115,34 @@ class Runner:
         Returns:
             How many ticks were run.
         """
-        first = self._ticks
+        first, tick = self._ticks, robot.describe().tick
         while not (stop.is_set() or self._pipeline.lost):
             observation = robot.sense()
             if observation is None:
                 break
+            self._count_skipped(observation.stamp_ns, tick)
+            began = self._clock()
             robot.act(self.tick(observation).command)
             if self.curious:
                 self.exchange()
+            self._previous = observation.stamp_ns, self._clock() - began
         return self._ticks - first
+
+    def _count_skipped(self, stamp_ns: int, tick: float) -> None:
+        """Count the images that came while the tick before took too long.
+
+        Images that a recording lacks, or that a camera has dropped, came while the loop was waiting.
+        """
+        if self._previous is None:
+            return
+        before_ns, busy = self._previous
+        missed = round((stamp_ns - before_ns) * 1e-9 / tick) - 1
+        if busy <= tick or missed <= 0:
+            return
+        self.skipped += missed
+        # Reported less and less often: 1, 2, 4, 8 ...
+        if self.skipped.bit_length() > (self.skipped - missed).bit_length():
+            log.warning(
+                "a tick took %.0f ms instead of %.0f: %d images skipped so far",
+                1e3 * busy, 1e3 * tick, self.skipped,
+            )  # fmt: skip

@@ -82,6 +82,8 @@ class ExplorerSettings:
         travel_speed: speed on the way to the next place, m/s.
         ask_fleet: whether to ask the fleet what others have mapped, and to leave that to them.
         random: explore by chance, as the paper does (section 4.1), instead of place by place.
+        without_rangers: whether a robot without proximity sensors may explore, slowly, by its camera and by
+            touch; it will touch things.
     """
 
     drive_speed: Positive = 0.25
@@ -89,6 +91,7 @@ class ExplorerSettings:
     travel_speed: Positive = 0.26
     ask_fleet: bool = True
     random: bool = False
+    without_rangers: bool = False
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,7 @@ class AgentStatus:
         battery: charge, if the driver tells it.
         last_error: the newest trouble with the fleet, in words; empty without any.
         error_age: how long ago that was, s.
+        skipped: images that it has skipped because a tick took too long.
     """
 
     status: Status
@@ -99,6 +100,7 @@ class AgentStatus:
     battery: Share | None = None
     last_error: Line = ""
     error_age: Amount = 0.0
+    skipped: Number = 0
 
     @property
     def fix_node(self) -> NodeId | None:

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.limits import MAX_NUMBER, MAX_POSITION, Coordinate, LandmarkCount, Probability, Words
+from mapweave.hybridmap.limits import (
+    MAX_NUMBER,
+    MAX_POSITION,
+    Coordinate,
+    LandmarkCount,
+    Name,
+    Probability,
+    Words,
+)
 from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -164,6 +172,40 @@ class RouteRequest:
     goal: NodeId
     blocked: Blocked = ()
     start_from_robot: Pose2 = field(default_factory=Pose2)
+
+
+@dataclass(frozen=True, slots=True)
+class ReserveRequest:
+    """May a robot drive on? It asks again every second, so that it keeps what it has.
+
+    Attributes:
+        robot: its name.
+        start: node that the robot knows itself by.
+        start_from_robot: where it is exactly.
+        route: the nodes ahead of it, in order; none releases what it holds.
+    """
+
+    robot: Name
+    start: NodeId
+    start_from_robot: Pose2
+    route: Annotated[tuple[NodeId, ...], Meta(max_length=MAX_LEGS)]
+
+
+@dataclass(frozen=True, slots=True)
+class ReserveAnswer:
+    """How far a robot may drive.
+
+    Attributes:
+        granted: so many nodes of its route, from the first.
+        holder: the robot that holds what comes then; empty if none does.
+        aside: both wait for each other: this robot steps aside, to this node; None if it only waits.
+        reason: in words.
+    """
+
+    granted: Annotated[int, Meta(ge=0, le=MAX_LEGS)]
+    holder: Annotated[str, Meta(max_length=32)]
+    aside: NodeId | None
+    reason: Words
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,12 +9,13 @@ from concurrent.futures import Executor, Future
 from mapweave.hybridmap.errors import Busy, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
-from mapweave.hybridmap.query import KnownRequest, RouteAnswer, RouteRequest
+from mapweave.hybridmap.query import KnownRequest, ReserveRequest, RouteAnswer, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.packed_map import PackedMap
+from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.bus import Bus, Closing, Request
@@ -71,6 +72,7 @@ class Services:
         self._missions = missions
         self._roster = roster
         self._relays = relays
+        self._reservations = Reservations()
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor
         )
@@ -79,6 +81,7 @@ class Services:
             bus.serve(keys.route(name), guarded(self._route)),
             bus.serve(keys.known(name), guarded(self._known)),
             bus.serve(keys.server_map(name), self._map.ask),
+            bus.serve(keys.reserve(name), guarded(self._reserve)),
             bus.serve(keys.server_mission(name), self._command_later),
             bus.serve(keys.missions(name), guarded(lambda _: encode(missions.missions()))),
             bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(answers().merged)))),
@@ -121,6 +124,10 @@ class Services:
             return answers.router.route(start, goal, blocked, wary, start_from_robot)
 
         return encode(drivable(route, request.blocked))
+
+    def _reserve(self, payload: bytes) -> bytes:
+        request = decode(payload, ReserveRequest)
+        return encode(self._reservations.ask(request, self._answers().router, self._clock()))
 
     def _known(self, payload: bytes) -> bytes:
         request = decode(payload, KnownRequest)

@@ -33,11 +33,15 @@ class BusSettings:
         mode: a client of a router, or the router itself.
         endpoints: routers that a client tries; it takes the first that answers.
         listen: where a router waits for clients.
+        session: id of the Zenoh session, hexadecimal; empty for a random one.
+        timestamps: whether what is published gets a time, without which nothing is kept for late subscribers.
     """
 
     mode: Literal["client", "router"] = "client"
     endpoints: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    session: str = ""
+    timestamps: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what cannot work.

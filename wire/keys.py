@@ -6,6 +6,7 @@
     mapweave/1/<fleet>/agent/<agent>/alive/<epoch>    liveliness
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: a mission order
+    mapweave/1/<fleet>/agent/<agent>/drive            question: a person's velocity command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain and
@@ -101,6 +102,10 @@ class Keys:
     def mission(self, agent: str) -> str:
         """Where an agent takes orders."""
         return f"{self.root}/agent/{check_name(agent)}/mission"
+
+    def drive(self, agent: str) -> str:
+        """Where an agent takes a person's velocity commands."""
+        return f"{self.root}/agent/{check_name(agent)}/drive"
 
     # Keys of a server.
 

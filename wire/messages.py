@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
+from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
@@ -24,6 +25,8 @@ from mapweave.hybridmap.query import (
     KnownAnswer,
     KnownRequest,
     RelocalizeAnswer,
+    ReserveAnswer,
+    ReserveRequest,
     RouteAnswer,
     RouteRequest,
     View,
@@ -60,6 +63,8 @@ LIMITS: dict[type, Limit] = {
     RouteRequest: Limit("route request", 2**16),
     # 16 kB a leg; a node takes about 3 kB.
     RouteAnswer: Limit("route", 2**23),
+    ReserveRequest: Limit("reserve request", 2**16),
+    ReserveAnswer: Limit("reservation", 2**14),
     KnownRequest: Limit("known request", 256),
     KnownAnswer: Limit("known", 16 * MAX_KNOWN + 2**13),
     ExplainRequest: Limit("explain request", 2**16),
@@ -69,6 +74,8 @@ LIMITS: dict[type, Limit] = {
     ManualConstraint: Limit("manual constraint", 4096),
     History: Limit("history", 2**26, 1_000_000),
     AgentStatus: Limit("agent status", 2**15),
+    DriveRequest: Limit("drive request", 256),
+    DriveAnswer: Limit("drive answer", 2**15 + 256),
     FleetStatus: Limit("fleet status", 2**24, 200_000),
     MissionOrder: Limit("mission", 2048),
     MissionReport: Limit("mission report", 2**15),

@@ -32,7 +32,11 @@ _D = TypeVar("_D", bound=Declared)
 
 
 class ZenohBus:
-    """A connection to the fleet over Zenoh. Close it: an open session can hang the interpreter's exit."""
+    """A connection to the fleet over Zenoh. Close it: an open session can hang the interpreter's exit.
+
+    Attributes:
+        owner: what is declared shares this with the bus.
+    """
 
     def __init__(self, settings: BusSettings | None = None) -> None:
         """Connect, or begin to.
@@ -51,7 +55,7 @@ class ZenohBus:
         self._connecting = threading.Thread(target=self._connect, name="zenoh-connect", daemon=True)
         if self._settings.mode == "router":
             self._session = _open_router(self._settings)
-        self._owner = Owner(Dispatcher(f"zenoh-{self._settings.mode}", QUEUE_LIMIT))
+        self.owner = Owner(Dispatcher(f"zenoh-{self._settings.mode}", QUEUE_LIMIT))
         exit_closing.remember(self)
         if self._session is None:
             self._connecting.start()
@@ -59,7 +63,7 @@ class ZenohBus:
     def publish(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
         """Send best-effort. Without a connection the message is lost."""
         check_key(key)
-        with self._using_session() as session:
+        with self.using_session() as session:
             if session is None:
                 return
             try:
@@ -70,16 +74,16 @@ class ZenohBus:
 
     def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
         """Call the handler with each matching message."""
-        return self._declare(Subscription(self._owner, check_pattern(pattern), handler))
+        return self.declare(Subscription(self.owner, check_pattern(pattern), handler))
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
         """Answer questions."""
-        return self._declare(Service(self._owner, check_pattern(key), handler))
+        return self.declare(Service(self.owner, check_pattern(key), handler))
 
     def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
         """Ask everyone who serves the key (or a key that the pattern matches)."""
         check_pattern(key)
-        with self._using_session() as session:
+        with self.using_session() as session:
             if session is None:
                 return []
             try:
@@ -101,11 +105,11 @@ class ZenohBus:
 
     def announce(self, key: str) -> Closing:
         """Be alive under this key."""
-        return self._declare(Token(self._owner, check_key(key)))
+        return self.declare(Token(self.owner, check_key(key)))
 
     def watch(self, pattern: str, handler: Callable[[str, bool], None]) -> Closing:
         """Call the handler with who is alive, now and at each change."""
-        return self._declare(Watcher(self._owner, check_pattern(pattern), handler))
+        return self.declare(Watcher(self.owner, check_pattern(pattern), handler))
 
     def connected(self) -> bool:
         """Whether messages can leave now. A router is always connected."""
@@ -123,16 +127,16 @@ class ZenohBus:
 
     def close(self) -> None:
         """Take everything back and disconnect."""
-        with self._owner.lock:
+        with self.owner.lock:
             if self._closed.is_set():
                 return
             self._closed.set()
             session, self._session = self._session, None
-            declared, self._owner.declared = self._owner.declared, []
+            declared, self.owner.declared = self.owner.declared, []
         if self._connecting.is_alive():
             self._connecting.join()
-        self._owner.dispatcher.close()
-        for request in list(self._owner.open_requests):
+        self.owner.dispatcher.close()
+        for request in list(self.owner.open_requests):
             request.abandon()
         for entity in declared:
             entity.close()
@@ -143,7 +147,7 @@ class ZenohBus:
         exit_closing.forget(self)
 
     @contextmanager
-    def _using_session(self) -> Iterator[zenoh.Session | None]:
+    def using_session(self) -> Iterator[zenoh.Session | None]:
         """The session, if there is one; `close` waits until its users are done.
 
         The interpreter kills a daemon thread that it finds inside Zenoh at its exit, and Rust answers that by
@@ -160,11 +164,16 @@ class ZenohBus:
                     self._in_use -= 1
                     self._in_use_changed.notify_all()
 
-    def _declare(self, declared: _D) -> _D:
-        with self._owner.lock:
+    def declare(self, declared: _D) -> _D:
+        """Declare something now, or once there is a session.
+
+        Raises:
+            NotConnected: the bus is closed.
+        """
+        with self.owner.lock:
             if self._closed.is_set():
                 raise NotConnected("this bus is closed")
-            self._owner.declared.append(declared)
+            self.owner.declared.append(declared)
             if self._session is not None:
                 declared.declare(self._session)
         return declared
@@ -185,10 +194,10 @@ class ZenohBus:
                 self._closed.wait(wait)
                 wait = min(2 * wait, RETRY_LONGEST)
                 continue
-            with self._owner.lock:
+            with self.owner.lock:
                 if not self._closed.is_set():
                     try:
-                        for declared in self._owner.declared:
+                        for declared in self.owner.declared:
                             declared.declare(session)
                         self._session = session
                         return

@@ -17,7 +17,7 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "period_max_ms": round(RETRY_LONGEST * 1e3),
         "period_increase_factor": 2,
     }
-    return {
+    values: dict[str, object] = {
         "mode": settings.mode,
         "connect/endpoints": list(settings.endpoints) if settings.mode == "client" else [],
         "listen/endpoints": list(settings.listen) if settings.mode == "router" else [],
@@ -33,3 +33,8 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "transport/link/tx/queue/size/data": ROUTER_QUEUE if settings.mode == "router" else 2,
         "transport/shared_memory/enabled": False,
     }
+    if settings.session:
+        values["id"] = settings.session
+    if settings.timestamps:
+        values["timestamping/enabled"] = True
+    return values

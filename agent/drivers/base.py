@@ -27,12 +27,16 @@ class BaseReading:
         proximity: (K,) m from the robot's edge; the reach where nothing is near.
         bumped: whether the bumper is pressed.
         battery: charge, as a share; None if the base does not tell.
+        kidnapped: whether the base notices that it has been lifted off the floor.
+        stamp_ns: when it was measured, as `clock.now_ns`; None if it was while it was read.
     """
 
     way: Wheels
     proximity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     bumped: bool = False
     battery: float | None = None
+    kidnapped: bool = False
+    stamp_ns: int | None = None
 
 
 class Base(Protocol):

@@ -85,6 +85,7 @@ class _Observation(msgspec.Struct):
     odometry: tuple[Way, Way] = msgspec.field(name="u")
     proximity: Annotated[list[Reach], Meta(max_length=MAX_RANGERS)] = msgspec.field(name="r")
     bumped: bool = msgspec.field(name="b")
+    kidnapped: bool = msgspec.field(name="k", default=False)
     size: tuple[Side, Side] = msgspec.field(name="s", default=(1, 1))
     encoding: str = RAW
     image: bytes | None = msgspec.field(name="i", default=None)
@@ -120,6 +121,8 @@ def encode_observation(observation: Observation) -> bytes:
     }
     if observation.battery is not None:
         fields["battery"] = observation.battery
+    if observation.kidnapped:
+        fields["k"] = True
     if observation.image is not None:
         image = np.ascontiguousarray(observation.image)
         if image.ndim != 2 or image.dtype != np.uint8:
@@ -142,8 +145,9 @@ def decode_observation(data: bytes) -> Observation:
             f"observation: odometry of {forward:g} m and {turn:g} rad in one step is out of range"
         )
     image = None if seen.image is None else _image(seen.encoding, seen.size, seen.image)
-    proximity = np.array(seen.proximity)
-    return Observation(seen.stamp_ns, Odometry(forward, turn), image, proximity, seen.bumped, seen.battery)
+    odometry, proximity = Odometry(forward, turn), np.array(seen.proximity)
+    rest = seen.bumped, seen.battery, seen.kidnapped
+    return Observation(seen.stamp_ns, odometry, image, proximity, *rest)
 
 
 def check_image(observation: Observation, description: RobotDescription) -> None:

@@ -30,6 +30,7 @@ SHIPPED: Mapping[str, str] = {
     "create": "mapweave.agent.drivers.create:Create",
     "koala": "mapweave.agent.drivers.koala:Koala",
     REMOTE: "mapweave.agent.drivers.remote:RemoteRobot",
+    "ros2": "mapweave.agent.drivers.ros2:Ros2",
     "waveshare": "mapweave.agent.drivers.waveshare:Waveshare",
 }
 """Drivers of this package; available without installed metadata."""

@@ -13,6 +13,7 @@ import select
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 
 SILENCE = 0.3
 """s after the last command until the wheels are stopped; an agent gives one each 0.1 s."""
@@ -28,12 +29,15 @@ class WheelGuard:
             port: file descriptor of the open port.
             stop: bytes that stop the wheels, even after an incomplete command.
         """
-        # Without site packages the process starts in some ten milliseconds. A new session: Ctrl-C in the
-        # terminal must not end the guard before the driver.
+        # Without site packages the process starts in some ten milliseconds.
+        self._start([sys.executable, "-I", "-S", __file__, stop.hex(), str(SILENCE)], port)
+
+    def _start(self, command: list[str], output: int) -> None:
+        """Start the process; its standard output is a file descriptor, or what `subprocess` takes."""
+        # A new session: Ctrl-C in the terminal must not end the guard before the driver.
         self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", __file__, stop.hex(), str(SILENCE)],
-            stdin=subprocess.PIPE, stdout=port, start_new_session=True,
-        )  # fmt: skip
+            command, stdin=subprocess.PIPE, stdout=output, start_new_session=True
+        )
         assert self._process.stdin is not None
         self._pipe = self._process.stdin.fileno()
         os.set_blocking(self._pipe, False)
@@ -63,8 +67,13 @@ def _write(data: bytes) -> None:
         os.write(1, data)
 
 
-def main(stop: bytes, silence: float) -> None:
-    """Run until the input ends."""
+def watch(stop: Callable[[], None], silence: float) -> None:
+    """Run until the input ends.
+
+    Args:
+        stop: stops the wheels.
+        silence: s without a command after which it is called.
+    """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         # Only the end of the driver process ends the guard.
         signal.signal(number, signal.SIG_IGN)
@@ -76,9 +85,10 @@ def main(stop: bytes, silence: float) -> None:
             break
         moving = said[-1:] == b"1"
         if not ready:
-            _write(stop)
-    _write(stop)
+            stop()
+    stop()
 
 
 if __name__ == "__main__":
-    main(bytes.fromhex(sys.argv[1]), float(sys.argv[2]))
+    _stop = bytes.fromhex(sys.argv[1])
+    watch(lambda: _write(_stop), float(sys.argv[2]))

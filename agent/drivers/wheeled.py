@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +91,7 @@ class WheeledRobot:
                 read_ns, reading = self._readings[-1]
                 self._stamp_ns = read_ns - self._age_ns
                 self._odometry_at = reading.way
-            self._description = self._settings.describe(self._base.geometry)
+            self._description = self._put_together()
         return self._description
 
     def sense(self) -> Observation | None:
@@ -137,6 +138,7 @@ class WheeledRobot:
             reading.proximity if used else np.zeros(0),
             reading.bumped and fresh,
             reading.battery,
+            reading.kidnapped and fresh,
         )
 
     def act(self, command: Command) -> Command:
@@ -163,6 +165,10 @@ class WheeledRobot:
         if self._thread is not threading.current_thread():
             self._thread.join(2.0)
         self._camera.close()
+
+    def _put_together(self) -> RobotDescription:
+        """Description of the robot, once the base has answered."""
+        return self._settings.describe(self._base.geometry)
 
     def _wheels(self, command: Command) -> Wheels:
         """Wheel speeds of a command within the limits."""
@@ -215,8 +221,13 @@ class WheeledRobot:
             self._base.drive(command)
         asked = now_ns()
         reading = self._base.read()
+        stamp_ns = (asked + now_ns()) // 2 if reading.stamp_ns is None else reading.stamp_ns
         with self._changed:
-            self._readings.append(((asked + now_ns()) // 2, reading))
+            if self._readings and stamp_ns <= self._readings[-1][0]:
+                # The wheels' newest way is known; what the other sensors say may be news.
+                stamp_ns, known = self._readings.pop()
+                reading = replace(reading, way=known.way)
+            self._readings.append((stamp_ns, reading))
             if self._failure and self._opened:
                 log.warning("the robot answers again")
             self._opened, self._failure = True, ""

@@ -40,12 +40,14 @@ class ExplorationBehaviours:
     Attributes:
         phase: what it is doing.
         detail: why, in words.
+        patience: how many times longer than usual a drive may take.
     """
 
     def __init__(self, description: RobotDescription, mapper: Episode, settings: ExplorerSettings) -> None:
         """Take the robot's description, and the mapper that the pipeline keeps up to date."""
         self.phase = Phase.LOOKING
         self.detail = ""
+        self.patience = 1.0
         self._description = description
         self._mapper = mapper
         self._settings = settings
@@ -81,7 +83,7 @@ class ExplorationBehaviours:
         self.phase = Phase.DRIVING
         self._drive.start(reach)
         far_end = False
-        for _ in self._ticks(4 * abs(reach) / 0.1 + 40):
+        for _ in self._ticks(4 * abs(reach) / 0.1 * self.patience + 40):
             since = self._mapper.anchor_from_robot
             command, done, reason = self._drive.command(
                 since.x, since.heading, self._mapper.bearings, self._now.proximity

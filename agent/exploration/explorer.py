@@ -39,7 +39,10 @@ class Explorer:
 
     Attributes:
         places: where it has made a full turn, (x, y) m in map.
+        spacing: least distance between two of them, m.
     """
+
+    spacing = SPACING
 
     def __init__(
         self,
@@ -115,7 +118,11 @@ class Explorer:
             self._ask()
             if not (yield from self._moves.travel(path)):
                 self._avoid.append(path[-1])
-        self._moves.phase = Phase.DONE
+        yield from self._stand()
+
+    def _stand(self) -> Iterator[Move]:
+        """There is no place left to go."""
+        self._moves.phase, self._moves.detail = Phase.DONE, ""
         while True:
             yield Command()
 
@@ -147,7 +154,7 @@ class Explorer:
         s = self._settings
         been = np.array(self.places + self._avoid)
         fleet_places = self._fleet_coverage.places(self._views, COVERED_REACH, COVERED_SHARE)
-        return next_viewpoint(self._floor, self._moves.position, been, fleet_places, s)
+        return next_viewpoint(self._floor, self._moves.position, been, fleet_places, s, self.spacing)
 
     @property
     def _views(self) -> Array:

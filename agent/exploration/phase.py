@@ -14,3 +14,4 @@ class Phase(StrEnum):
     SCANNING = "turning where the map shows everything already"
     TRAVELLING = "travelling to the next place"
     DONE = "no new place in reach: exploration is complete"
+    NOT_DARED = "standing: the rest cannot be reached over floor that the camera has shown free"

@@ -58,6 +58,7 @@ def next_viewpoint(
     visited: Array,
     covered_by_others: Array,
     settings: ExplorerSettings,
+    spacing: float = SPACING,
 ) -> list[Array]:
     """Corners of the way to the place where the robot should make its next full turn; empty if there is none.
 
@@ -70,6 +71,7 @@ def next_viewpoint(
         visited: (N, 2) m, in map, N > 0: where there is nothing more to be seen.
         covered_by_others: (M, 2) m, in map: places that others have covered.
         settings: of the exploration.
+        spacing: least distance of the next place from these, m.
     """
     ways = floor.ways(position, REACH)
     for choose in (_new_area, _closer_view):
@@ -78,7 +80,7 @@ def next_viewpoint(
         ):
             taken = np.concatenate([visited, skipped])
             away = np.linalg.norm(ways.positions[:, None] - taken[None], axis=2).min(axis=1)
-            free = np.flatnonzero(away >= SPACING)
+            free = np.flatnonzero(away >= spacing)
             path = choose(floor, ways, free, skipped, settings) if len(free) else []
             if path:
                 return path

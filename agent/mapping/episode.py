@@ -18,11 +18,12 @@ class EpisodeRequest(Enum):
     ADD_VIEW = auto()
     """Keep the current image as a further node, for example at the far end of a drive."""
     FINISH = auto()
-    """End the episode: its views become nodes, and the current image becomes the next anchor."""
+    """End the episode: its views become nodes, and the current image becomes the next anchor. This ends the
+    tick."""
 
 
 Move = Command | EpisodeRequest
-"""What a behaviour does next. A command ends its tick; a request is met at once."""
+"""What a behaviour does next. A command ends its tick, and so does `FINISH`."""
 
 
 class Episode(Protocol):

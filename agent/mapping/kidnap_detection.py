@@ -16,23 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.image_quality import BLACK, LEAST_CORNERS, MOST_CLIPPED, WHITE, strongest_corners
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
-PATCH_PX = 11
-"""Side of the square in which texture is measured, about that of a tracked patch."""
-
-GRID = (6, 8)
-"""Rows and columns of the image's cells, each of which gives at most one corner."""
-
 LEAST_GAIN, MOST_GAIN = 0.5, 4.0
 """How much a light may change: a darker image has too few grey levels left to be tracked in, and one that is
 made much fainter to be like a blank wall shows as little as that."""
-
-BLACK, WHITE = 5, 250
-"""Grey levels beyond which a camera is saturated."""
 
 
 class FrameOverlap(Enum):
@@ -54,12 +46,6 @@ BORDER_PX = 12.0
 """Points expected nearer to the border may well have left."""
 ASTRAY_PX = 20.0
 """A point found further than this from where it is expected is another one."""
-LEAST_TEXTURE = 8.0
-"""Mean squared gradient around a corner in its weakest direction, (grey/px)^2."""
-LEAST_CORNERS = 6
-"""An image with fewer corners shows nothing."""
-MOST_CLIPPED = 0.5
-"""An image of which a larger share is black or white shows nothing."""
 FEW_POINTS = 30
 """With fewer points than this, the whole image is compared as well."""
 COARSE = 8
@@ -113,7 +99,7 @@ class KidnapDetector:
         if few and self._alike(before, now, turn):
             return FrameOverlap.SAME
         clipped = float(((now <= BLACK) | (now >= WHITE)).mean())
-        blank = clipped > MOST_CLIPPED or len(self._corners(now)) < LEAST_CORNERS
+        blank = clipped > MOST_CLIPPED or len(strongest_corners(now)) < LEAST_CORNERS
         return FrameOverlap.BLANK if blank else FrameOverlap.STRANGE
 
     def _same(self, expected: Array, followed: Array) -> bool | None:
@@ -143,7 +129,7 @@ class KidnapDetector:
         return spread > LEAST_SPREAD**2 and float((a * b).mean()) > ALIKE * spread
 
     def _corners_agree(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool | None:
-        corners = self._corners(before)
+        corners = strongest_corners(before)
         if len(corners) < LEAST:
             return None
         tracker = Tracker(self._lens, self._tracker)
@@ -154,20 +140,6 @@ class KidnapDetector:
         followed = np.full(expected.shape, np.nan)
         followed[tracker.ids] = tracker.pixels
         return self._same(expected, followed)
-
-    def _corners(self, image: NDArray[np.uint8]) -> Array:
-        """(N, 2) px in the real image: the strongest corner of each cell that has one."""
-        strength = cv2.cornerMinEigenVal(cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32), PATCH_PX)
-        rows, columns = (side // n for side, n in zip(image.shape, GRID, strict=True))
-        cropped = strength[: rows * GRID[0], : columns * GRID[1]].reshape(GRID[0], rows, GRID[1], columns)
-        cells = cropped.transpose(0, 2, 1, 3).reshape(GRID[0] * GRID[1], rows * columns)
-        best, cell = cells.argmax(axis=1), np.arange(len(cells))
-        # OpenCV sums (2 * gradient / block)^2 over the block: four times the mean.
-        strong = cells[cell, best] / 4.0 >= LEAST_TEXTURE
-        x = cell % GRID[1] * columns + best % columns
-        y = cell // GRID[1] * rows + best // columns
-        corners: Array = np.stack([x, y], axis=1)[strong].astype(np.float64)
-        return corners
 
 
 def relit(image: NDArray[np.uint8], like: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.edge_measurement.traverse import Traverse
+from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.mapping.anchored_keyframe import HERE
 from mapweave.agent.mapping.episode import EpisodeRequest
@@ -63,6 +65,11 @@ class Mapper:
         self._wayside = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
+        # Features take as long as all else in a tick that makes nodes. A thread extracts them while the robot
+        # waits for its next image. The next tick begins by waiting for them: no result depends on speed.
+        self._extraction = ThreadPoolExecutor(1, "features")
+        self._extracting: tuple[Future[Features], Callable[[Features], None]] | None = None
+        self._ended = False
 
     # What behaviours read, see `Episode`
 
@@ -80,6 +87,11 @@ class Mapper:
     def astray(self) -> bool:
         """Whether there is a map and the robot does not know where on it it is: it must recognise a place."""
         return self._anchor is None and bool(self.map.nodes)
+
+    @property
+    def between_episodes(self) -> bool:
+        """Whether an episode has ended in this tick. The next begins with the next tick, at this image."""
+        return self._ended
 
     @property
     def doubtful(self) -> bool:
@@ -155,6 +167,11 @@ class Mapper:
         """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
         return self._tracking.converged_share
 
+    @property
+    def landmarks(self) -> LandmarkEstimates:
+        """The filter's landmarks, in robot."""
+        return self._tracking.landmarks()
+
     def take_changes(self) -> tuple[ChangeBody, ...]:
         """What was changed in the map since the last call; the only way by which nodes and edges leave."""
         return self._cartographer.take_changes()
@@ -167,6 +184,7 @@ class Mapper:
 
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
+        self._use_extracted()
         self._tracking.step(observation)
         if self._tracking.acceptance.carried_off or self._tracking.disputed:
             self.lose()
@@ -190,9 +208,9 @@ class Mapper:
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
-        anchor = self._take(observation, HERE)
-        if anchor is not None:
-            self._begin_at(anchor)
+        if observation.image is not None:
+            features = self._extract(observation.image).result()
+            self._begin_at(self._tracking.take(observation, features, HERE))
 
     def lose(self) -> None:
         """The robot's pose is lost. Observations since the anchor view are dropped.
@@ -203,6 +221,7 @@ class Mapper:
         self._take_up_pending()
         self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._leaves = None, []
+        self._extracting, self._ended = None, False
 
     def resume(
         self, observation: Observation, features: Features, node: Node, recognition: Recognition
@@ -230,10 +249,16 @@ class Mapper:
 
     def leaf(self, observation: Observation) -> None:
         """Keep the current image as a further node, for example at the far end of a drive."""
-        view = self._take(observation, self._tracking.pose)
-        if view is not None:
-            self._tracking.remember(force=True)
-            self._leaves.append(view)
+        if observation.image is None:
+            return
+        pose = self._tracking.pose
+        self._tracking.remember(force=True)
+
+        def take(features: Features) -> None:
+            self._leaves.append(self._tracking.take(observation, features, pose))
+
+        self._use_extracted()
+        self._extracting = self._extract(observation.image), take
 
     def finish(self, observation: Observation) -> bool:
         """End the episode: its views become nodes, and the current image becomes the next anchor.
@@ -241,30 +266,44 @@ class Mapper:
         Returns:
             Whether the anchor view became a node. False without an image.
         """
-        next_anchor = self._take(observation, HERE)
-        if next_anchor is None or self._anchor is None:
+        self._use_extracted()
+        if observation.image is None or self._anchor is None:
             return False
+        features = self._extract(observation.image)
         self._tracking.remember(force=True)
         node = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
         if node is not None:
             self.typical_depth = float(np.median(node.landmarks.depths))
-        moved = self._tracking.reanchor()
-        self._cartographer.move_anchor(moved)
-        if node is not None:
-            self._wayside.clear(next_anchor.stamp_ns)
-        else:
-            self._wayside.move_anchor(moved.mean)
-        self._anchor, self._leaves = next_anchor, []
-        if self._take_up_pending():
-            # Tracks of another lens are of no use to a filter of this one.
-            self._tracking = Tracking(self._description, self._lens, self._settings)
-            self._tracking.step(observation)
-            anchor = self._take(observation, HERE)
-            assert anchor is not None, "this observation has an image"
-            self._begin_at(anchor)
-        else:
-            self._tracking.follow(next_anchor, self.typical_depth)
+
+        def begin_next(features: Features) -> None:
+            anchor = self._tracking.take(observation, features, HERE)
+            moved = self._tracking.reanchor()
+            self._cartographer.move_anchor(moved)
+            if node is not None:
+                self._wayside.clear(anchor.stamp_ns)
+            else:
+                self._wayside.move_anchor(moved.mean)
+            self._anchor, self._leaves = anchor, []
+            if self._take_up_pending():
+                # Tracks and features of another lens are of no use to a filter of this one.
+                self._tracking = Tracking(self._description, self._lens, self._settings)
+                self._tracking.step(observation)
+                self.begin(observation)
+            else:
+                self._tracking.follow(anchor, self.typical_depth)
+
+        self._extracting, self._ended = (features, begin_next), True
         return node is not None
+
+    def _extract(self, image: NDArray[np.uint8]) -> Future[Features]:
+        """Have the features of an image extracted."""
+        return self._extraction.submit(self._sift.extract, image)
+
+    def _use_extracted(self) -> None:
+        """Use the features of the image before. Nothing was tracked since."""
+        if self._extracting is not None:
+            (features, take), self._extracting, self._ended = self._extracting, None, False
+            take(features.result())
 
     def _take_up_pending(self) -> bool:
         """Change to another geometry, between two episodes; returns whether there was any."""
@@ -274,8 +313,3 @@ class Mapper:
         self._sift = Sift(self._lens, self._settings.sift)
         self._cartographer.recalibrate(self._description)
         return True
-
-    def _take(self, observation: Observation, anchor_from_view: PoseGaussian) -> View | None:
-        if observation.image is None:
-            return None
-        return self._tracking.take(observation, self._sift.extract(observation.image), anchor_from_view)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 from enum import StrEnum
+from itertools import pairwise
 
 import numpy as np
 
+from mapweave.agent.cautious_driving import lacks_rangers
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.global_localization.candidates import Candidate, FleetMap, OwnMap
@@ -20,12 +22,13 @@ from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.navigation.blocked_edges import BlockedEdges
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.right_of_way import RightOfWay
 from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteProgress
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.node import EdgeKind, Node, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.vision.lens import Lens
@@ -42,10 +45,15 @@ class Stage(StrEnum):
     ASKING = "asking for a route"
     BLOCKED = "waiting at an obstacle"
     WAITING = "waiting for a route"
+    YIELDING = "waiting for another robot"
+    ASIDE = "stepping aside for another robot"
     ARRIVED = "parked at the goal"
     GIVEN_UP = "gave up its goal"
 
 
+RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
+"""Edges between places that look alike, which no robot need have driven. A robot without proximity sensors
+avoids those that are longer than its radius."""
 TIGHT = 0.07
 """Something nearer than this counts as what is in the way, m."""
 ANSWER_PATIENCE = 100
@@ -54,6 +62,10 @@ PAUSE = 2.0
 """How long it waits before what is in its way, and before it asks again for a route, s."""
 REFUSED = 20.0
 """A fleet that answers for so long that there is no way is believed, s: it may first have to merge."""
+YIELDED = 30.0
+"""How long it waits for another robot before it looks for another way, s."""
+THERE = 0.3
+"""It has stepped aside within this distance of the node, m."""
 TRUSTED = 1.0
 """After a block it still knows where it is if it has driven less than this blindly, m."""
 
@@ -112,10 +124,12 @@ class Navigator:
         self._failed_views = 0
         self._goal_hidden = False
         self._following = self._searching = self._parking_retried = False
+        self._touched = ""
         self._refused_since: float | None = None
         self._driven: set[tuple[NodeId, NodeId]] = set()
         self._progressed_at = 0.0
         self._refusing = False
+        self._aside: NodeId | None = None
         self._trouble = "it does not know where it is"
         self._behaviour = self._go()
 
@@ -155,6 +169,14 @@ class Navigator:
             self.detail = self._localization.detail
         return command, self._motion.questions()
 
+    def touch(self, what: str) -> None:
+        """Something was touched: the present edge is blocked.
+
+        Args:
+            what: in words.
+        """
+        self._touched = what
+
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
 
     def _go(self) -> Behaviour:
@@ -162,10 +184,14 @@ class Navigator:
             if self.fix is None:
                 yield from self._find()
             assert self.fix is not None, "the search ends with a fix"
-            route = yield from self._get_route(self.fix)
-            if route:
+            route = yield from self._get_route(self.fix, self.goal)
+            if (undriven := self._undriven(route)) is not None:
+                self._blocks.add(*undriven, self._motion.now)
+            elif route:
                 self._refused_since = None
                 yield from self._follow(route, self.fix)
+                if self._aside is not None and self.fix is not None:
+                    yield from self._step_aside(self.fix, self._aside)
             else:
                 yield from self._wait_for_a_way()
         yield from self._stand()
@@ -203,22 +229,32 @@ class Navigator:
             )  # fmt: skip
             self.fix = Fix.of(localizer)
 
-    def _get_route(self, fix: Fix) -> Generator[Command, None, tuple[RouteLeg, ...]]:
+    def _get_route(self, fix: Fix, goal: NodeId) -> Generator[Command, None, tuple[RouteLeg, ...]]:
         """Ask the fleet's map; without an answer use the own map."""
         self.stage = Stage.ASKING
         node_from_robot, blocked = fix.node_from_robot.mean, self._blocks.at(self._motion.now)
-        question = WhichWay(self._motion.number(), fix.node, self.goal, node_from_robot, blocked)
+        question = WhichWay(self._motion.number(), fix.node, goal, node_from_robot, blocked)
         answer = yield from self._motion.ask(question)
         content, trouble = answer.content, ""
         if not isinstance(content, RouteAnswer):
             trouble = f"{answer.error or 'no answer'}; "
-            content = onboard_route(self._own_map, fix.node, self.goal, blocked)
+            content = onboard_route(self._own_map, fix.node, goal, blocked)
         self.detail = f"{trouble}{content.reason}"
         if not content.legs:
             self._trouble = self.detail
         self._refusing = not (trouble or blocked)
         self.legs = self.legs or len(content.legs)
         return content.legs
+
+    def _undriven(self, route: tuple[RouteLeg, ...]) -> tuple[NodeId, NodeId] | None:
+        """The first leg of a route that no robot has driven; None without one, or if there are rangers."""
+        if not lacks_rangers(self._description):
+            return None
+        for before, leg in pairwise(route):
+            way = math.hypot(leg.previous_from_node.mean.x, leg.previous_from_node.mean.y)
+            if leg.kind in RECOGNISED and way > self._description.radius:
+                return before.node.id, leg.node.id
+        return None
 
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""
@@ -229,14 +265,20 @@ class Navigator:
             self._give_up(self._trouble)
         yield from self._motion.stand(PAUSE)
 
-    def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
-        """Follow a route until it is driven, or blocked, or the robot is lost."""
-        follower = RouteFollower(
+    def _follower(self, route: tuple[RouteLeg, ...], fix: Fix) -> RouteFollower:
+        return RouteFollower(
             self._description, self._lens, self._sift, route, fix, self._local_planner,
             self._settings, self._rng,
         )  # fmt: skip
-        self._following = True
+
+    def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
+        """Follow a route until it is driven, or blocked, or the robot is lost."""
+        follower = self._follower(route, fix)
+        right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
+        self._following, self._touched = True, ""
         while True:
+            if not (yield from self._let_pass(right_of_way, follower)):
+                return
             leg = follower.leg
             if follower.blocked not in self._driven:
                 self._driven.add(follower.blocked)
@@ -247,6 +289,8 @@ class Navigator:
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._failed_views = 0
+            if self._touched:
+                follower.progress = RouteProgress.BLOCKED
             if follower.progress not in (RouteProgress.DRIVING, RouteProgress.PARKING):
                 break
             yield command
@@ -271,6 +315,41 @@ class Navigator:
                 # By landmarks seen a moment ago it is at the goal, yet it sees none of the goal's landmarks.
                 self._goal_hidden = follower.fix.blind < self._settings.navigation.blind_distance
                 yield from self._relocalize()
+
+    def _let_pass(self, right_of_way: RightOfWay, follower: RouteFollower) -> Generator[Command, None, bool]:
+        """Stand while another robot holds the way ahead; returns whether to go on then."""
+        began, self._following, go_on = self._motion.now, False, True
+        while go_on and not right_of_way.may_drive(follower.leg, follower.fix):
+            if right_of_way.holder:
+                self.stage, self.detail = Stage.YIELDING, f"{right_of_way.holder} drives there"
+                self._trouble = f"{right_of_way.holder} is in the way"
+            self._aside = right_of_way.aside
+            go_on = self._aside is None
+            if go_on and self._motion.now - began > YIELDED:
+                # It is stuck, or stands there: another way may be free.
+                self._blocks.add(*follower.blocked, self._motion.now)
+                go_on = False
+            if go_on:
+                yield Command()
+        self._following = go_on
+        return go_on
+
+    def _step_aside(self, fix: Fix, node: NodeId) -> Behaviour:
+        """Drive to a node off another robot's way; then the way to the goal is asked for again."""
+        self._aside = None
+        route = yield from self._get_route(fix, node)
+        if not route:
+            yield from self._motion.stand(PAUSE)
+            return
+        follower = self._follower(route, fix)
+        right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
+        while follower.to_goal > THERE and follower.progress is RouteProgress.DRIVING:
+            if not (yield from self._let_pass(right_of_way, follower)):
+                return
+            command = follower.step(self._motion.observation)
+            self.fix, self.stage, self.detail = follower.fix, Stage.ASIDE, follower.detail
+            yield command
+        self._following = False
 
     def _report_block(self, a: NodeId, b: NodeId) -> Behaviour:
         """Something is in the way: report it, wait, then plan another route."""
@@ -308,6 +387,8 @@ class Navigator:
 
     def _obstacle(self) -> str:
         """The obstacle ahead, in words; empty if nothing is near."""
+        if self._touched:
+            return f"something was touched: {self._touched}"
         ranges = self._motion.observation.proximity
         bearings = self._description.ranger_bearings
         if len(ranges) == len(bearings) and len(bearings):

@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.recordings.bag_images import grey_of
 from mapweave.agent.recordings.damaged_bag import DamagedBag
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
-from mapweave.agent.recordings.pose_files import heading_of, read_poses
+from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import (
     Images,
     Recording,
@@ -23,33 +22,30 @@ from mapweave.agent.recordings.recording import (
     assembled,
     without_odometry,
 )
+from mapweave.agent.ros_messages.images import grey_of
+from mapweave.agent.ros_messages.values import (
+    CAMERA_TYPE,
+    IMAGE_TYPES,
+    ODOMETRY_TYPE,
+    TF_TYPE,
+    FixedTransforms,
+    Mount,
+    camera_of,
+    pose_of,
+    stamp_of,
+)
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
-from mapweave.hybridmap.pose import Array
-from mapweave.vision.lens import Distortion, LensModel, lens_of
+from mapweave.vision.lens import Distortion, lens_of
 
 SUFFIXES = {".bag", ".mcap", ".db3"}
-IMAGE_TYPES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 POSE_TYPES = (
-    "nav_msgs/msg/Odometry",
+    ODOMETRY_TYPE,
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
-ODOMETRY_TYPE, CAMERA_TYPE, TF_TYPE = POSE_TYPES[0], "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 TRUTH = ("truth", "gt", "amcl", "mocap", "vicon")
 """Parts of names of topics that are never taken for odometry."""
-LENS_MODELS = {
-    "plumb_bob": LensModel.RADIAL_TANGENTIAL,
-    "rational_polynomial": LensModel.RADIAL_TANGENTIAL,
-    "": LensModel.RADIAL_TANGENTIAL,
-    "equidistant": LensModel.EQUIDISTANT,
-    "fisheye": LensModel.EQUIDISTANT,
-}
-"""Lens models by ROS' names of them; some drivers write `fisheye`."""
-BASES = ("base_footprint", "base_link")
-"""Frames of a robot on the floor, and above it (REP 105)."""
-CAMERA_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""(3, 3) from x right, y down, z forward to x forward, y left, z up (REP 103)."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +99,7 @@ class Bag:
             try:
                 for arrived, message in part.messages(topic):
                     count += 1
-                    header = getattr(message, "header", None)
-                    stamp = 0 if header is None else header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-                    yield stamp or arrived, message
+                    yield stamp_of(message) or arrived, message
             except Exception as error:  # noqa: BLE001  # parsers raise whatever a damaged file leads them to
                 self.damaged(f"{self.path}: {topic} ends after {count} messages ({_line(error)})")
                 return
@@ -256,11 +250,7 @@ def _names(topics: Sequence[Topic]) -> str:
 
 
 def _poses(opened: Bag, topic: str) -> StampedPoses:
-    rows: list[tuple[int, float, float, float]] = []
-    for stamp, message in opened.messages(topic):
-        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-        q = pose.orientation
-        rows.append((stamp, pose.position.x, pose.position.y, heading_of(q.x, q.y, q.z, q.w)))
+    rows = [(stamp, *pose_of(message)) for stamp, message in opened.messages(topic)]
     stamps = np.array([row[0] for row in rows], np.int64)
     poses = np.array([row[1:] for row in rows]).reshape(-1, 3)
     good = np.isfinite(poses).all(axis=1)
@@ -291,32 +281,21 @@ def _camera(
     _, message = next(opened.messages(info.name), (0, None))
     if message is None:
         raise DeviceError(opened.damage[-1])
-    model = str(message.distortion_model)
-    if model not in LENS_MODELS:
-        known = " and ".join(name for name in LENS_MODELS if name)
-        raise DeviceError(f"{opened.path}: {info.name}: lens model {model!r} is not supported; {known} are")
-    # ROS 1 writes these in capitals.
-    k, d = (np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float) for name in "kd")
-    if len(d) > 5 and np.any(d[5:]):
-        raise DeviceError(f"{opened.path}: {info.name}: a lens of {len(d)} coefficients is not supported")
-    mount = _mount(opened, str(message.header.frame_id))
     try:
-        camera = Camera(
-            int(message.width), int(message.height), k[0], k[4], k[2], k[5],
-            mount_height=0.0 if mount is None else mount[2],
-            mount_forward=0.0 if mount is None else mount[0],
-        )  # fmt: skip
-        count = 4 if LENS_MODELS[model] is LensModel.EQUIDISTANT else 5
-        given = lens_of(camera, LENS_MODELS[model], [*d, 0.0, 0.0, 0.0, 0.0, 0.0][:count])
-    except (InvalidValue, IndexError) as error:
+        camera, model, coefficients = camera_of(message)
+        mount = _mount(opened, str(message.header.frame_id))
+        if mount is not None:
+            camera = replace(camera, mount_height=mount.up, mount_forward=mount.forward)
+        given = lens_of(camera, model, coefficients)
+    except (DeviceError, InvalidValue) as error:
         raise DeviceError(f"{opened.path}: {info.name}: {error}") from None
     if mount is not None:
-        notes.append(f"camera {mount[0]:.2f} m ahead of the axle and {mount[2]:.2f} m high, by tf")
-        if abs(mount[1]) > 0.05:
-            notes.append(f"the camera is {mount[1]:.2f} m to the left, which is not taken into account")
-        if abs(mount[3]) > math.radians(3.0):
+        notes.append(f"camera {mount.forward:.2f} m ahead of the axle and {mount.up:.2f} m high, by tf")
+        if abs(mount.left) > 0.05:
+            notes.append(f"the camera is {mount.left:.2f} m to the left, which is not taken into account")
+        if abs(mount.heading) > math.radians(3.0):
             notes.append(
-                f"the camera looks {math.degrees(mount[3]):.0f} deg to the left: it should look ahead"
+                f"the camera looks {math.degrees(mount.heading):.0f} deg to the left: it should look ahead"
             )
     return options.camera_of(opened.path, given, mount is not None)
 
@@ -325,42 +304,14 @@ def _namespace(topic: str) -> str:
     return topic.rsplit("/", 1)[0]
 
 
-def _mount(opened: Bag, frame: str) -> tuple[float, float, float, float] | None:
-    """Forward, left, up, m, and heading, rad, of a camera in the robot, by the fixed transforms."""
-    parents: dict[str, tuple[str, Array]] = {}
+def _mount(opened: Bag, frame: str) -> Mount | None:
+    """The mount of a camera, by the fixed transforms."""
+    transforms = FixedTransforms()
     for topic in opened.topics:
         if topic.kind == TF_TYPE and "static" in topic.name:
             for _, message in opened.messages(topic.name):
-                for one in message.transforms:
-                    parents[one.child_frame_id.lstrip("/")] = (
-                        one.header.frame_id.lstrip("/"),
-                        _matrix(one.transform),
-                    )
-    at, chain = frame.lstrip("/"), np.eye(4)
-    above: tuple[float, float, float, float] | None = None
-    for _ in range(len(parents) + 1):
-        if at in BASES:
-            ahead = chain[:3, :3] @ np.linalg.inv(CAMERA_FROM_OPTICAL)[:, 0]
-            x, y, z = chain[:3, 3].tolist()
-            above = x, y, z, math.atan2(ahead[1], ahead[0])
-        if at not in parents:
-            break
-        at, step = parents[at]
-        chain = step @ chain
-    return above
-
-
-def _matrix(transform: Any) -> Array:
-    q, t = transform.rotation, transform.translation
-    x, y, z, w = np.array([q.x, q.y, q.z, q.w]) / max(math.hypot(q.x, q.y, q.z, q.w), 1e-12)
-    out = np.eye(4)
-    out[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    out[:3, 3] = t.x, t.y, t.z
-    return out
+                transforms.add(message)
+    return transforms.camera(frame)
 
 
 def _sequential(opened: Bag, topic: str) -> Callable[[int], NDArray[np.uint8]]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import os
 import queue
 import struct
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.ros_messages import making
+from mapweave.agent.ros_messages.values import FOOTPRINT as BASE
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.equidistant import Equidistant
@@ -28,7 +30,7 @@ MCAP_END = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 
 WAITING = 200
 """Observations that wait for the disk; more are dropped, and counted."""
 JPEG_QUALITY = 95
-BASE, OPTICAL, ODOM = "base_footprint", "camera_optical_frame", "odom"
+OPTICAL, ODOM = "camera_optical_frame", "odom"
 """Frames of REP 105 and REP 103."""
 
 
@@ -145,6 +147,9 @@ class _Part:
         self._lossless = lossless
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._types = self._store.types
+        self._header, self._pose, self._twist = (
+            partial(function, self._make) for function in (making.header, making.pose, making.twist)
+        )
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         self._connections: dict[str, Any] = {}
@@ -209,22 +214,6 @@ class _Part:
 
     def _make(self, name: str, **fields: Any) -> Any:
         return self._types[name](**fields)
-
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-        stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
-    def _pose(self, pose: Pose2) -> Any:
-        position = self._make("geometry_msgs/msg/Point", x=pose.x, y=pose.y, z=0.0)
-        half = pose.heading / 2
-        turn = self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
-        return self._make("geometry_msgs/msg/Pose", position=position, orientation=turn)
-
-    def _twist(self, command: Command) -> Any:
-        linear = self._make("geometry_msgs/msg/Vector3", x=command.forward, y=0.0, z=0.0)
-        angular = self._make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=command.turn)
-        return self._make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
 
     def _camera_info(self) -> dict[str, Any]:
         c = self._description.camera

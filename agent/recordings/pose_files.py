@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mapweave.agent.recordings.recording import StampedPoses
+from mapweave.agent.ros_messages.values import heading_of
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
 from mapweave.storage.atomic_file import read_whole
@@ -39,11 +40,6 @@ def read_poses(path: Path) -> StampedPoses:
     rows = rows[np.append(True, np.diff(rows[:, 0]) > 0)]
     stamps = np.array([round(1e9 * t) for t in rows[:, 0]], np.int64)
     return StampedPoses(stamps, rows[:, 1:], f"{damage}; the poses before it are used" if damage else "")
-
-
-def heading_of(qx: float, qy: float, qz: float, qw: float) -> float:
-    """Heading of a rotation about the vertical, rad, from a quaternion of any length but zero."""
-    return math.atan2(2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
 
 
 def _csv(path: Path, text: str) -> tuple[Array, str]:

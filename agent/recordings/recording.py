@@ -16,7 +16,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.equidistant import Equidistant
-from mapweave.vision.lens import Distortion
+from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
 
 Stamps = NDArray[np.int64]
 
@@ -189,19 +189,27 @@ def assembled(
     factor = math.ceil(camera.width / MOST_WIDTH)
     if factor > 1:
         notes = (*notes, f"images are reduced {factor} times")
+    read = _reader(path, read, camera, factor)
+    camera = reduced(camera, factor)
     if isinstance(distortion, Equidistant):
-        distortion = distortion.reduced(factor)
+        field = math.degrees(2.0 * camera.semi_aperture)
+        notes = (*notes, f"fisheye images are rectified to {field:.0f} degrees")
+        read, distortion = _rectified(read, Lens(camera, distortion.reduced(factor))), NO_DISTORTION
     return Recording(
         path,
         kind,
-        reduced(camera, factor),
+        camera,
         distortion,
         stamps,
-        _reader(path, read, camera, factor),
+        read,
         increments,
         notes,
         damage,
     )
+
+
+def _rectified(read: Callable[[int], NDArray[np.uint8]], lens: Lens) -> Callable[[int], NDArray[np.uint8]]:
+    return lambda k: lens.rectified(read(k))
 
 
 def _silence(stamps_ns: Stamps, odometry_ns: Stamps) -> list[str]:

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import math
 
-from mapweave.agent.mission import Question, WhatIsKnown, WhereAmI
+from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import KnownAnswer, KnownRequest, RelocalizeAnswer, RouteAnswer, RouteRequest
+from mapweave.hybridmap.query import (
+    KnownAnswer,
+    KnownRequest,
+    RelocalizeAnswer,
+    ReserveAnswer,
+    ReserveRequest,
+    RouteAnswer,
+    RouteRequest,
+)
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode, encode_view
 
@@ -16,12 +24,13 @@ FARTHEST = 100.0
 cars lie up to ten metres apart."""
 
 
-def encode_query(keys: Keys, question: Question) -> tuple[str, bytes]:
+def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes]:
     """Which server to ask, and how.
 
     Args:
         keys: of the fleet.
         question: any.
+        robot: the asking one.
 
     Raises:
         InvalidValue: no message can hold it.
@@ -31,11 +40,16 @@ def encode_query(keys: Keys, question: Question) -> tuple[str, bytes]:
     if isinstance(question, WhatIsKnown):
         around = KnownRequest(question.map, question.x, question.y, question.reach)
         return keys.any_known(), encode(around)
+    if isinstance(question, MayIDrive):
+        reserve = ReserveRequest(robot, question.start, question.start_from_robot, question.route)
+        return keys.any_reserve(), encode(reserve)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
     return keys.any_route(), encode(request)
 
 
-def decode_answer(question: Question, payload: bytes) -> RelocalizeAnswer | RouteAnswer | KnownAnswer:
+def decode_answer(
+    question: Question, payload: bytes
+) -> RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer:
     """A server's answer to a question.
 
     Raises:
@@ -48,6 +62,8 @@ def decode_answer(question: Question, payload: bytes) -> RelocalizeAnswer | Rout
         return answer
     if isinstance(question, WhatIsKnown):
         return decode(payload, KnownAnswer)
+    if isinstance(question, MayIDrive):
+        return decode(payload, ReserveAnswer)
     route = decode(payload, RouteAnswer)
     for leg in route.legs:
         _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")

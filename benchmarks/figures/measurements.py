@@ -28,5 +28,6 @@ MEASUREMENTS: dict[str, str] = {
     "rules_places": "python -m benchmarks.rules --places 1000 --seed 708 --json",
     "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
     "--seed 723 --json",
+    "agent": "python -m benchmarks.agent --seed 724 --json",
     "life": "python -m benchmarks.life --drives 6 --stops 4 --seed 713 --json",
 }

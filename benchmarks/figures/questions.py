@@ -255,4 +255,27 @@ LIFE = Question(
         ),
     ),
 )
-QUESTIONS = (FILTERS, DRIVING, LANDMARKS, LOST, MERGING, LIFE)
+SMALL_COMPUTERS = Question(
+    "What does an agent need?",
+    (
+        Row(
+            "a tick of the whole agent on one core, base installation: median, 99th percentile by the clock",
+            "{tick_ms_p50:.1f}, {tick_ms_p99:.0f} ms",
+            "agent",
+            "at most 10, 40 ms",
+        ),
+        Row(
+            "the same by the processor time of the loop; a tick in which a node is made, by the clock",
+            "{tick_cpu_ms_p50:.1f}, {tick_cpu_ms_p99:.0f} ms; {node_ms:.0f} ms",
+            "agent",
+        ),
+        Row(
+            "the same with numba: median, 99th percentile by the clock; memory",
+            "{with_numba/tick_ms_p50:.1f}, {with_numba/tick_ms_p99:.0f} ms; {with_numba/rss_mb:.0f} MB",
+            "agent",
+        ),
+        Row("memory; imports", "{rss_mb:.0f} MB; {import_s:.1f} s", "agent", "at most 300 MB, 2 s"),
+        Row("wheels of the base installation", "{wheel_mb:.0f} MB", "agent"),
+    ),
+)
+QUESTIONS = (FILTERS, DRIVING, SMALL_COMPUTERS, LANDMARKS, LOST, MERGING, LIFE)

@@ -20,6 +20,7 @@ from mapweave.sim.worlds.catalog import make_world
 from mapweave.vision.lens import Lens
 
 WORLDS = ("office", "arena", "warehouse", "corridor")
+LENSES = ("webcam", "wide", "phone", "cheap")
 CLEARANCE = 0.3
 NEAR, TURNED = 0.5, math.radians(20.0)
 """Other poses are up to so far from the place, m forth or aside and rad."""
@@ -46,7 +47,7 @@ class SimulatedPlace:
     @staticmethod
     def draw(rng: np.random.Generator) -> SimulatedPlace:
         """Some place of some building, through one of the simulator's cameras."""
-        kind, name = str(rng.choice(WORLDS)), str(rng.choice(list(CAMERAS)))
+        kind, name = str(rng.choice(WORLDS)), str(rng.choice(LENSES))
         world, setup = make_world(kind, int(rng.integers(1 << 20))), CAMERAS[name]
         camera, surfaces = setup.intrinsics, Surfaces(world)
         grid = np.stack(np.meshgrid(np.arange(20, 320, 20.0), np.arange(20, 160, 20.0)), -1).reshape(-1, 2)

@@ -35,6 +35,7 @@ FINER = 4
 TEXEL_PX = 1.25
 """How large a photograph's pixel is seen at first."""
 WORLDS = ("office", "arena", "warehouse", "corridor")
+LENSES = ("webcam", "wide", "phone", "cheap")
 BORDER_PX = 4.0
 SAME_POINT = 0.005
 """m; a ray that meets something further than this from a point does not see it."""
@@ -146,7 +147,7 @@ def _drawn(picture: Image, to_image: Array, camera: Camera) -> NDArray[np.float3
 
 def room_drive(rng: np.random.Generator, frames: int) -> Drive:
     """A drive in a simulated building, through one of the simulator's cameras."""
-    kind, lens = str(rng.choice(WORLDS)), str(rng.choice(list(CAMERAS)))
+    kind, lens = str(rng.choice(WORLDS)), str(rng.choice(LENSES))
     world, setup = make_world(kind, int(rng.integers(1 << 20))), CAMERAS[lens]
     camera, surfaces, steps = setup.intrinsics, Surfaces(world), way(rng, frames)
     grid = np.stack(np.meshgrid(np.arange(20, 320, 20.0), np.arange(20, 160, 20.0)), -1).reshape(-1, 2)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mapweave.agent.drivers.settings import RobotSettings
     from mapweave.agent.synchronization import Synchronization
     from mapweave.wire.bus import Bus
+    from mapweave.wire.ros2.settings import Ros2Link
 
 
 def add_to(commands: Any) -> None:
@@ -40,6 +41,10 @@ def add_to(commands: Any) -> None:
         "--mission", choices=["idle", "explore", "carried"],
         help="what to do now (default: go on with the last mission; a robot without one explores)",
     )  # fmt: skip
+    parser.add_argument(
+        "--without-rangers", action="store_true",
+        help="a robot without proximity sensors may explore, slowly, by its camera and by touch",
+    )  # fmt: skip
     parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
     parser.add_argument(
         "--epoch", type=int, help="least number of a new map (default: the next one, as the server knows it)"
@@ -51,6 +56,11 @@ def add_to(commands: Any) -> None:
     which.add_argument("--resume", metavar="MAP", help="go on with this map of the journal, for example r0.3")
     add_calibration(parser)
     parser.add_argument("--record", type=Path, metavar="DIR", help="record what the robot senses, as MCAP")
+    parser.add_argument(
+        "--ros2", nargs="?", const="", metavar="ENDPOINT",
+        help="publish pose, tf, path and map as ROS 2 topics, for rviz and Nav2 (docs/ros2.md), through this "
+        "Zenoh router (default: that of the driver ros2, else tcp/127.0.0.1:7447)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
@@ -121,8 +131,12 @@ def run(arguments: argparse.Namespace) -> int:
             synchronization=synchronization,
             server=network.server,
             calibration=calibration_of(arguments, name),
+            ros2=None if arguments.ros2 is None else ros2_link(arguments, settings.robot),
         )
-        run_agent(CheckedRobot(robot), bus, keys, settings.agent, options, stop)
+        agent = settings.agent
+        if arguments.without_rangers:
+            agent = replace(agent, exploration=replace(agent.exploration, without_rangers=True))
+        run_agent(CheckedRobot(robot), bus, keys, agent, options, stop)
     finally:
         if robot is not None:
             robot.close()
@@ -146,6 +160,21 @@ def calibration_of(arguments: argparse.Namespace, name: str) -> Path:
     """The file of what was measured of a robot."""
     folder: Path = arguments.calibration
     return folder / f"{name}.toml"
+
+
+def ros2_link(arguments: argparse.Namespace, settings: RobotSettings) -> Ros2Link:
+    """Where to publish: where the robot's own topics are, if it has any."""
+    from mapweave.agent.drivers.ros2 import Ros2Options
+    from mapweave.storage.settings_file import build
+    from mapweave.wire.ros2.settings import Ros2Link
+
+    link = Ros2Link()
+    if (arguments.robot or settings.driver) == "ros2":
+        link = build(Ros2Options, settings.options, "[robot.options]")
+    if arguments.ros2:
+        link = replace(link, endpoint=arguments.ros2)
+    link.domain_id()
+    return link
 
 
 def print_error(line: str) -> None:

@@ -144,9 +144,12 @@ def _live(
         camera = Capture(settings)
         stack.callback(camera.close)
         console.print(f"{collection.detector.target}. Ctrl-C ends it with the views so far.", highlight=False)
-        for image, guidance in guide(camera, collection, console):
-            if page is not None:
-                page.show(guidance_picture(image, guidance, collection.views))
+        try:
+            for image, guidance in guide(camera, collection, console):
+                if page is not None:
+                    page.show(guidance_picture(image, guidance, collection.views))
+        except KeyboardInterrupt:
+            console.print("stopped; the views so far are used")
 
 
 def _recorded(collection: ViewCollection, path: Path, console: Console) -> None:

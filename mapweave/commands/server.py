@@ -47,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.node import check_name
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
+    from mapweave.processes.service_manager import ServiceManager
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
@@ -78,8 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
             if address is not None:
                 stack.enter_context(Web(address, server, commands=arguments.http_commands))
                 print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
-            last_line = ""
+            last_line, manager = "", ServiceManager()
+            manager.ready()
             while not stop.wait(1.0):
+                manager.alive()
                 now = server.summary()
                 if now != last_line:
                     print(now, flush=True)

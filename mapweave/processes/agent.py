@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,9 +17,11 @@ from mapweave.agent.calibration.correction import declaring, geometry_of
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.ranger_monitor import announcement
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile
 from mapweave.agent.replication.epochs import newest_on_server, next_epoch
@@ -29,12 +32,16 @@ from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
+from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NUMBER, MapId, NodeId
+from mapweave.processes.ros2_publisher import Ros2Publisher
+from mapweave.processes.service_manager import ServiceManager
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
+from mapweave.wire.ros2.settings import Ros2Link
 from mapweave.wire.traffic_meter import TrafficMeter
 from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -43,6 +50,9 @@ FIRST_PATIENCE = 3.0
 
 SILENCE = 2.0
 """s; a longer wait for the robot is reported."""
+
+SERVER_PATIENCE = 20.0
+"""s without the map server after which that is reported."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +74,7 @@ class AgentOptions:
         trajectories: whether the pose at each observation goes to a file beside the map's.
         patience: how long to wait at the end until the server has everything, s.
         calibration: file with what `mapweave calibrate` has measured of this robot, if it exists.
+        ros2: where pose and map are published as ROS 2 topics; None if they are not.
     """
 
     name: str
@@ -80,6 +91,7 @@ class AgentOptions:
     trajectories: bool = False
     patience: float = 5.0
     calibration: Path | None = None
+    ros2: Ros2Link | None = None
 
 
 def measured(description: RobotDescription, calibration: Path | None) -> RobotDescription:
@@ -127,20 +139,26 @@ class Agent:
         self._bus = TrafficMeter(bus)
         self._keys = keys
         self._settings = replace(settings, seed=options.seed)
+        self._teleoperation = Teleoperation()
         self._options = options
         self._on_step = on_step
         self._causes = 0
         self._print = print_line
+        self._server_missing, self._server_ns = False, 0
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
             self.missions = MissionControl(
-                options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server
-            )
+                options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server,
+                lambda save: threading.Thread(target=save, name="missions").start(),
+            )  # fmt: skip
             if options.mission is not None or self.missions.report is None:
                 self.missions.begin(options.mission or options.otherwise)
             self.missions.unknown_goal = self._unknown_goal
             self._description = measured(describe(), options.calibration)
+            explores = settings.exploration.without_rangers
+            for line in announcement(self._description, options.name, explores):
+                print_line(f"{options.name}: {line}")
             maps = self.journal.maps()
             if options.resume is not None or (maps and not options.fresh):
                 self._resume(self._chosen(maps))
@@ -199,23 +217,47 @@ class Agent:
         self.merged_poses = MergedPoses(self._bus, self._keys, options.name, options.server)
         self._fleet = FleetClient(
             self._bus, self._keys, map_id, self.missions, options.synchronization.answer_timeout,
-            options.server, self.replicator.unacknowledged, self._placed,
+            options.server, self.replicator.unacknowledged, self._placed, self._teleoperation,
+            (self._description.max_forward, self._description.max_turn),
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)
         self._trajectory = TrajectoryFile(path) if options.trajectories else None
         self.runner = Runner(
-            pipeline, self._fleet, self.replicator, self.missions, options.synchronization, self._stepped
-        )
+            pipeline, self._fleet, self.replicator, self.missions, MappingMonitor(self._description),
+            options.synchronization, self._stepped, self._say,
+        )  # fmt: skip
+
+    def _say(self, line: str) -> None:
+        self._print(f"{self._options.name}: {line}")
 
     def _stepped(self, observation: Observation, step: Step) -> None:
         if self._trajectory is not None and step.status.located:
             self._trajectory.add(observation.stamp_ns, step.status.map_from_robot)
+        self._look_for_server(observation.stamp_ns)
         self._on_step(observation, step)
         # A geometry that is found to be declared wrongly is reported once.
         causes = self.pipeline.calibration.causes
         for cause in causes[self._causes :]:
             self._print(f"{self._options.name}: {cause}")
         self._causes = len(causes)
+
+    def _look_for_server(self, stamp_ns: int) -> None:
+        """Say once that the map server is missing, and when it is there."""
+        if self._options.patience <= 0.0:
+            return
+        server = self._options.server
+        if self._fleet.server_in_reach():
+            if self._server_missing:
+                self._say(f"map server {server} is in reach")
+            self._server_missing, self._server_ns = False, stamp_ns
+        elif not self._server_ns:
+            self._server_ns = stamp_ns
+        elif not self._server_missing and stamp_ns - self._server_ns > SERVER_PATIENCE * 1e9:
+            self._server_missing = True
+            self._say(
+                f"no map server {server} in reach for {SERVER_PATIENCE:g} s: what is mapped stays on this "
+                "disk; start `mapweave server`, with the same --fleet"
+            )
 
     @property
     def map_id(self) -> MapId:
@@ -225,6 +267,7 @@ class Agent:
     def begin_new_map(self) -> None:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
         mission, old, calibration = self.pipeline.mission, self.map_id, self.pipeline.calibration
+        cause = "was lifted" if self.pipeline.put_elsewhere else f"cannot find itself on map {old}"
         self._leave()
         try:
             self.write_map()
@@ -233,10 +276,7 @@ class Agent:
             self._print(f"{self._options.name}: {error}")
         self._begin(calibration)
         self.pipeline.set_mission(mission)
-        self._print(
-            f"{self._options.name}: cannot find itself on map {old}; it begins map {self.map_id}, "
-            "and the old one stays"
-        )
+        self._print(f"{self._options.name}: {cause}; it begins map {self.map_id}, and the old one stays")
 
     def tick(self, observation: Observation) -> Step:
         """One tick; see Runner.tick. Begins a fresh map where that is needed."""
@@ -292,6 +332,7 @@ class Agent:
     def close(self) -> None:
         """Commit what was mapped and leave the fleet. The bus stays open."""
         self._leave()
+        self.missions.save()
         self.journal.close()
 
 
@@ -327,10 +368,22 @@ def run_agent(
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
     console = Console(stderr=True)
-    show = _progress(console, options)
+    show, manager = _progress(console, options), ServiceManager()
     describe = partial(_describe, robot, console.print, options.name)
-    agent = Agent(describe, bus, keys, settings, options, show, console.print)
-    with show:
+    publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
+
+    def stepped(observation: Observation, step: Step) -> None:
+        manager.alive()
+        show(observation, step)
+        if publisher is not None:
+            publisher.step(observation, bool(step.changes), agent.pipeline, agent.merged_poses)
+
+    with contextlib.ExitStack() as closing:
+        if publisher is not None:
+            closing.callback(publisher.close)
+        agent = Agent(describe, bus, keys, settings, options, stepped, console.print)
+        manager.ready()
+        closing.enter_context(show)
         try:
             agent.run(robot, stop)
         finally:

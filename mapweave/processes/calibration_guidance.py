@@ -24,7 +24,7 @@ PATIENCE = 5.0
 def guide(
     camera: FrameSource, collection: ViewCollection, console: Console, patience: float = PATIENCE
 ) -> Iterator[tuple[NDArray[np.uint8], Guidance]]:
-    """Look at the newest frames until the views suffice, the stream ends, or Ctrl-C.
+    """Look at the newest frames until the views suffice or the stream ends.
 
     Yields:
         Each frame, (H, W) grey, and what it added.
@@ -34,19 +34,16 @@ def guide(
     """
     stamp_ns, frames = 0, 0
     with Live(console=console, refresh_per_second=8, transient=True) as shown:
-        try:
-            while collection.done is None:
-                frame = camera.newer(stamp_ns, patience)
-                if frame is None:
-                    if not frames:
-                        raise DeviceError("the camera delivers no images")
-                    return
-                stamp_ns, frames = frame.stamp_ns, frames + 1
-                guidance = collection.see(frame.image, f"frame {frames}")
-                shown.update(panel(guidance))
-                yield frame.image, guidance
-        except KeyboardInterrupt:
-            console.print("stopped; the views so far are used")
+        while collection.done is None:
+            frame = camera.newer(stamp_ns, patience)
+            if frame is None:
+                if not frames:
+                    raise DeviceError("the camera delivers no images")
+                return
+            stamp_ns, frames = frame.stamp_ns, frames + 1
+            guidance = collection.see(frame.image, f"frame {frames}")
+            shown.update(panel(guidance))
+            yield frame.image, guidance
 
 
 def panel(guidance: Guidance) -> Group:

@@ -36,7 +36,7 @@ ABDUCT_TRIES, ABDUCT_PAUSE = 8, 10.0
 RECOVERY_PATIENCE = 120.0
 """How long all may take to be well again after something came back, wall s."""
 
-CONDUCTOR = "scenario"
+SENDER = "scenario"
 """Gives the missions."""
 
 
@@ -277,7 +277,7 @@ class ScenarioRunner:
         return True
 
     def _command(self, robot: str, kind: MissionKind, node: NodeId | None = None) -> None:
-        send_order(self._fleet.bus, self._fleet.keys, MissionOrder.new(robot, kind, CONDUCTOR, node))
+        send_order(self._fleet.bus, self._fleet.keys, MissionOrder.new(robot, kind, SENDER, node))
 
 
 def _in_words(event: ScenarioEvent) -> str:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission import Answer, MayIDrive, Question
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
@@ -66,6 +66,7 @@ class Trial:
         self.asked: list[Question] = []
         self.commands: list[Command] = []
         self.said: list[tuple[str, str]] = []
+        self.traffic: Fleet = lambda question: Answer(question.number, None, "no map server answered")
         self._moved = Odometry(0.0, 0.0)
         self._answers: tuple[Answer, ...] = ()
 
@@ -77,8 +78,10 @@ class Trial:
             saying = (str(self.navigator.stage), self.navigator.detail)
             if not self.said or self.said[-1] != saying:
                 self.said.append(saying)
-            self.asked += questions
-            self._answers = tuple(map(self.fleet, questions))
+            traffic = [question for question in questions if isinstance(question, MayIDrive)]
+            others = [question for question in questions if not isinstance(question, MayIDrive)]
+            self.asked += others
+            self._answers = (*map(self.fleet, others), *map(self.traffic, traffic))
             share = 0.0 if self.held else BODY.tick
             self._moved = Odometry(command.forward * share, command.turn * share)
             self.eyes.pose = self.eyes.pose @ self._moved.motion()

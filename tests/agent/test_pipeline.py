@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import Lens
 from mapweave.wire.codec import encode_body
 from tests.agent.ranged_body import BEARINGS, BODY, MAP, ROOM, essence, live, on, rangers, still
 
@@ -55,6 +58,19 @@ def test_the_same_observations_give_the_same_steps(drive):
         assert essence(again.step(observation)) == essence(step)
     assert sum(len(step.changes) for step in steps) >= 3
     assert len({step.command for step in steps}) > 10
+
+
+def test_behind_a_fisheye_the_camera_is_a_pinhole(drive):
+    observations, _, _ = drive
+    lens = Equidistant(115.0, 115.4, 158.6, 120.9, (-0.02, 0.004, -0.003, 0.0005))
+    ideal = lens.ideal(320, 240, 0.3)
+    fisheye = on(Carried(), body=replace(BODY, camera=ideal, distortion=lens))
+    pinhole = on(Carried(), body=replace(BODY, camera=ideal))
+    for observation in observations[:40]:
+        image = Lens(ideal, lens).rectified(observation.image)
+        step = fisheye.step(observation)
+        assert essence(step) == essence(pinhole.step(replace(observation, image=image)))
+    assert step.status.tracked > 10
 
 
 def test_observations_are_not_modified(drive):
@@ -219,6 +235,53 @@ def test_a_robot_carried_off_before_the_first_node_restarts(walls):
         image = still(walls).image if tick < 3 else elsewhere
         status = pipeline.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), image)).status
     assert status.doing == "mapping while carried" and status.tracked > 20
+
+
+def lift(walls, pipeline: Pipeline, tick: int) -> list[Step]:
+    """A person lifts the robot, carries it, and puts it down where it sees something else."""
+    away = Pose2(0.3, 0.0, math.pi)
+    seen = [still(walls, tick=tick + k, kidnapped=True) for k in range(3)]
+    seen += [still(walls, away, tick=tick + 3 + k) for k in range(2)]
+    return [pipeline.step(observation) for observation in seen]
+
+
+@pytest.mark.parametrize("mission", [Explore(), Carried()])
+def test_a_robot_that_was_lifted_is_lost_once_it_is_put_down(walls, mission):
+    pipeline = on(Carried())
+    before = Pose2(-1.0)
+    for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
+        pipeline.step(walls.observe(before, Pose2(x), tick))
+        before = Pose2(x)
+    pipeline.set_mission(mission)
+    elements = set(pipeline.map.nodes) | set(pipeline.map.edges)
+    assert elements
+    steps = lift(walls, pipeline, 100)
+    assert [step.command for step in steps] == [Command()] * 5
+    assert [step.status.doing for step in steps] == ["lifted"] * 5
+    assert [step.status.lost for step in steps] == [False] * 3 + [True] * 2
+    assert set(pipeline.map.nodes) | set(pipeline.map.edges) == elements
+    # A person may know better.
+    pipeline.set_mission(Carried())
+    assert not pipeline.lost
+
+
+def test_a_robot_that_was_lifted_before_the_first_node_maps_on(walls):
+    pipeline = on(Carried())
+    pipeline.step(still(walls))
+    steps = lift(walls, pipeline, 1)
+    assert steps[-1].status.doing == "mapping while carried"
+    assert not pipeline.lost
+
+
+def test_a_robot_that_was_lifted_on_its_way_asks_where_it_is(walls):
+    pipeline = on(GoTo(NodeId("r1", 1, 1)))
+    first = [question for tick in range(10) for question in pipeline.step(still(walls, tick=tick)).questions]
+    steps = lift(walls, pipeline, 20)
+    assert not any(step.questions for step in steps[:3])
+    again = [q for tick in range(30, 40) for q in pipeline.step(still(walls, tick=tick)).questions]
+    assert first
+    assert again
+    assert not pipeline.lost
 
 
 # Questions

@@ -55,7 +55,7 @@ def same(a: Observation, b: Observation) -> bool:
     images = (a.image is None and b.image is None) or (
         a.image is not None and b.image is not None and np.array_equal(a.image, b.image)
     )
-    rest = (a.stamp_ns, a.odometry, a.bumped) == (b.stamp_ns, b.odometry, b.bumped)
+    rest = (a.stamp_ns, a.odometry, a.bumped, a.kidnapped) == (b.stamp_ns, b.odometry, b.bumped, b.kidnapped)
     return images and rest and np.array_equal(a.proximity, b.proximity)
 
 
@@ -73,16 +73,17 @@ reals = st.floats(-1e3, 1e3)
     st.one_of(st.none(), st.tuples(st.integers(1, 40), st.integers(1, 40))),
     st.lists(st.floats(0, 1e4), max_size=32),
     st.booleans(),
+    st.booleans(),
     st.randoms(use_true_random=False),
 )
 def test_an_observation_survives_exactly(
     stamp: int, odometry: tuple[float, float], shape: tuple[int, int] | None,
-    proximity: list[float], bumped: bool, random: Any,
+    proximity: list[float], bumped: bool, kidnapped: bool, random: Any,
 ) -> None:  # fmt: skip
     image = None
     if shape is not None:
         image = np.frombuffer(random.randbytes(shape[0] * shape[1]), np.uint8).reshape(shape)
-    given_ = Observation(stamp, Odometry(*odometry), image, np.array(proximity), bumped)
+    given_ = Observation(stamp, Odometry(*odometry), image, np.array(proximity), bumped, kidnapped=kidnapped)
     assert same(decode_observation(encode_observation(given_)), given_)
 
 

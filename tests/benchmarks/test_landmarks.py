@@ -81,13 +81,6 @@ def test_a_missing_folder_is_reported_in_one_line(
     assert str(folder) in output[-1]
 
 
-@pytest.mark.parametrize("wrong", [["--pairs", "1"], ["--seed", "-1"], ["--places", "-1"], ["--pairs", "x"]])
-def test_arguments_out_of_range(wrong: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SystemExit) as error:
-        run(monkeypatch, *wrong)
-    assert error.value.code == 2
-
-
 def test_matches_of_a_warp_agree_with_the_homography() -> None:
     """To 3 px of where the homography takes a feature, written down here once more."""
     rng = np.random.default_rng(1)

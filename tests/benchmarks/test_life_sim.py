@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.life_sim.benchmark import Fleet, main
+from benchmarks.life_sim.benchmark import Fleet
 from mapweave.hybridmap.node import MapId
 from mapweave.sim.floorplan import distances_to
 
@@ -38,13 +38,3 @@ def test_nothing_has_been_shown_since_before_there_is_a_later_drive(fleet: Fleet
     assert not any(fleet.shown_since(node).any() for node in nodes)
     last = fleet.faded(fleet.merger.merged())
     assert last.seen == last.moved_faded == last.others_faded == 0 < last.moved
-
-
-def test_bad_input_is_reported_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("sys.argv", ["life_sim", "--drives", "0"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    result = capsys.readouterr().err
-    assert ended.value.code == 2 and result.count("\n") == 1 and "at least one drive" in result

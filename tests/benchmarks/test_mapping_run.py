@@ -54,34 +54,6 @@ def test_the_command_draws_and_prints(
         assert image.std() > 5.0
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--out", "{file}"], "name a folder that can be written"),
-        (["--out", "{file}/below"], "name a folder that can be written"),
-        (["--out", "{folder}", "--steps", "3"], "at least 30"),
-        (["--out", "{folder}", "--seed", "-1"], "seed"),
-    ],
-)
-def test_errors_are_reported_in_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    options: list[str],
-    words: str,
-) -> None:
-    file = tmp_path / "file"
-    file.write_text("not a folder")
-    given = [option.format(file=file, folder=tmp_path / "out") for option in options]
-    monkeypatch.setattr(sys, "argv", ["mapping_run", *given])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line
-    assert file.read_text() == "not a folder"
-
-
 def test_mismatched_comparisons_are_reported() -> None:
     seen: dict[str, float | None] = {"person_in_view_s": 3.0, "landmarks_left": 9.0}
     unseen: dict[str, float | None] = {"person_in_view_s": 0.0, "landmarks_left": 0.0}

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import networkx as nx
 import numpy as np
 import pytest
 
-from benchmarks.navigate.benchmark import main, summary
+from benchmarks.navigate.benchmark import summary
 from benchmarks.navigate.drives import PATIENCE, Outcome, _reason, drive
 from benchmarks.navigate.floor import Floor
 from benchmarks.navigate.office import Mapped
@@ -202,18 +200,3 @@ def test_a_drive_is_timed_measured_and_ended(arrives: bool) -> None:
         assert one.success and one.time_s == pytest.approx(21.5, abs=0.6)
     else:
         assert "not there within 240 s: driving" in one.reason and one.time_s == PATIENCE
-
-
-@pytest.mark.parametrize("wrong", [["--runs", "0"], ["--seed", "-1"]])
-def test_bad_input_is_reported_in_one_line(
-    wrong: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["navigate", "--out", str(tmp_path), *wrong])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 1
-    output = capsys.readouterr().err.splitlines()
-    assert len(output) == 1 and output[0].startswith(f"navigate: {wrong[0]} {wrong[1]}")

@@ -60,15 +60,3 @@ def test_the_command_prints_figures_and_draws(tmp_path, monkeypatch, capsys):
     assert {"success", "error_m_median", "error_deg_median", "fov_violations"} <= set(figures)
     assert figures["starts"] == 1
     assert sorted(path.name for path in out.iterdir()) == ["fig12.png", "fig13.png", "fig14.png"]
-
-
-@pytest.mark.parametrize(
-    ("option", "words"), [(["--starts", "0"], "at least 1"), (["--out", "{file}/x"], "can be made")]
-)
-def test_bad_options_are_reported_in_one_line(tmp_path, monkeypatch, capsys, option, words):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr("sys.argv", ["parking", *(o.format(file=tmp_path / "file") for o in option)])
-    with pytest.raises(SystemExit) as ended:
-        parking.main()
-    assert ended.value.code == 2
-    assert words in capsys.readouterr().err.splitlines()[-1]

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.tracking.benchmark import follow, main
+from benchmarks.tracking.benchmark import follow
 from benchmarks.tracking.scenes import TEXEL_PX, Drive, room_drive, wall_drive, wall_to_image
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.camera import WEBCAM
@@ -76,15 +76,3 @@ def test_the_last_line_is_for_scripts():
             assert 0 <= figures["wrong"] <= 1
             assert figures["points"] > 10
             assert figures["ms"] > 0
-
-
-@pytest.mark.parametrize("bad", [("--drives", "0"), ("--frames", "3"), ("--seed", "-1")])
-def test_bad_input_is_reported_in_one_line(
-    bad: tuple[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setattr(sys, "argv", ["tracking", *bad])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    words = "tracking: at least 1 drive, 12 frames and seed 0 are needed"
-    assert ended.value.code == 1
-    assert capsys.readouterr().err.splitlines() == [words]

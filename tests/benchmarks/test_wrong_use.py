@@ -14,38 +14,54 @@ NAMES = sorted(path.parent.name for path in FOLDER.glob("*/benchmark.py"))
 SEEDED = [name for name in NAMES if 'add_argument("--seed"' in (FOLDER / name / "benchmark.py").read_text()]
 """Those that people start, with a seed."""
 WRONG = [
-    *((name, ["--seed", "-1"]) for name in SEEDED),
-    ("ekf", ["--runs", "0"]),
-    ("explore", ["--robots", "0"]),
-    ("fit_belief", ["--seeds", "-1"]),
-    ("fit_belief", ["--queries", "0", "0"]),
-    ("servo", ["--trials", "0"]),
-    ("servo", ["--jobs", "0"]),
-    ("sim", ["--robots", "0"]),
-    ("sim", ["--robots", "3", "17"]),
-    ("sim", ["--seconds", "0"]),
-    ("sim", ["--seconds", "nan"]),
+    *((name, "--seed -1", "seed") for name in SEEDED),
+    ("ekf", "--runs 0", "--runs"),
+    ("explore", "--robots 0", "--robots"),
+    ("fit_belief", "--seeds -1", "seeds"),
+    ("fit_belief", "--queries 0 0", "queries"),
+    ("landmarks", "--pairs 1", "at least 2 pairs, 0 places and seed 0"),
+    ("landmarks", "--places -1", "at least 2 pairs, 0 places and seed 0"),
+    ("landmarks", "--pairs x", "--pairs"),
+    ("life_sim", "--drives 0", "at least one drive"),
+    ("mapping_run", "--out {file}", "name a folder that can be written"),
+    ("mapping_run", "--out {file}/below", "name a folder that can be written"),
+    ("mapping_run", "--steps 3", "at least 30"),
+    ("navigate", "--runs 0", "navigate: --runs 0"),
+    ("parking", "--starts 0", "at least 1"),
+    ("parking", "--out {file}/x", "can be made"),
+    ("servo", "--trials 0", "--trials"),
+    ("servo", "--jobs 0", "--jobs"),
+    ("sim", "--robots 0", "--robots"),
+    ("sim", "--robots 3 17", "--robots"),
+    ("sim", "--seconds 0", "--seconds"),
+    ("sim", "--seconds nan", "--seconds"),
+    ("tracking", "--drives 0", "tracking: at least 1 drive, 12 frames and seed 0 are needed"),
+    ("tracking", "--frames 3", "tracking: at least 1 drive, 12 frames and seed 0 are needed"),
 ]
 
 
-@pytest.mark.parametrize(("name", "wrong"), WRONG, ids=lambda case: "".join(case))
+@pytest.mark.parametrize(("name", "wrong", "words"), WRONG, ids=lambda case: case if "-" in case else None)
 def test_errors_are_reported_in_one_line(
     name: str,
-    wrong: list[str],
+    wrong: str,
+    words: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
+    file = tmp_path / "file"
+    file.write_text("not a folder")
     module = importlib.import_module(f"benchmarks.{name}.benchmark")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", [name, *wrong])
+    monkeypatch.setattr("sys.argv", [name, *wrong.format(file=file).split()])
     with pytest.raises(SystemExit) as ended:
         module.main()
     output = capsys.readouterr().err + (ended.value.code if isinstance(ended.value.code, str) else "")
     assert ended.value.code not in (0, None)
     assert "Traceback" not in output
-    assert "seed" in output.splitlines()[-1] or wrong[0].strip("-") in output.splitlines()[-1]
-    assert not any(tmp_path.rglob("*.*")), "nothing is left behind"
+    assert words in output.splitlines()[-1]
+    assert file.read_text() == "not a folder"
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file], "nothing is left behind"
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -137,8 +137,10 @@ def test_a_drive(drive: Path, capfd, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("see", "camera_toml"),
-    [(lambda pose: render(pose, SMALL), SMALL_TOML), (seen_by_fisheye, FISHEYE_TOML)],
-    ids=["160x120", "fisheye"],
+    [
+        pytest.param(lambda pose: render(pose, SMALL), SMALL_TOML, id="160x120", marks=pytest.mark.slow),
+        pytest.param(seen_by_fisheye, FISHEYE_TOML, id="fisheye"),
+    ],
 )
 def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, capfd, tmp_path: Path) -> None:
     folder = recorded(tmp_path / "drive", see, camera_toml)

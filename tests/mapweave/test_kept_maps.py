@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +13,23 @@ import pytest
 from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.replication.journal import Journal
+from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
-from mapweave.processes.agent import epochs_of_files
+from mapweave.processes.agent import Agent, AgentOptions, epochs_of_files
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
@@ -158,8 +162,6 @@ def journal_with(path: Path, *epochs: int) -> Path:
 
 
 def renumbered(epoch: int):
-    from dataclasses import replace
-
     (put,) = one_node()
     return replace(put, node=replace(put.node, id=NodeId("r0", epoch, 1)))
 
@@ -254,8 +256,6 @@ def test_a_file_is_set_aside_before_a_damaged_journal_writes_over_it(tmp_path, r
     data.mkdir()
     journal = Journal(data / "walk.sqlite", "walk")
     (put,) = one_node()
-    from dataclasses import replace
-
     nodes = [replace(put, node=replace(put.node, id=NodeId("walk", 1, k))) for k in (1, 2)]
     journal.append(journal.open_map(1), nodes, 0)
     journal.close()
@@ -270,3 +270,23 @@ def test_a_file_is_set_aside_before_a_damaged_journal_writes_over_it(tmp_path, r
     assert len(HybridMap(read_map_file(whole).changes).nodes) == 1
     assert (data / "walk.2.mapweave").exists()
     capfd.readouterr()
+
+
+def test_a_robot_that_is_lifted_begins_a_new_map_and_keeps_the_old_one(tmp_path):
+    said: list[str] = []
+    walls, bus = PhotoWalls(), MemoryBus(MemoryHub())
+    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.0)
+    agent = Agent(lambda: DESCRIPTION, bus, KEYS, AgentSettings(), options, print_line=said.append)
+    before = Pose2(-1.0)
+    for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
+        agent.tick(walls.observe(before, before := Pose2(float(x)), tick))
+    mapped = len(agent.pipeline.map.nodes)
+    assert mapped
+    away = walls.observe(Pose2(2.0), Pose2(2.0), 100)
+    agent.tick(replace(away, kidnapped=True))
+    assert str(agent.map_id) == "r0.1"
+    agent.tick(replace(away, stamp_ns=away.stamp_ns + 10**8))
+    agent.close()
+    bus.close()
+    assert "r0: was lifted; it begins map r0.2, and the old one stays" in said
+    assert len(HybridMap(read_map_file(tmp_path / "r0.1.mapweave").changes).nodes) == mapped

@@ -11,10 +11,11 @@ import io
 import json
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
+from importlib.metadata import Distribution, DistributionFinder
 from types import ModuleType
 
 
@@ -30,6 +31,11 @@ class Without:
     ) -> ModuleSpec | None:
         """None for those that are missing."""
         return None if name.split(".")[0] in self._missing else self._finder.find_spec(name, path, target)
+
+    def find_distributions(self, context: DistributionFinder.Context | None = None) -> Iterable[Distribution]:
+        """Versions are those of the installed packages."""
+        find = getattr(self._finder, "find_distributions", None)
+        return [] if find is None else find(context or DistributionFinder.Context())
 
 
 def outcome(arguments: list[str]) -> tuple[int | None, str, str]:

@@ -18,6 +18,8 @@ def test_a_camera_is_a_name_or_a_variation_of_a_named_camera() -> None:
     """The rest stays as it is in the camera that is named."""
     assert robot_from_table({"name": "a", "camera": "wide"}).camera == CAMERAS["wide"]
     assert robot_from_table({"name": "a"}).camera == CAMERAS["webcam"]
+    noisy = robot_from_table({"name": "a", "camera": {"like": "fisheye", "read_noise": 1.0}}).camera
+    assert (noisy.read_noise, noisy.distortion) == (1.0, CAMERAS["fisheye"].distortion)
     changed = robot_from_table(
         {"name": "a", "camera": {"like": "cheap", "read_noise": 1.0, "exposure": {"lag": 2.0}}}
     ).camera

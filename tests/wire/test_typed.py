@@ -17,7 +17,15 @@ from hypothesis import strategies as st
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from mapweave.hybridmap import explanation, manual_constraint, map_event, query, superseded
+from mapweave.hybridmap import (
+    agent_status,
+    explanation,
+    manual_constraint,
+    map_event,
+    mission_order,
+    query,
+    superseded,
+)  # fmt: skip
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
@@ -148,7 +156,9 @@ def test_the_page_on_the_wire_names_the_fields() -> None:
         name: re.findall(r"`([a-z]\w*)`", re.sub(r"\([^)]*\)", "", words))
         for name, words in ROW.findall(page)
     }
-    modules = (query, explanation, manual_constraint, map_event, superseded, map_file)
+    modules = (
+        query, explanation, manual_constraint, map_event, superseded, map_file, agent_status, mission_order,
+    )  # fmt: skip
     classes = {name: getattr(module, name) for module in modules for name in rows if hasattr(module, name)}
-    assert classes.keys() == rows.keys() and len(rows) == 22
+    assert classes.keys() == rows.keys() and len(rows) == 32
     assert {name: [one.name for one in fields(kind)] for name, kind in classes.items()} == rows

@@ -5,6 +5,7 @@ Zhang (2000) with the poses eliminated (Schur complement), as each view has its 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -34,6 +35,8 @@ FAR_OFF = 4.0
 """A view whose median residual is so many times that of the others is left out for the time being."""
 ROUNDS = 6
 """Of leaving out corners, at most."""
+FEW = 12
+"""Views from which the first focal length is found."""
 STARTS = 9
 """Focal lengths that are tried first."""
 WIDEST_START = 3.6
@@ -118,24 +121,25 @@ def residuals_of_held_out(
 def _first(views: Sequence[BoardView], model: LensModel) -> Fit:
     """The best of some focal lengths, without distortion."""
     width, height = views[0].image_size
-    everything = tuple(np.ones(len(view.points), np.bool_) for view in views)
-    best: tuple[float, Fit] | None = None
+    few = views[:: math.ceil(len(views) / FEW)]
+    best: tuple[float, Array] | None = None
     for focal in width * np.geomspace(0.25, 3.0, STARTS):
         middle = [focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)]
         intrinsics = np.array([*middle, *[0.0] * COEFFICIENTS[model]])
-        poses = [_pose(view, model, intrinsics) for view in views]
-        if sum(pose is not None for pose in poses) <= len(views) / 2:
-            continue
-        tried = Fit(
-            model, intrinsics, np.zeros((0, 0)),
-            np.array([UNKNOWN_POSE if pose is None else pose for pose in poses]), everything, 0.0,
-        )  # fmt: skip
-        cost = float(np.median(_medians(views, tried)))
+        cost = float(np.median(_medians(few, _posed(few, model, intrinsics))))
         if best is None or cost < best[0]:
-            best = cost, tried
-    if best is None:
+            best = cost, intrinsics
+    assert best is not None
+    if best[0] > width:
         raise InvalidValue("no focal length explains the views: are the board's numbers right?")
-    return best[1]
+    return _posed(views, model, best[1])
+
+
+def _posed(views: Sequence[BoardView], model: LensModel, intrinsics: Array) -> Fit:
+    poses = [_pose(view, model, intrinsics) for view in views]
+    known = np.array([UNKNOWN_POSE if pose is None else pose for pose in poses])
+    everything = tuple(np.ones(len(view.points), np.bool_) for view in views)
+    return Fit(model, intrinsics, np.zeros((0, 0)), known, everything, 0.0)
 
 
 def _pose(view: BoardView, model: LensModel, intrinsics: Array) -> Array | None:

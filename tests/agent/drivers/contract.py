@@ -20,7 +20,7 @@ import pytest
 
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.drivers.robot import Robot
-from mapweave.agent.drivers.settings import CameraSettings, RobotSettings
+from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.errors import InvalidValue
 
@@ -117,7 +117,6 @@ class RobotContract:
         from mapweave.settings import load_settings
 
         given: RobotSettings = load_settings(settings).robot
-        assert isinstance(given.camera, CameraSettings)
         robot = CheckedRobot(find_driver(given.driver)(given))
         robot.describe()
         yield robot

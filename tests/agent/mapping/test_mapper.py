@@ -115,4 +115,5 @@ def test_a_camera_that_turned_away_from_all_landmarks_has_not_failed(walls, desc
         collected.append(mapper.health)
     assert "landmark" in collected[-1], "it has turned away from what it mapped"
     mapper.finish(seen)
+    mapper.step(walls.observe(pose, pose, tick + 1))
     assert mapper.anchor_features > 0 and mapper.health == ""

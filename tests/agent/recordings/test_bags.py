@@ -29,7 +29,7 @@ from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.equidistant import Equidistant
-from mapweave.vision.lens import Distortion
+from mapweave.vision.lens import NO_DISTORTION, Distortion
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -328,7 +328,7 @@ def test_a_fisheyes_recording_names_its_lens_as_ros_does(drive: Drive, tmp_path:
     assert message.k.tolist() == [115.0, 0, 158.7, 0, 115.5, 120.9, 0, 0, 1]
     assert tuple(message.d) == fisheye.k
     described = Replay(tmp_path / "walk").describe()
-    assert (described.camera, described.distortion) == (ideal, fisheye)
+    assert (described.camera, described.distortion) == (ideal, NO_DISTORTION)
 
 
 def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> None:
@@ -388,10 +388,9 @@ def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, t
 
     def sense() -> Observation | None:
         observation = whole()
-        wrong = observation is not None and observation.stamp_ns > drive.stamps_ns[4]
-        return (
-            replace(observation, proximity=np.ones(1)) if observation is not None and wrong else observation
-        )
+        if observation is None or observation.stamp_ns <= drive.stamps_ns[4]:
+            return observation
+        return replace(observation, proximity=np.ones(1))
 
     robot.sense = sense  # type: ignore[method-assign]
     assert len(list(iter(recorded.sense, None))) == COUNT

@@ -17,6 +17,7 @@ from mapweave.agent.recordings.recording import reduced
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import NO_DISTORTION, Lens
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive
 
 KNOWN = COUNT - 1
@@ -125,12 +126,15 @@ def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Pa
     recording = open_recording(tmp_path, options)
     c = drive.camera
     lens = Equidistant(c.fx, c.fy, c.cx, c.cy, (-0.02, 0.004, -0.003, 0.0005))
-    assert (recording.camera, recording.distortion) == (lens.ideal(320, 240, 0.3), lens)
+    ideal = lens.ideal(320, 240, 0.3)
+    assert (recording.camera, recording.distortion) == (ideal, NO_DISTORTION)
+    assert np.array_equal(recording.read(0), Lens(ideal, lens).rectified(drive.images[0]))
+    assert any("rectified to" in note for note in recording.notes)
     # Kalibr's camera.toml by hand gives the same.
     camera = tmp_path / "own" / "camera.toml"
     camera.parent.mkdir()
     camera.write_text(CAMERA_TOML + 'lens = "equidistant"\ndistortion = [-0.02, 0.004, -0.003, 0.0005]\n')
-    assert read_camera(camera) == (recording.camera, recording.distortion)
+    assert read_camera(camera) == (ideal, lens)
     sensor.write_text(text.replace("[0.0, 0.0, 0.0, 0.0]", "[-0.9, 0.0, 0.0, 0.0]"))
     with pytest.raises(DeviceError, match=r"sensor.yaml: camera: an equidistant lens .* folds"):
         open_recording(tmp_path, options)

@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -168,19 +169,18 @@ bodies = st.one_of(
 def test_pruning_never_changes_the_map(
     tmp_path_factory: pytest.TempPathFactory, log: list[ChangeBody], data: st.DataObject
 ) -> None:
-    journal = Journal(tmp_path_factory.mktemp("prune") / "j", "r0")
-    map_id = journal.open_map(None)
-    journal.append(map_id, log, 0)
-    before = state(journal.replay(map_id))
     acknowledged = data.draw(st.integers(0, len(log)))
-    journal.acknowledge("s0", map_id, acknowledged)
-    dropped = journal.prune(map_id, ["s0"])
-    assert state(journal.replay(map_id)) == before
-    assert journal.head(map_id) == len(log)
-    kept = {change.sequence for change in journal.changes(map_id, 1, len(log))}
-    assert len(kept) == len(log) - dropped
-    assert set(range(acknowledged + 1, len(log) + 1)) <= kept
-    journal.close()
+    with closing(Journal(tmp_path_factory.mktemp("prune") / "j", "r0")) as journal:
+        map_id = journal.open_map(None)
+        journal.append(map_id, log, 0)
+        before = state(journal.replay(map_id))
+        journal.acknowledge("s0", map_id, acknowledged)
+        dropped = journal.prune(map_id, ["s0"])
+        assert state(journal.replay(map_id)) == before
+        assert journal.head(map_id) == len(log)
+        kept = {change.sequence for change in journal.changes(map_id, 1, len(log))}
+        assert len(kept) == len(log) - dropped
+        assert set(range(acknowledged + 1, len(log) + 1)) <= kept
 
 
 def test_another_agents_journal_is_refused(path: Path, journal: Journal) -> None:

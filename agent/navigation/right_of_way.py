@@ -1,0 +1,64 @@
+"""Whether the way ahead is free of other robots: the fleet is asked, and the robot does not wait for answers.
+
+Without an answer the robot drives on: its rangers keep it from touching anything, as without a server.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mapweave.agent.localization.fix import Fix
+from mapweave.agent.mission import MayIDrive
+from mapweave.agent.motion_primitives import MotionPrimitives
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.query import ReserveAnswer
+
+EVERY = 1.0
+"""Time between two questions, s."""
+OVERDUE = 3.0
+"""A question without an answer for so long is lost, s."""
+
+
+class RightOfWay:
+    """Of one drive along a route.
+
+    Attributes:
+        holder: the robot that drives where this one wants to; empty without one.
+        aside: the node to which this one must step aside; None if it need not.
+    """
+
+    def __init__(self, motion: MotionPrimitives, route: Sequence[NodeId]) -> None:
+        """Take a route; nothing is known of it yet."""
+        self.holder = ""
+        self.aside: NodeId | None = None
+        self._motion = motion
+        self._route = tuple(route)
+        self._asked: tuple[int, int, float] | None = None
+        self._last = -EVERY
+        self._granted: int | None = None
+
+    def may_drive(self, leg: int, fix: Fix) -> bool:
+        """Whether the robot may drive to a node of the route; called each tick.
+
+        Args:
+            leg: index of the node.
+            fix: where the robot is.
+        """
+        now = self._motion.now
+        if self._asked is not None:
+            number, first, at = self._asked
+            answer = self._motion.answer(number)
+            if answer is not None or now - at > OVERDUE:
+                self._asked = None
+                self._take(None if answer is None else answer.content, first)
+        if self._asked is None and now - self._last >= EVERY:
+            number = self._motion.number()
+            self._motion.post(MayIDrive(number, fix.node, fix.node_from_robot.mean, self._route[leg:]))
+            self._asked, self._last = (number, leg, now), now
+        return self._granted is not None and leg < self._granted
+
+    def _take(self, content: object, first: int) -> None:
+        if isinstance(content, ReserveAnswer):
+            self._granted, self.holder, self.aside = first + content.granted, content.holder, content.aside
+        else:
+            self._granted, self.holder, self.aside = len(self._route), "", None

@@ -1,0 +1,60 @@
+"""The agent's values as ROS messages, by whatever makes messages of a type from their fields."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+
+Make = Callable[..., Any]
+"""Makes a message: `make(type, **fields)`."""
+
+
+def header(make: Make, stamp_ns: int, frame: str) -> Any:
+    """A Header."""
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    stamp = make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def pose(make: Make, at: Pose2) -> Any:
+    """A Pose."""
+    position = make("geometry_msgs/msg/Point", x=at.x, y=at.y, z=0.0)
+    return make("geometry_msgs/msg/Pose", position=position, orientation=quaternion(make, at.heading))
+
+
+def pose_with_covariance(make: Make, at: PoseGaussian) -> Any:
+    """A PoseWithCovariance: its position's covariance is along the axes of the frame, not of the robot."""
+    c, s = math.cos(at.mean.heading), math.sin(at.mean.heading)
+    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_((0, 1, 5), (0, 1, 5))] = turned @ at.covariance @ turned.T
+    name = "geometry_msgs/msg/PoseWithCovariance"
+    return make(name, pose=pose(make, at.mean), covariance=covariance.ravel())
+
+
+def quaternion(make: Make, heading: float) -> Any:
+    """A Quaternion about the vertical."""
+    half = heading / 2
+    return make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+
+
+def transform(make: Make, stamp_ns: int, parent: str, child: str, parent_from_child: Pose2) -> Any:
+    """A TransformStamped on the floor."""
+    at = make("geometry_msgs/msg/Vector3", x=parent_from_child.x, y=parent_from_child.y, z=0.0)
+    turn = quaternion(make, parent_from_child.heading)
+    moved = make("geometry_msgs/msg/Transform", translation=at, rotation=turn)
+    name, head = "geometry_msgs/msg/TransformStamped", header(make, stamp_ns, parent)
+    return make(name, header=head, child_frame_id=child, transform=moved)
+
+
+def twist(make: Make, command: Command) -> Any:
+    """A Twist."""
+    linear = make("geometry_msgs/msg/Vector3", x=command.forward, y=0.0, z=0.0)
+    angular = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=command.turn)
+    return make("geometry_msgs/msg/Twist", linear=linear, angular=angular)

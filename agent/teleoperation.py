@@ -1,0 +1,67 @@
+"""Teleoperation, the robot's side: a person's newest velocity command, and what it is worth now."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from mapweave.agent.mission import Driven
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.drive_request import DriveRequest
+from mapweave.hybridmap.errors import InvalidValue
+
+DEAD_MAN = 0.5
+"""Without a command for so long the robot stands, s."""
+STALE = 1.0
+"""A command that was given later than this after the answer which it follows comes too late, s: it stops."""
+
+
+class Teleoperation:
+    """Holds the newest command. A question is answered before the next is sent, so none wait in a queue.
+
+    Thread-safe: requests come in the bus's thread, the robot's loop reads.
+    """
+
+    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        """No person drives.
+
+        Args:
+            clock: ns, of this process alone.
+        """
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._session: int | None = None
+        self._command = Command()
+        self._at_ns = 0
+
+    def take(self, request: DriveRequest) -> int:
+        """Take a command; returns the time of the answer, ns, which the next request repeats.
+
+        Raises:
+            InvalidValue: another program drives the robot now.
+        """
+        now = self._clock()
+        with self._lock:
+            if self._session not in (None, request.session) and now - self._at_ns < DEAD_MAN * 1e9:
+                raise InvalidValue("another `mapweave drive` drives this robot")
+            if request.release:
+                self._session = None
+                return now
+            late = not 0 <= now - request.answer_ns <= STALE * 1e9
+            self._session, self._at_ns = request.session, now
+            self._command = Command() if late else Command(request.forward, request.turn)
+        return now
+
+    def release(self) -> None:
+        """Give the wheels back to the mission."""
+        with self._lock:
+            self._session = None
+
+    def driven(self) -> Driven | None:
+        """The command that holds now; None where no person drives."""
+        with self._lock:
+            if self._session is None:
+                return None
+            silence = (self._clock() - self._at_ns) * 1e-9
+            return Driven(self._command) if silence < DEAD_MAN else Driven(Command(), silence)

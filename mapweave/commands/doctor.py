@@ -1,0 +1,135 @@
+"""`mapweave doctor`: examine a robot, and name the first thing that is wrong."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.network import add_network, network_of
+
+if TYPE_CHECKING:
+    from mapweave.agent.drivers.robot import Robot
+    from mapweave.doctor.finding import Finding
+    from mapweave.settings import Settings
+    from mapweave.wire.bus import Bus
+
+STYLES = {"good": "green", "warning": "yellow", "wrong": "bold red", "skipped": "dim"}
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "doctor",
+        help="examine a robot, and name the first thing that is wrong",
+        description="Examine libraries, clock, disk, calibration, camera, driver, encoders and server, and "
+        "name the first thing that is wrong with what to do about it. Exit status 1 if something is wrong. "
+        "Runs even where libraries are missing. The robot moves only with --drive.",
+    )
+    parser.add_argument(
+        "--robot",
+        metavar="FILE",
+        help="settings of the robot (TOML); or a driver, or FILE.py:CLASS, as of `agent`",
+    )
+    parser.add_argument("--name", default="r0", help="of the robot in the fleet (default: r0)")
+    parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
+    parser.add_argument(
+        "--drive", action="store_true",
+        help="let the robot drive 20 cm forward and turn 45 degrees, to compare encoders and image; else you "
+        "are asked to push it",
+    )  # fmt: skip
+    parser.add_argument("--offline", action="store_true", help="leave out the server")
+    parser.add_argument("--json", action="store_true", help="print a JSON object instead of a table")
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Examine, print, and return 1 if something is wrong."""
+    from mapweave.doctor.examination import ExaminationOptions, examine
+    from mapweave.doctor.finding import first_wrong, report
+
+    driver = arguments.robot
+    if driver is not None and not driver.rpartition(":")[0].endswith(".py") and driver.endswith(".toml"):
+        arguments.settings, driver = Path(driver), None
+
+    def load() -> Settings:
+        from mapweave.settings import load_settings
+
+        return load_settings(arguments.settings)
+
+    buses: list[Bus] = []
+
+    def open_robot(settings: Settings) -> Callable[[], Robot] | None:
+        from mapweave.agent.drivers.settings import REMOTE
+
+        chosen = driver or settings.robot.driver
+        if chosen == REMOTE and driver is None and arguments.settings is None:
+            return None
+        return lambda: _robot(arguments, settings, chosen, buses)
+
+    people = sys.stdin.isatty() and sys.stdout.isatty() and not arguments.json
+    options = ExaminationOptions(
+        load, lambda settings: network_of(arguments, settings), open_robot, arguments.data, arguments.drive,
+        arguments.offline, _ask if people else lambda words: False,
+    )  # fmt: skip
+    try:
+        findings = list(examine(options))
+    finally:
+        for bus in buses:
+            bus.close()
+    first = first_wrong(findings)
+    if arguments.json:
+        print(json.dumps(report(findings)))
+    else:
+        _print(findings)
+        if first is None:
+            print("nothing is wrong")
+        else:
+            print(f"first: {first.subject}: {first.detail}\ndo: {first.advice}")
+    return int(first is not None)
+
+
+def _robot(arguments: argparse.Namespace, settings: Settings, driver: str, buses: list[Bus]) -> Robot:
+    """Open the robot; one behind the network has a bus of its own, which is added to `buses`."""
+    from mapweave.agent.drivers.registry import find_driver
+    from mapweave.agent.drivers.remote import RemoteRobot
+    from mapweave.agent.drivers.settings import REMOTE
+    from mapweave.commands.network import connect
+
+    if driver != REMOTE:
+        return find_driver(driver)(settings.robot)
+    network = network_of(arguments, settings)
+    bus, _ = connect(network)
+    buses.append(bus)
+    return RemoteRobot(bus, network.fleet, arguments.name, REMOTE_PATIENCE)
+
+
+REMOTE_PATIENCE = 5.0
+"""s that a base behind the network may be silent."""
+
+
+def _ask(words: str) -> bool:
+    return input(f"{words}. Enter begins, s skips: ").strip().lower() != "s"
+
+
+def _print(findings: Sequence[Finding]) -> None:
+    """A table; lines where rich is not installed."""
+    try:
+        from rich.box import SIMPLE
+        from rich.console import Console
+        from rich.table import Table
+        from rich.text import Text
+    except ImportError:
+        for one in findings:
+            print(f"{one.verdict:<8} {one.subject:<18} {one.detail}{'; ' if one.advice else ''}{one.advice}")
+        return
+    table = Table("", "subject", box=SIMPLE)
+    table.add_column("finding", overflow="fold", ratio=3)
+    table.add_column("what to do", overflow="fold", ratio=2)
+    for one in findings:
+        table.add_row(Text(one.verdict, STYLES[one.verdict]), one.subject, Text(one.detail), Text(one.advice))
+    Console().print(table)

@@ -1,0 +1,128 @@
+"""`mapweave drive`: drive a robot by hand."""
+
+from __future__ import annotations
+
+import argparse
+import select
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.network import SOON, add_network, connect, network_of, settings_of, stop_on_signals
+
+if TYPE_CHECKING:
+    import threading
+
+    from mapweave.teleoperation.gamepad import Gamepad
+    from mapweave.teleoperation.keyboard import Keyboard, RawTerminal
+    from mapweave.teleoperation.session import Session
+
+TICK = 0.05
+"""Between two looks at the keys, s."""
+SHOWN = 0.2
+"""Between two states on the screen, s."""
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "drive",
+        help="drive a robot by hand",
+        description="Drive the robot of a running agent by keyboard or gamepad. Its mission waits meanwhile; "
+        "with the missions explore and carried it maps. It stands when no command arrives for 0.5 s.",
+    )
+    parser.add_argument("name", help="of the agent, for example r0")
+    parser.add_argument(
+        "--gamepad", type=Path, nargs="?", const=Path("/dev/input/js0"), metavar="DEVICE",
+        help="drive by the left stick of a gamepad (default device: /dev/input/js0)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--speed", type=float, default=0.5, metavar="SHARE",
+        help="share of the robot's speed limits, 0.1 to 1 (default: 0.5)",
+    )  # fmt: skip
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Drive until the person quits."""
+    from mapweave.hybridmap.errors import DeviceError, InvalidValue
+    from mapweave.hybridmap.node import check_name
+    from mapweave.teleoperation.gamepad import Gamepad
+    from mapweave.teleoperation.keyboard import Keyboard, RawTerminal
+    from mapweave.teleoperation.session import Session
+
+    name = check_name(arguments.name)
+    if not 0.1 <= arguments.speed <= 1.0:
+        raise InvalidValue(f"--speed: {arguments.speed:g} is not within 0.1 to 1")
+    gamepad = None if arguments.gamepad is None else Gamepad(arguments.gamepad, arguments.speed)
+    terminal = RawTerminal() if gamepad is None else None
+    network = network_of(arguments, settings_of(arguments))
+    stop = stop_on_signals()
+    bus, keys = connect(network)
+    try:
+        if not bus.wait_connected(SOON):
+            raise DeviceError(
+                f"no router at {', '.join(network.endpoints)}: start `mapweave server` or `mapweave router`, "
+                "or give --connect"
+            )
+        with Session(bus, keys, name) as session:
+            if gamepad is not None:
+                _by_gamepad(session, name, gamepad, stop)
+            elif terminal is not None:
+                with terminal:
+                    _by_keyboard(session, name, terminal, Keyboard(arguments.speed), stop)
+        if session.refused:
+            raise DeviceError(f"{name}: {session.refused}")
+    finally:
+        bus.close()
+        if gamepad is not None:
+            gamepad.close()
+    return 0
+
+
+def _by_keyboard(
+    session: Session, name: str, terminal: RawTerminal, keyboard: Keyboard, stop: threading.Event
+) -> None:
+    from mapweave.teleoperation.keyboard import HELP
+
+    show = _shown(session, name, HELP)
+    while not (stop.is_set() or keyboard.quit or session.refused):
+        if select.select([terminal], [], [], TICK)[0]:
+            data = terminal.read()
+            if not data:
+                return
+            keyboard.feed(data, time.monotonic())
+        session.want(*keyboard.wanted(time.monotonic()))
+        show()
+
+
+def _by_gamepad(session: Session, name: str, gamepad: Gamepad, stop: threading.Event) -> None:
+    from mapweave.teleoperation.gamepad import HELP
+
+    show = _shown(session, name, f"{HELP}, Ctrl-C quits")
+    while not (stop.is_set() or session.refused):
+        if select.select([gamepad], [], [], TICK)[0]:
+            gamepad.read()
+        session.want(*gamepad.wanted())
+        show()
+
+
+def _shown(session: Session, name: str, usage: str) -> Any:
+    """A function that shows the state, no more often than people can read it."""
+    from mapweave.agent.teleoperation import DEAD_MAN
+    from mapweave.teleoperation.display import Display, lines
+
+    display, last = Display(), [0.0]
+
+    def show() -> None:
+        now = time.monotonic()
+        if now - last[0] < SHOWN or session.answer is None:
+            return
+        last[0] = now
+        silence = now - session.answered
+        display.show(
+            lines(name, session.answer.report, session.command, silence if silence > DEAD_MAN else 0.0, usage)
+        )
+
+    return show

@@ -1,0 +1,1 @@
+"""Examination of a robot. Libraries are imported where they are used: a missing one is a finding."""

@@ -1,0 +1,142 @@
+"""Robots let each other pass: what one does when its way is held, and two of them head-on in a corridor."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI
+from mapweave.agent.navigation.navigator import YIELDED, Stage
+from mapweave.agent.settings import NavigatorSettings
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
+from mapweave.mapserver.reservations import Reservations
+from tests.agent.scripted_fleet import (
+    BODY,
+    NOWHERE,
+    A,
+    B,
+    C,
+    Eyes,
+    Trial,
+    bare,
+    found,
+    here,
+    navigator,
+    straight,
+)
+from tests.mapserver.test_reservations import node, router  # noqa: F401 - a fixture
+
+BLIND = NavigatorSettings(blind_distance=1e9)
+
+
+def trial_to(home, goal=B) -> Trial:
+    """A robot at A, whose fleet knows the way to any node: straight ahead."""
+    eyes = Eyes(home, Pose2(1.0, 2.0))
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        if {A, B} in [set(pair) for pair in question.blocked]:
+            return Answer(question.number, RouteAnswer((), "blocked"))
+        return Answer(question.number, RouteAnswer(straight(bare(A), bare(question.goal)), "a way"))
+
+    return Trial(navigator(eyes, NOWHERE, goal, BLIND), eyes, fleet)
+
+
+def test_a_robot_whose_way_is_held_stands_and_says_so_and_then_drives_on(home):
+    trial, free = trial_to(home), [False]
+    asked: list[MayIDrive] = []
+
+    def traffic(question: MayIDrive) -> Answer:
+        asked.append(question)
+        granted = len(question.route) if free[0] else 0
+        return Answer(question.number, ReserveAnswer(granted, "" if free[0] else "r7", None, ""))
+
+    trial.traffic = traffic
+    trial.run(10.0)
+    assert trial.navigator.stage == Stage.YIELDING and trial.navigator.detail == "r7 drives there"
+    assert not any(command.forward for command in trial.commands)
+    assert 6 <= len(asked) <= 10, "it asks every second"
+    assert asked[-1].route[-1] == B and asked[-1].start == A
+    free[0] = True
+    trial.run(5.0)
+    assert any(command.forward for command in trial.commands[-30:])
+
+
+def test_a_robot_that_waits_too_long_looks_for_another_way(home):
+    trial = trial_to(home)
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(0, "r7", None, ""))
+    trial.run(YIELDED + 8.0)
+    assert [question.blocked for question in trial.asked if not isinstance(question, WhereAmI)][:2] == [
+        (),
+        ((A, B),),
+    ]
+
+
+def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
+    trial = trial_to(home)
+    free = ReserveAnswer(2, "", None, "")
+
+    def traffic(question: MayIDrive) -> Answer:
+        return Answer(question.number, free if question.route[-1] == C else ReserveAnswer(0, "r7", C, ""))
+
+    trial.traffic = traffic
+    trial.run(4.0)
+    goals = [question.goal for question in trial.asked if not isinstance(question, WhereAmI)]
+    assert goals[:2] == [B, C] and trial.navigator.stage == Stage.ASIDE
+    trial.traffic = lambda question: Answer(question.number, free)
+    trial.run(20.0, lambda: len(trial.asked) > 3)
+    assert trial.asked[-1].goal == B
+
+
+@pytest.mark.parametrize("reserved", [True, False])
+def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
+    """Each wants to where the other comes from. With reservations one lets the other pass, in the niche.
+
+    They drive by exact wheels and see nothing, so what keeps them apart is the reservation alone.
+    """
+    poses, reservations = router.roads.poses, Reservations()
+
+    def robot(name: str, start: int, goal: int) -> Trial:
+        facing = Pose2(0.0, 0.0, 0.0 if goal > start else math.pi)
+        eyes = Eyes(home, poses[node(start)] @ facing)
+
+        def fleet(question: Question) -> Answer:
+            if isinstance(question, WhereAmI):
+                return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
+            return Answer(
+                question.number,
+                router.route(question.start, question.goal, question.blocked, (), question.start_from_robot),
+            )
+
+        def traffic(question: MayIDrive) -> Answer:
+            request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
+            now = len(trial.commands) * BODY.tick
+            return Answer(question.number, reservations.ask(request, router, now) if reserved else None)
+
+        trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
+        trial.traffic = traffic
+        return trial
+
+    robots = [robot("r0", 0, 8), robot("r1", 8, 0)]
+    gaps, goals = [], [node(8), node(0)]
+
+    def there(trial: Trial, goal) -> bool:
+        return trial.eyes.pose.distance(poses[goal]) < 0.3
+
+    for _ in range(2400):
+        for trial in robots:
+            trial.run(BODY.tick)
+        gaps.append(robots[0].eyes.pose.distance(robots[1].eyes.pose))
+        if all(map(there, robots, goals)):
+            break
+    if reserved:
+        assert len(gaps) * BODY.tick < 80.0, "32 s without the other one"
+        assert all(map(there, robots, goals)), "both are where they wanted to be"
+        assert min(gaps) > 2 * BODY.radius, "and have not touched"
+        said = {stage for trial in robots for stage, _ in trial.said}
+        assert Stage.ASIDE in said and Stage.YIELDING in said
+    else:
+        assert min(gaps) < 2 * BODY.radius, "without reservations they drive into each other"

@@ -1,0 +1,185 @@
+"""The loop of a real robot: it waits for neither disk nor network, and skips images rather than lag."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from mapweave.agent.mapping_monitor import MappingMonitor
+from mapweave.agent.mission import Idle
+from mapweave.agent.mission_control import MissionControl
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.pipeline import Step
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.runner import Runner
+from mapweave.agent.settings import AgentSettings
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
+from mapweave.hybridmap.pose import Pose2
+from mapweave.processes.agent import Agent, AgentOptions
+from mapweave.wire.bus import Bus
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.zenoh_bus import ZenohBus
+from tests.waiting import eventually
+
+LONGEST_TICK = 1.0
+"""s; far above what a tick takes on a busy machine, and far below what is waited for here."""
+
+
+class Player:
+    """The Robot protocol over a list of observations; notes when each was asked for."""
+
+    def __init__(self, description: RobotDescription, observations: list[Observation]) -> None:
+        self.description, self.left = description, list(observations)
+        self.asked: list[float] = []
+
+    def describe(self) -> RobotDescription:
+        return self.description
+
+    def sense(self) -> Observation | None:
+        self.asked.append(time.monotonic())
+        return self.left.pop(0) if self.left else None
+
+    def act(self, command: Command) -> Command:
+        return command
+
+    def close(self) -> None:
+        pass
+
+
+def forth_and_back(walls, description: RobotDescription) -> Player:
+    """A drive before photographs that makes a node or two."""
+    poses = [Pose2(0.025 * min(tick, 48 - tick)) for tick in range(48)]
+    before = [poses[0], *poses]
+    return Player(description, [walls.observe(before[k], poses[k], k + 1) for k in range(48)])
+
+
+def run(robot: Player, bus: Bus, folder: Path) -> Agent:
+    """Run an agent to the end of its observations; it stays open."""
+    options = AgentOptions("r0", folder, epoch=1, mission=MissionKind.CARRIED, patience=0.0)
+    agent = Agent(robot.describe, bus, Keys("fleet"), AgentSettings(), options)
+    agent.run(robot, threading.Event())
+    return agent
+
+
+def test_a_disk_that_hangs_holds_up_no_tick(walls, description, tmp_path, monkeypatch) -> None:
+    """Every commit hangs until all ticks are over: a loop that waited for one would never end."""
+    ticks_over, waited = threading.Event(), []
+    write = Journal.write
+
+    def hanging(journal: Journal, *args: object) -> int:
+        waited.append(ticks_over.wait(60.0))
+        return write(journal, *args)
+
+    monkeypatch.setattr(Journal, "write", hanging)
+    robot, bus = forth_and_back(walls, description), MemoryBus(MemoryHub())
+    agent = run(robot, bus, tmp_path)
+    try:
+        nodes = len(agent.pipeline.map.nodes)
+        assert nodes and agent.replicator.status().waiting >= nodes
+        ticks_over.set()
+        assert agent.replicator.flush(60.0), "what waited in memory is written"
+        assert waited and all(waited)
+    finally:
+        ticks_over.set()
+        agent.close()
+        bus.close()
+
+
+def test_a_disk_that_hangs_holds_up_no_mission() -> None:
+    """An order comes, and a mission ends, while the disk hangs: the loop goes on, the sender waits."""
+    over, kept = threading.Event(), []
+
+    def keep(reports: object) -> None:
+        kept.append(over.wait(60.0))
+
+    savers: list[threading.Thread] = []
+
+    def defer(save: Callable[[], None]) -> None:
+        savers.append(threading.Thread(target=save))
+        savers[-1].start()
+
+    control = MissionControl("r0", keep=keep, defer=defer)
+    order = MissionOrder("m1", "r0", MissionKind.STOP, 1, "anna", None)
+    sender = threading.Thread(target=control.take, args=(order,))
+    sender.start()
+    try:
+        eventually(lambda: control.report is not None)
+        assert control.next(True, 0.0, None) == Idle()
+        assert control.follow(Status("idle", "", 0, 0, Pose2(), True)), "the stop is done"
+        assert sender.is_alive() and not kept, "nothing is on the disk yet"
+    finally:
+        over.set()
+        for thread in (sender, *savers):
+            thread.join(60.0)
+    assert kept == [True, True]
+
+
+def test_a_dead_network_holds_up_no_tick(walls, description, tmp_path) -> None:
+    """A machine that takes connections and never says a word."""
+    deaf = socket.create_server(("127.0.0.1", 0))
+    bus = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{deaf.getsockname()[1]}",)))
+    try:
+        robot = forth_and_back(walls, description)
+        agent = run(robot, bus, tmp_path)
+        took = [after - before for before, after in zip(robot.asked, robot.asked[1:], strict=False)]
+        assert agent.pipeline.map.nodes
+        assert max(took) < LONGEST_TICK
+        agent.close()
+    finally:
+        deaf.close()  # else Zenoh waits ten seconds for its first word
+        bus.close()
+
+
+class Slow:
+    """A pipeline whose ticks take long, by a clock of its own."""
+
+    lost = False
+    map = HybridMap()
+
+    def __init__(self, durations: list[float]) -> None:
+        self.durations, self.now = durations, 0.0
+
+    def clock(self) -> float:
+        return self.now
+
+    def step(self, observation: Observation, answers: object) -> Step:
+        self.now += self.durations.pop(0)
+        return Step(Command(), (), (), Status("mapping", "", 0, 0, Pose2(), False))
+
+
+class Fleet:
+    """No fleet; keeps what is reported."""
+
+    def __init__(self) -> None:
+        self.skipped: list[int] = []
+
+    def server_in_reach(self) -> bool:
+        return True
+
+    def answers(self) -> tuple[object, ...]:
+        return ()
+
+    def report(self, status: Status, stamp_ns: int, battery: float | None, now: bool, skipped: int) -> None:
+        self.skipped.append(skipped)
+
+
+def test_images_that_come_during_a_long_tick_are_skipped_and_counted(description, caplog) -> None:
+    """A gap of the camera's own, in a loop that had waited for it, is no image skipped."""
+    stamps = [0.1, 0.2, 0.6, 0.7, 1.5, 1.6]
+    durations = [0.02, 0.35, 0.02, 0.02, 0.15, 0.02]
+    robot = Player(description, [Observation(round(s * 1e9), Odometry(0.0, 0.0)) for s in stamps])
+    slow, fleet = Slow(durations), Fleet()
+    runner = Runner(slow, fleet, None, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
+    with caplog.at_level(logging.WARNING):
+        assert runner.run(robot, threading.Event()) == 6
+    assert fleet.skipped == [0, 0, 3, 3, 3, 3] and runner.skipped == 3
+    (line,) = caplog.messages
+    assert line == "a tick took 350 ms instead of 100: 3 images skipped so far"

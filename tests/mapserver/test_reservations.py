@@ -1,0 +1,164 @@
+"""One robot at a time where two cannot pass: leases by the ground that robots cover."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.reservations import AHEAD, LEASE, Reservations
+from mapweave.mapserver.routes import Router
+from tests.agent.scripted_fleet import bare
+
+MAP = MapId("a", 1)
+CORRIDOR = [(float(x), 0.0) for x in range(9)]
+NICHE = (4.0, 1.5)
+HALL = [(float(x), 5.0) for x in range(9)]
+"""Beside the corridor, with its own nodes; joined at the end."""
+
+
+@pytest.fixture(scope="module")
+def router() -> Router:
+    """A corridor of nine nodes 1 m apart with a niche beside the fifth, and a hall beside it."""
+    places = [*CORRIDOR, NICHE, *HALL]
+    joints = [*((k, k + 1) for k in range(8)), (4, 9), *((k, k + 1) for k in range(10, 18)), (8, 18)]
+    merger, exact = Merger(), np.diag([1e-4, 1e-4, 1e-4])
+    nodes = [place_node(NodeId(*MAP, k + 1), place) for k, place in enumerate(places)]
+    bodies: list[NodePut | EdgePut] = [NodePut(node) for node in nodes]
+    for number, (a, b) in enumerate(joints, start=1):
+        relative = nodes[a].map_from_robot.mean.inverse() @ nodes[b].map_from_robot.mean
+        edge = Edge(
+            EdgeId(*MAP, number), nodes[a].id, nodes[b].id, PoseGaussian(relative, exact), EdgeKind.DRIVEN
+        )
+        bodies.append(EdgePut(edge))
+    for number, body in enumerate(bodies, start=1):
+        merger.on_change(Change(MAP, number, 0, body))
+    return Router(merger.merged())
+
+
+def place_node(node_id: NodeId, place: tuple[float, float]) -> Node:
+    return replace(bare(node_id), map_from_robot=PoseGaussian(Pose2(*place), np.diag([1e-6, 1e-6, 1e-6])))
+
+
+def node(number: int) -> NodeId:
+    return NodeId(*MAP, number + 1)
+
+
+class Traffic:
+    """Robots that ask for the way from node to node."""
+
+    def __init__(self, router: Router) -> None:
+        self.router, self.reservations, self.now = router, Reservations(), 0.0
+
+    def ask(self, robot: str, *way: int, off: float = 0.0) -> ReserveAnswer:
+        route = tuple(map(node, way[1:] if len(way) > 1 else way))
+        request = ReserveRequest(robot, node(way[0]), Pose2(off, 0.0, 0.0), route)
+        return self.reservations.ask(request, self.router, self.now)
+
+
+def test_the_way_of_a_lone_robot_is_free_as_far_as_it_may_hold_it(router: Router) -> None:
+    traffic = Traffic(router)
+    assert traffic.ask("r0", 0, 1, 2, 3, 4) == ReserveAnswer(4, "", None, "")
+    assert AHEAD == 10.0
+    long = traffic.ask("r0", 0, *range(1, 9), 18, 17, 16, 15, 14)
+    assert 8 <= long.granted < 13 and long.holder == "", "it holds no more than the next 10 m"
+
+
+def test_who_comes_second_waits_until_the_first_has_passed(router: Router) -> None:
+    """The first drives 2 to 6; the second comes from the niche, and behind it."""
+    traffic = Traffic(router)
+    assert traffic.ask("r0", 2, 3, 4, 5, 6).granted == 4
+    niche = traffic.ask("r1", 9, 4)
+    assert (niche.granted, niche.holder, niche.aside) == (0, "r0", None) and niche.reason == "r0 drives there"
+    behind = traffic.ask("r2", 0, 1, 2, 3, 4, 5)
+    assert (behind.granted, behind.holder) == (1, "r0"), "it may close up"
+    traffic.ask("r0", 5, 6)
+    assert traffic.ask("r1", 9, 4).holder == "", "and drives on when the first has left"
+    assert traffic.ask("r2", 1, 2, 3, 4, 5).granted == 2, "now the other one holds the crossing"
+
+
+def test_beside_each_other_is_room_for_both(router: Router) -> None:
+    traffic = Traffic(router)
+    assert traffic.ask("r0", 0, 1, 2, 3).granted == 3
+    assert traffic.ask("r1", 13, 12, 11, 10) == ReserveAnswer(3, "", None, "")
+
+
+def test_a_robot_that_died_releases_its_way(router: Router) -> None:
+    traffic = Traffic(router)
+    traffic.ask("r0", 3, 4, 5)
+    assert traffic.ask("r1", 6, 5, 4).granted == 0
+    traffic.now += LEASE - 0.1
+    assert traffic.ask("r1", 6, 5, 4).holder == "r0"
+    traffic.now += 0.2
+    assert traffic.ask("r1", 6, 5, 4) == ReserveAnswer(2, "", None, "")
+
+
+def test_a_robot_that_has_arrived_releases_its_way(router: Router) -> None:
+    traffic = Traffic(router)
+    traffic.ask("r0", 3, 4, 5)
+    traffic.reservations.ask(ReserveRequest("r0", node(5), Pose2(), ()), router, 0.0)
+    assert traffic.ask("r1", 6, 5, 4).granted == 2
+
+
+def test_of_two_head_on_the_later_one_steps_aside_into_the_niche(router: Router) -> None:
+    traffic = Traffic(router)
+    traffic.ask("r0", 1, 2, 3, 4)
+    traffic.ask("r1", 7, 6, 5)
+    first = traffic.ask("r0", 3, 4, 5, 6, 7, 8)
+    second = traffic.ask("r1", 5, 4, 3, 2, 1)
+    assert first.granted == 1 and first.holder == "r1"
+    assert second.holder == "r0" and second.aside is None, "the first one may be on the way to the niche"
+    first = traffic.ask("r0", 3, 4, 5, 6, 7, 8)
+    assert (first.granted, first.holder, first.aside) == (0, "r1", None), "it waits, and now leaves it free"
+    second = traffic.ask("r1", 5, 4, 3, 2, 1)
+    assert second.aside == node(9), "the niche is nearer than the corridor's end"
+    assert traffic.ask("r1", 5, 4, 9).granted == 2
+    assert traffic.ask("r0", 3, 4, 5, 6, 7, 8).holder == "r1"
+    traffic.ask("r1", 9, 9)
+    assert traffic.ask("r0", 3, 4, 5, 6, 7, 8).holder == "", "the second is in the niche: the first may pass"
+    waits = traffic.ask("r1", 9, 4, 3, 2, 1)
+    assert (waits.granted, waits.holder, waits.aside) == (0, "r0", None), "and the second waits there"
+
+
+def test_robots_side_by_side_may_part(router: Router) -> None:
+    """They stand nearer to each other than two robots ever pass: away from each other both may drive."""
+    traffic = Traffic(router)
+    assert traffic.ask("r0", 4, 5, 6, off=0.2).granted == 2
+    assert traffic.ask("r1", 4, 5, 6, off=-0.2).holder == "r0", "behind the first one it waits"
+    assert traffic.ask("r1", 4, 3, 2, off=-0.2).granted == 2
+
+
+def test_of_what_is_not_on_the_map_nothing_is_held(router: Router) -> None:
+    traffic = Traffic(router)
+    assert traffic.ask("r0", 98, 99).granted == 1
+    assert traffic.ask("r1", 0, 99).granted == 1
+
+
+robots = st.sampled_from(["r0", "r1", "r2"])
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(robots, st.integers(0, 8), st.integers(0, 3)), max_size=20))
+def test_robots_that_drive_no_further_than_granted_never_meet(
+    router: Router, drives: list[tuple[str, int, int]]
+) -> None:
+    """By brute force: any robot, to any goal, as far as it likes of what it is granted, in any order."""
+    traffic, at, held = Traffic(router), {"r0": 0, "r1": 4, "r2": 8}, dict[str, range]()
+    for robot, start in at.items():
+        traffic.ask(robot, start)
+    for robot, goal, driven in drives:
+        step = 1 if goal >= at[robot] else -1
+        way = [at[robot], *range(at[robot] + step, goal + step, step)] if goal != at[robot] else [goal]
+        granted = traffic.ask(robot, *way).granted if len(way) > 1 else 0
+        held[robot] = range(min(way[0], way[0] + step * granted), max(way[0], way[0] + step * granted) + 1)
+        at[robot] += step * min(driven, granted)
+        for other in held.keys() - {robot}:
+            assert not set(held[robot]) & set(held[other]), "nodes are 1 m apart, which is room for two"

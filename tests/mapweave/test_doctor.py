@@ -1,0 +1,325 @@
+"""`mapweave doctor`: each thing that can be wrong is found, and named before what follows from it."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapweave.agent.drivers import wheeled
+from mapweave.agent.observation import Odometry, RobotDescription
+from mapweave.cli import main
+from mapweave.doctor import camera, camera_model, driver, machine
+from mapweave.doctor.finding import Finding, Verdict
+from mapweave.doctor.motion import MotionComparison
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.children import free_port
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import encode_record
+from mapweave.wire.zenoh_bus import ZenohBus
+from tests.agent.conftest import DESCRIPTION, PhotoWalls
+from tests.agent.drivers.emulators import ArduinoSketch
+from tests.waiting import eventually
+
+ROOT = Path(__file__).parents[2]
+WIDTH, HEIGHT = 320, 240
+
+
+def doctor(capfd: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Finding], str]:
+    """Exit status, findings by their subjects, and the subject of the first that is wrong."""
+    status = main(["doctor", "--json", *map(str, words)])
+    answer = json.loads(capfd.readouterr().out)
+    found = [Finding(**{**one, "verdict": Verdict(one["verdict"])}) for one in answer["findings"]]
+    findings = {one.subject: one for one in found}
+    return status, findings, (answer["first_wrong"] or {"subject": ""})["subject"]
+
+
+# Libraries
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [["cv2"], ["cv2", "msgpack", "msgspec", "networkx", "numpy", "rich", "rosbags", "serial", "zenoh"]],
+)
+def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path: Path) -> None:
+    commands = [
+        ["doctor", "--json", "--data", str(tmp_path), "--offline"],
+        ["doctor", "--data", str(tmp_path), "--offline"],
+    ]
+    ran = subprocess.run(
+        [sys.executable, "-m", "tests.mapweave.without_libraries", *missing],
+        input=json.dumps(commands), capture_output=True, text=True, check=True, cwd=ROOT, timeout=60,
+    )  # fmt: skip
+    (status, out, err), (plain_status, plain, plain_err) = json.loads(ran.stdout)
+    assert status == plain_status == 1 and not err and not plain_err
+    wrong = [one for one in json.loads(out)["findings"] if one["verdict"] == "wrong"]
+    assert len(wrong) == len(missing)
+    assert all("is not installed" in one["detail"] and "pip install" in one["advice"] for one in wrong)
+    assert json.loads(out)["first_wrong"] == wrong[0]
+    assert (
+        all(one["subject"].removeprefix("library ") in plain for one in wrong) and "first: library" in plain
+    )
+
+
+# The computer
+
+
+def test_a_clock_before_the_installation_and_a_place_that_is_no_folder(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(time, "time", lambda: 3600.0)
+    (finding,) = machine.clock()
+    assert finding.verdict is Verdict.WRONG and "1970" in finding.detail
+    (tmp_path / "file").write_text("")
+    *_, finding = machine.disk(tmp_path / "file")
+    assert finding.verdict is Verdict.WRONG and "--data" in finding.advice
+
+
+def test_a_full_or_slow_disk(tmp_path, monkeypatch) -> None:
+    usage = machine.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(machine.shutil, "disk_usage", lambda path: usage._replace(free=5_000_000))
+    (finding,) = machine.disk(tmp_path)
+    assert finding.verdict is Verdict.WRONG and "free" in finding.advice
+    monkeypatch.setattr(machine.shutil, "disk_usage", lambda path: usage._replace(free=10**10))
+    assert next(machine.disk(tmp_path)).verdict is Verdict.GOOD
+    monkeypatch.setattr(machine, "SLOW_SYNC", 0.0)
+    assert next(machine.disk(tmp_path)).verdict is Verdict.WARNING
+
+
+# Calibration
+
+CAMERA = Camera(640, 480, 610.0, 612.0, 322.0, 238.0, 0.25, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("declared", "distortion", "words"),
+    [
+        (replace(CAMERA, fx=61.0), (0.0,) * 5, "field of view 158 degrees"),
+        (replace(CAMERA, fy=480.0), (0.0,) * 5, "not the same"),
+        (replace(CAMERA, cx=610.0), (0.0,) * 5, "cx = 610"),
+        (replace(CAMERA, mount_height=25.0), (0.0,) * 5, "height_m = 25"),
+        (replace(CAMERA, mount_forward=10.0), (0.0,) * 5, "forward_m = 10"),
+        (CAMERA, (-1.2, 0.0, 0.0, 0.0, 0.0), "folds the image back"),
+    ],
+)
+def test_a_calibration_that_cannot_be_right(declared, distortion, words) -> None:
+    (finding,) = camera_model.examine(RobotDescription(declared, distortion))
+    assert (
+        finding.verdict is Verdict.WRONG
+        and words in finding.detail
+        and "mapweave calibrate" in finding.advice
+    )
+
+
+def test_distortion_folds_where_opencv_brings_two_points_to_one(capfd) -> None:
+    description = RobotDescription(CAMERA, (-1.2, 0.1, 0.0, 0.0, 0.0))
+    radius = camera_model.folding_radius(description)
+    rays = np.zeros((2000, 3))
+    rays[:, 0], rays[:, 2] = np.linspace(0.0, 1.0, 2000), 1.0
+    matrix = np.array([[610.0, 0, 0], [0, 610.0, 0], [0, 0, 1]])
+    pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(description.distortion))
+    assert radius == pytest.approx(610.0 * rays[int(pixels[:, 0, 0].argmax()), 0], rel=0.03)
+    assert camera_model.folding_radius(RobotDescription(CAMERA, (-0.28, 0.07, 0.0, 0.0, 0.0))) is None
+    good = list(camera_model.examine(RobotDescription(CAMERA, (-0.28, 0.07, 0.0, 0.0, 0.0))))
+    assert [one.verdict for one in good] == [Verdict.GOOD]
+
+
+# Camera and driver: a video file for the one, a pseudo-terminal for the other
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a second of images and of observations is enough here."""
+    monkeypatch.setattr(camera, "SECONDS", 0.5)
+    monkeypatch.setattr(driver, "SECONDS", 0.5)
+    monkeypatch.setattr(driver, "DRIVE_SECONDS", 1.0)
+    monkeypatch.setattr(driver, "TURN_SECONDS", 1.0)
+    monkeypatch.setattr(wheeled, "PATIENCE", 0.5)
+
+
+@pytest.fixture(scope="module")
+def walls() -> PhotoWalls:
+    return PhotoWalls()
+
+
+def film(path: Path, walls: PhotoWalls, spoil=lambda image: image, moves: bool = True) -> Path:
+    """A camera that moves a little, or repeats one image."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (WIDTH, HEIGHT))
+    for k in range(8):
+        image = spoil(walls.render(Pose2(0.01 * k if moves else 0.0)))
+        for _ in range(10):
+            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+def robot_toml(folder: Path, video: Path, port: object, width: int = WIDTH) -> Path:
+    path = folder / "robot.toml"
+    path.write_text(f"""
+[robot]
+driver = "arduino"
+[robot.options]
+port = "{port}"
+wheel_radius = 0.033
+counts_per_turn = 1440
+[robot.geometry]
+radius = 0.12
+axle = 0.15
+ranger_bearings_deg = [45, 0, -45]
+ranger_reach = 1.5
+[robot.camera]
+source = "{video}"
+width = {width}
+height = {HEIGHT}
+fx = 277
+fy = 277
+cx = {width / 2}
+cy = 120
+height_m = 0.3
+""")
+    return path
+
+
+@pytest.fixture
+def sketch(tmp_path: Path) -> Iterator[ArduinoSketch]:
+    emulator = ArduinoSketch(tmp_path)
+    yield emulator
+    emulator.close()
+
+
+def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> None:
+    """All is well but that the camera does not see the drive; without --drive nothing moves."""
+    sketch.distances = [200, 200, 200]
+    still = film(tmp_path / "still.avi", walls, moves=False)
+    settings = robot_toml(tmp_path, still, sketch.path)
+    status, findings, first = doctor(capfd, "--robot", settings, "--drive", "--offline", "--data", tmp_path)
+    assert findings["camera"].verdict is Verdict.GOOD and "320x240 px" in findings["camera"].detail
+    assert findings["driver"].verdict is Verdict.GOOD and "3 proximity sensors" in findings["driver"].detail
+    assert findings["encoders"].verdict is Verdict.WRONG
+    assert "the encoders count and the image stands still" in findings["encoders"].detail
+    eventually(lambda: sketch.wheels.speeds == (0.0, 0.0))
+    assert 0.08 < sketch.wheels.way()[1] < 0.2
+    assert status == 1 and first in ("image", "encoders")
+
+
+def test_a_robot_that_is_not_pushed_and_a_wrong_size(walls, sketch, tmp_path, capfd) -> None:
+    settings = robot_toml(tmp_path, film(tmp_path / "film.avi", walls), sketch.path, width=640)
+    status, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    assert status == 1 and first == "camera" and "320x240" in findings["camera"].detail
+    assert "declared as 640x240" in findings["camera"].detail
+    assert sketch.wheels.way() == (0.0, 0.0)
+
+
+def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd) -> None:
+    dark = film(tmp_path / "dark.avi", walls, lambda image: (image * 0.02).astype(np.uint8))
+    settings = robot_toml(tmp_path, dark, tmp_path / "ttyUSB7")
+    status, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    assert (status, first) == (1, "image") and "dark" in findings["image"].detail
+    assert findings["driver"].verdict is Verdict.WRONG and "no such port" in findings["driver"].detail
+    assert "mapweave find-port" in findings["driver"].advice
+
+
+def test_no_camera_and_wrong_settings(tmp_path, capfd) -> None:
+    settings = robot_toml(tmp_path, tmp_path / "none.avi", tmp_path / "none")
+    _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    assert first == "camera" and "find-cameras" in findings["camera"].advice
+    settings.write_text("[robot]\ndrivre = 1\n")
+    _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    assert first == "settings" and "did you mean 'driver'" in findings["settings"].detail
+
+
+# Encoders against the image
+
+
+@pytest.fixture(scope="module")
+def push(walls: PhotoWalls) -> list:
+    """0.3 m forward and 20 degrees to the left, then the same back."""
+    poses = [Pose2(0.02 * k, 0.0, 0.0) for k in range(16)] + [Pose2(0.3, 0.0, 0.035 * k) for k in range(11)]
+    poses += poses[::-1]
+    return [walls.observe(before, now, k) for k, (before, now) in enumerate(pairwise(poses))]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "verdict", "words"),
+    [
+        (lambda one, first: one, Verdict.GOOD, "agree with the image"),
+        (lambda one, first: replace(one, odometry=Odometry(0.0, 0.0)),
+         Verdict.WRONG, "encoders do not count"),
+        (lambda one, first: replace(one, image=first.image), Verdict.WRONG, "the image stands still"),
+        (lambda one, first: replace(one, odometry=Odometry(one.odometry.forward, -one.odometry.turn)),
+         Verdict.WRONG, "the image turns the other way"),
+        (lambda one, first: replace(one, odometry=Odometry(-one.odometry.forward, one.odometry.turn)),
+         Verdict.WRONG, "forward by the encoders is backward by the image"),
+        (lambda one, first: replace(one, odometry=Odometry(one.odometry.forward, one.odometry.turn / 2)),
+         Verdict.WRONG, "turns 2.0"),
+        (lambda one, first: replace(one, image=first.image, odometry=Odometry(0.0, 0.0)),
+         Verdict.SKIPPED, "nothing has moved"),
+        (lambda one, first: replace(one, image=np.full_like(one.image, 90)),
+         Verdict.SKIPPED, "too little to follow"),
+    ],
+)  # fmt: skip
+def test_encoders_are_compared_with_the_image(push, spoil, verdict, words) -> None:
+    comparison = MotionComparison(DESCRIPTION)
+    for one in push:
+        comparison.see(spoil(one, push[0]))
+    (finding,) = comparison.judge()
+    assert finding.verdict is verdict and words in finding.detail, finding
+
+
+# The server
+
+
+@pytest.fixture
+def router() -> Iterator[tuple[ZenohBus, str]]:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    bus = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
+    yield bus, endpoint
+    bus.close()
+
+
+def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
+    bus, endpoint = router
+    asked = ("--connect", endpoint, "--fleet", "ours", "--data", tmp_path)
+    status, findings, first = doctor(capfd, *asked)
+    assert (status, first) == (1, "server") and "no map server of fleet ours" in findings["server"].detail
+    theirs, ours = Keys("theirs"), Keys("ours")
+    other = bus.announce(theirs.server_alive("s7"))
+    assert "s7 of fleet theirs" in doctor(capfd, *asked)[1]["server"].detail
+    other.close()
+    record = {"version": "0.0.1", "summary": "3 maps"}
+    serving = bus.serve(ours.server_status("s0"), lambda request: request.reply(encode_record(record)))
+    status, findings, _ = doctor(capfd, *asked)
+    assert (
+        status == 0 and findings["server"].verdict is Verdict.WARNING and "0.0.1" in findings["server"].detail
+    )
+    record["version"] = version("mapweave")
+    assert doctor(capfd, *asked)[1]["server"].verdict is Verdict.GOOD
+    serving.close()
+
+
+def test_nothing_listens(tmp_path, capfd) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    status, findings, first = doctor(capfd, "--connect", endpoint, "--data", tmp_path)
+    assert (status, first) == (1, "server") and "refused" in findings["server"].detail
+
+
+def test_a_table_names_the_first_thing_wrong(tmp_path, capfd) -> None:
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{closed.getsockname()[1]}"
+        assert main(["doctor", "--connect", endpoint, "--data", str(tmp_path)]) == 1
+    out = capfd.readouterr().out
+    assert "python" in out and f"first: server: {endpoint}" in out and "do: start `mapweave server`" in out
+    assert main(["doctor", "--offline", "--data", str(tmp_path)]) == 0
+    assert capfd.readouterr().out.rstrip().endswith("nothing is wrong")
