@@ -30,6 +30,7 @@ from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
+P = Parameter
 ENOUGH = 0.04
 """A pair ends when half of its tracks have moved this far, as a share of the image's width,"""
 LEAST = 0.004
@@ -42,7 +43,7 @@ STALE = 0.25
 """A pair is reduced again when a parameter has moved by this share of a useful sigma since."""
 KEPT_NEW = 40
 """Of these the newest stay; of the others those go that turn least."""
-STEPS = 2
+STEPS = 1
 """Gauss-Newton steps of a solution."""
 SETTLED = 0.5
 """Two solutions in a row must agree to this share of a useful sigma."""
@@ -50,9 +51,10 @@ WORTH = 1.0
 """A change is put to use if it is larger than this share of a useful sigma, and than three of its own."""
 SIGMAS = 3.0
 
-SCALES = [Parameter.HEIGHT, Parameter.WHEEL_SCALE]
-"""Named, but not used by itself: what passes for the floor was up to 8 % off in a rendered room, and a
-wrong scale makes a map worse than the wheels alone."""
+NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
+"""Named, but not used by themselves. The wheels' scales and drift are what all else is measured by, and the
+floor shows the height only as a multiple of the way. A camera aside or rolled shows too weakly: of two
+simulated explorations each would have changed one of these, wrongly."""
 USEFUL = np.array([USEFUL_SIGMAS[p] for p in Parameter])
 
 
@@ -203,12 +205,12 @@ class OnlineCalibration:
         target = self._next.vector
         off = np.abs(estimate.vector - target)
         change = estimate.shown & settled & (off > WORTH * USEFUL) & (off > SIGMAS * estimate.sigmas)
-        change[SCALES] = False
+        change[NAMED_ONLY] = False
         if not change.any():
             return
         # What is shown but differs less goes along: the estimates belong together.
         along = estimate.shown & settled & (off > estimate.sigmas)
-        along[SCALES] = False
+        along[NAMED_ONLY] = False
         self._next = DriveGeometry.of(np.where(change | along, estimate.vector, target))
         self.pending = corrected(self._declared, self._next)
 
