@@ -95,7 +95,8 @@ def _recorded(
 
     robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
     observed = iter(robot.sense, None)
-    shown = track(observed, name, total=len(robot), console=console, transient=True)
+    quiet = not console.is_terminal
+    shown = track(observed, name, total=len(robot), console=console, transient=True, disable=quiet)
     return robot.describe(), iter(shown)
 
 
