@@ -12,6 +12,7 @@ from mapweave.agent.mission import Carried, Explore, GoTo, Idle
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.ranger_monitor import RangerMonitor
+from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -20,6 +21,7 @@ from mapweave.sim.worlds.catalog import make_world
 from tests.agent.ranged_body import BODY, MAP, on, rangers
 
 Broken = Callable[[np.ndarray], np.ndarray]
+ALLOWED = AgentSettings(exploration=ExplorerSettings(without_rangers=True))
 NONE: Broken = lambda readings: readings[:0]  # noqa: E731
 FEWER: Broken = lambda readings: readings[:5]  # noqa: E731
 MORE: Broken = lambda readings: np.append(readings, readings)  # noqa: E731
@@ -94,9 +96,9 @@ def test_an_agent_without_wheels_needs_no_rangers(walls, mission):
     assert all("promised" not in step.status.detail for step in steps)
 
 
-def test_a_robot_that_promises_none_drives_without(walls):
+def test_a_robot_that_promises_none_is_not_held_back_by_their_silence(walls):
     description = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3))
-    drive = Drive(walls, on(Explore(), body=description))
+    drive = Drive(walls, on(Explore(), body=description, settings=ALLOWED))
     assert any(step.command != Command() for step in drive.run(20, NONE))
 
 

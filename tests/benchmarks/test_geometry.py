@@ -17,6 +17,7 @@ from mapweave.evaluation.truth import Truth
 from synthetic.room_drive import CAMERA, drive, write
 
 
+@pytest.mark.slow
 def test_the_benchmark_says_what_a_wrong_geometry_costs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -109,6 +109,7 @@ def still(control: SimControl) -> bool:
     return before.distance(pose(control)) < 0.003
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_a_robot_is_driven_by_keys_maps_and_stands_when_who_drives_is_killed(
     network: tuple[list[str], SimControl],
@@ -150,6 +151,7 @@ def test_a_robot_is_driven_by_keys_maps_and_stands_when_who_drives_is_killed(
         other.end()
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_a_robot_is_driven_by_a_gamepad_and_a_second_person_is_refused(
     network: tuple[list[str], SimControl], tmp_path: Path
@@ -180,6 +182,7 @@ def test_a_robot_is_driven_by_a_gamepad_and_a_second_person_is_refused(
         person.end()
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_who_is_not_there_is_named_in_one_line(
     network: tuple[list[str], SimControl], tmp_path: Path, capfd: pytest.CaptureFixture[str]

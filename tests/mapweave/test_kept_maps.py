@@ -80,6 +80,7 @@ def network(tmp_path: Path) -> Iterator[tuple[Children, ZenohBus, str]]:
             bus.close()
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_agents_that_are_killed_begun_again_and_robbed_of_their_disk_lose_no_map(
     network: tuple[Children, ZenohBus, str], tmp_path: Path

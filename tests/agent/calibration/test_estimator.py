@@ -48,6 +48,7 @@ def trials() -> list[tuple[DriveGeometry, Estimate]]:
     return results
 
 
+@pytest.mark.slow
 def test_all_that_is_shown_is_right(trials: list[tuple[DriveGeometry, Estimate]]):
     """Within what a map needs, from declarations wrong in every parameter."""
     bounds = {
@@ -63,6 +64,7 @@ def test_all_that_is_shown_is_right(trials: list[tuple[DriveGeometry, Estimate]]
         assert estimate.shown[[P.TURN_SCALE, P.FORWARD, P.PITCH, P.DELAY]].all()
 
 
+@pytest.mark.slow
 def test_sigmas_cover_the_errors(trials: list[tuple[DriveGeometry, Estimate]]):
     """Most errors of what is shown are within two sigmas, nearly none beyond four."""
     z = np.concatenate([np.abs((e.vector - true.vector) / e.sigmas)[e.shown] for true, e in trials])

@@ -20,7 +20,11 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.wire.codec import decode_body, encode_body
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
-ROBOT = RobotDescription(camera=CAMERA)
+REACH = 1.0
+BEARINGS = tuple(np.linspace(-np.pi, np.pi, 16, endpoint=False))
+ROBOT = RobotDescription(camera=CAMERA, ranger_bearings=BEARINGS, ranger_reach=REACH)
+"""With rangers: without any it drives more slowly."""
+FREE = np.full(len(BEARINGS), REACH)
 MAP = MapId("r0", 1)
 A, B, ELSEWHERE = NodeId("r0", 1, 1), NodeId("r0", 1, 2), NodeId("r1", 1, 7)
 TRUE = Pose2(0.8, 0.1, 0.05)
@@ -119,7 +123,7 @@ def drive(pipeline: Pipeline, walls, begin: Pose2, goal: NodeId, slip: float) ->
     pipeline.set_mission(GoTo(goal))
     answers: tuple[Answer, ...] = ()
     for tick in range(600):
-        step = pipeline.step(Observation(tick * 100_000_000, odometry, walls.render(pose)), answers)
+        step = pipeline.step(Observation(tick * 100_000_000, odometry, walls.render(pose), FREE), answers)
         answers = tuple(Answer(question.number, None, "no server") for question in step.questions)
         changes += [change for change in step.changes if isinstance(change, EdgePut)]
         if step.status.finished:

@@ -16,6 +16,7 @@ from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
+from mapweave.merge.explanation.map_explanation import explain_fleet
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.stub_services import StubServices, two_maps
@@ -35,6 +36,12 @@ def ask(served: Web, query: str, of: str = "explain") -> tuple[int, dict]:
             return reply.status, json.load(reply)
     except HTTPError as error:
         return error.code, json.load(error)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled() -> None:
+    """What a first explanation compiles takes longer on a busy machine than a person would wait."""
+    explain_fleet(two_maps(), 10)
 
 
 def test_maps_and_nodes_are_explained(served: Web) -> None:

@@ -81,6 +81,7 @@ def same(first, second):
         assert getattr(first.figures, name) == getattr(second.figures, name), name
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_in_one_process_and_in_many_on_a_busy_machine(tmp_path):
     """Neither the order in which threads and processes run nor where they run changes anything."""

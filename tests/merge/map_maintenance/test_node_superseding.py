@@ -240,6 +240,7 @@ def covers(merged: MergedMap, first: NodeId, second: NodeId) -> bool:
     return bool(depths and least_in_view(shared, a, b, between) >= rules.FOUND)
 
 
+@pytest.mark.slow
 def test_nodes_of_today_are_searched_even_if_superseded(drives: Drives) -> None:
     """Another robot's view of the same hour is evidence; an hour later it is past."""
     rng = np.random.default_rng(8)
