@@ -131,6 +131,7 @@ def test_figures_by_hand(tmp_path) -> None:
     assert table(figures(nothing, 1.0, 7)).row_count == 3
 
 
+@pytest.mark.slow
 def test_a_short_race() -> None:
     """One robot for some seconds: both strategies run in the same office, without a fleet."""
     done = measure([1], 3, 0.16, 1, spread=False, quiet=True)

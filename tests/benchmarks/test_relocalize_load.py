@@ -49,6 +49,7 @@ def test_an_answer_is_right_where_it_was_taken(tmp_path: Path) -> None:
     assert not is_right(building, query, nothing)
 
 
+@pytest.mark.slow
 def test_a_small_run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     arguments = [
         "relocalize_load",

@@ -89,6 +89,7 @@ def test_without_floor_no_scale_is_shown():
     assert estimate.usable.wheel_scale == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_a_right_geometry_has_no_causes():
     for seed in range(3):
         run = drive(np.random.default_rng(seed), DECLARED, 30.0)

@@ -60,6 +60,7 @@ troubles = 0
 """
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_bad_day(tmp_path):
     path = tmp_path / "bad-day.toml"
