@@ -340,8 +340,6 @@ class Pipeline:
         while isinstance(move := behaviour.next_move(), EpisodeRequest):
             self._mapper.meet(move, observation)
             self._see_changes()
-            if self._mapper.between_episodes:
-                return Command()
         return move
 
     def _calibrate(self, image: NDArray[np.uint8]) -> None:

@@ -65,11 +65,11 @@ class Mapper:
         self._wayside = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
-        # Features take as long as all else in a tick that makes nodes. A thread extracts them while the robot
-        # waits for its next image. The next tick begins by waiting for them: no result depends on speed.
+        # A thread extracts features. Those of a further view are used in the next tick, which begins by
+        # waiting for them: no result depends on speed. The next anchor's are needed at once: episodes that
+        # begin a tick later cost a robot a quarter of its nodes.
         self._extraction = ThreadPoolExecutor(1, "features")
         self._extracting: tuple[Future[Features], Callable[[Features], None]] | None = None
-        self._ended = False
 
     # What behaviours read, see `Episode`
 
@@ -87,11 +87,6 @@ class Mapper:
     def astray(self) -> bool:
         """Whether there is a map and the robot does not know where on it it is: it must recognise a place."""
         return self._anchor is None and bool(self.map.nodes)
-
-    @property
-    def between_episodes(self) -> bool:
-        """Whether an episode has ended in this tick. The next begins with the next tick, at this image."""
-        return self._ended
 
     @property
     def doubtful(self) -> bool:
@@ -221,7 +216,7 @@ class Mapper:
         self._take_up_pending()
         self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._leaves = None, []
-        self._extracting, self._ended = None, False
+        self._extracting = None
 
     def resume(
         self, observation: Observation, features: Features, node: Node, recognition: Recognition
@@ -274,25 +269,21 @@ class Mapper:
         node = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
         if node is not None:
             self.typical_depth = float(np.median(node.landmarks.depths))
-
-        def begin_next(features: Features) -> None:
-            anchor = self._tracking.take(observation, features, HERE)
-            moved = self._tracking.reanchor()
-            self._cartographer.move_anchor(moved)
-            if node is not None:
-                self._wayside.clear(anchor.stamp_ns)
-            else:
-                self._wayside.move_anchor(moved.mean)
-            self._anchor, self._leaves = anchor, []
-            if self._take_up_pending():
-                # Tracks and features of another lens are of no use to a filter of this one.
-                self._tracking = Tracking(self._description, self._lens, self._settings)
-                self._tracking.step(observation)
-                self.begin(observation)
-            else:
-                self._tracking.follow(anchor, self.typical_depth)
-
-        self._extracting, self._ended = (features, begin_next), True
+        anchor = self._tracking.take(observation, features.result(), HERE)
+        moved = self._tracking.reanchor()
+        self._cartographer.move_anchor(moved)
+        if node is not None:
+            self._wayside.clear(anchor.stamp_ns)
+        else:
+            self._wayside.move_anchor(moved.mean)
+        self._anchor, self._leaves = anchor, []
+        if self._take_up_pending():
+            # Tracks and features of another lens are of no use to a filter of this one.
+            self._tracking = Tracking(self._description, self._lens, self._settings)
+            self._tracking.step(observation)
+            self.begin(observation)
+        else:
+            self._tracking.follow(anchor, self.typical_depth)
         return node is not None
 
     def _extract(self, image: NDArray[np.uint8]) -> Future[Features]:
@@ -302,7 +293,7 @@ class Mapper:
     def _use_extracted(self) -> None:
         """Use the features of the image before. Nothing was tracked since."""
         if self._extracting is not None:
-            (features, take), self._extracting, self._ended = self._extracting, None, False
+            (features, take), self._extracting = self._extracting, None
             take(features.result())
 
     def _take_up_pending(self) -> bool:
