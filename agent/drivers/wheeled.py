@@ -59,6 +59,8 @@ class WheeledRobot:
         self._description: RobotDescription | None = None
         self._changed = threading.Condition()
         self._readings: deque[tuple[int, BaseReading]] = deque(maxlen=64)
+        # Since the last observation: a short touch must not fall between two of them.
+        self._bumped = self._kidnapped = False
         self._command: Wheels | None = None
         self._failure = ""
         self._mistake: Exception | None = None
@@ -125,6 +127,8 @@ class WheeledRobot:
                 stamp_ns = max(self._stamp_ns + tick_ns // 10, now_ns() - self._age_ns - tick_ns)
             way = self._way(stamp_ns)
             read_ns, reading = self._readings[-1]
+            bumped, kidnapped = self._bumped, self._kidnapped
+            self._bumped, self._kidnapped = reading.bumped, reading.kidnapped
         before, self._odometry_at = self._odometry_at, way
         self._stamp_ns = stamp_ns
         left, right = way.left - before.left, way.right - before.right
@@ -136,9 +140,9 @@ class WheeledRobot:
             Odometry((left + right) / 2, (right - left) / description.axle),
             None if frame is None else frame.image,
             reading.proximity if used else np.zeros(0),
-            reading.bumped and fresh,
+            bumped and fresh,
             reading.battery,
-            reading.kidnapped and fresh,
+            kidnapped and fresh,
         )
 
     def act(self, command: Command) -> Command:
@@ -228,6 +232,8 @@ class WheeledRobot:
                 stamp_ns, known = self._readings.pop()
                 reading = replace(reading, way=known.way)
             self._readings.append((stamp_ns, reading))
+            self._bumped |= reading.bumped
+            self._kidnapped |= reading.kidnapped
             if self._failure and self._opened:
                 log.warning("the robot answers again")
             self._opened, self._failure = True, ""

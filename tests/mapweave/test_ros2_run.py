@@ -39,12 +39,13 @@ class RosInSimulation:
         endpoint: of the router.
         command: the newest.
         kidnapped: whether it is lifted.
+        lifted_ticks: how often it has said so.
         shown: when each image was taken, ns, and where.
     """
 
     def __init__(self, simulation: Simulation, endpoint: str) -> None:
         self.simulation, self.endpoint, self.peer = simulation, endpoint, RosPeer(endpoint)
-        self.command, self.kidnapped = Command(), False
+        self.command, self.kidnapped, self.lifted_ticks = Command(), False, 0
         self.shown: list[tuple[int, Pose2]] = []
         self.world = threading.RLock()
         self._description = simulation.describe("r0")
@@ -91,7 +92,9 @@ class RosInSimulation:
             walls = [math.inf if r >= d.ranger_reach else r + d.radius for r in seen.proximity.tolist()]
             reach = d.ranger_reach + d.radius
             topics["/scan"].publish(peer.scan(now, "laser", 0.0, math.tau / RANGERS, 0.05, reach, walls))
-            topics["/kidnap_status"].publish(peer.kidnap_status(now, self.kidnapped))
+            lifted = self.kidnapped
+            topics["/kidnap_status"].publish(peer.kidnap_status(now, lifted))
+            self.lifted_ticks += lifted
             info = peer.camera_info(now, c.width, c.height, c.fx, centre=(c.cx, c.cy))
             topics["/camera_info"].publish(info)
             if seen.image is not None:
@@ -168,7 +171,7 @@ ranger_reach = {d.ranger_reach}
 
         # A person lifts it and puts it down where it began, turned around.
         robot.kidnapped = True
-        wait_for(lambda: robot.command == Command(), 5)
+        wait_for(lambda: robot.lifted_ticks >= 10 and robot.command == Command(), 10)
         mapped = nodes()
         with robot.world:
             robot.simulation.kidnap("r0", start @ Pose2(0.0, 0.0, 2.0))

@@ -16,6 +16,7 @@ from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSetti
 from mapweave.agent.drivers.wheeled import WheeledRobot
 from mapweave.agent.observation import Command
 from mapweave.hybridmap.errors import DeviceError
+from tests.waiting import eventually
 
 SETTINGS = RobotSettings(camera=CameraSettings(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3))
 IMAGE = np.zeros((48, 64), np.uint8)
@@ -29,6 +30,7 @@ class EvenBase:
 
     def __init__(self) -> None:
         self.failing = self.broken = False
+        self.touches = self.reads = 0
 
     def way(self, stamp_ns: int) -> Wheels:
         seconds = (stamp_ns % 10**13) / 1e9
@@ -51,7 +53,9 @@ class EvenBase:
     def read(self) -> BaseReading:
         if self.failing:
             raise DeviceError("gone")
-        return BaseReading(self.way(now_ns()))
+        self.reads += 1
+        touched, self.touches = self.touches > 0, max(self.touches - 1, 0)
+        return BaseReading(self.way(now_ns()), bumped=touched, kidnapped=touched)
 
 
 class LateCamera:
@@ -104,6 +108,18 @@ def test_odometry_is_that_of_the_time_between_the_images(robot: CheckedRobot) ->
         assert second.odometry.forward == pytest.approx(0.25 * seconds, abs=5e-4)
         assert second.odometry.turn == pytest.approx(0.1 / 0.25 * seconds, abs=4e-3)
         first = second
+
+
+def test_a_touch_between_two_observations_is_not_lost(robot: CheckedRobot, base: EvenBase) -> None:
+    quiet = robot.sense()
+    base.touches, base.reads = 1, 0
+    eventually(lambda: base.reads >= 3)  # The last two touch nothing.
+    touched, after = robot.sense(), robot.sense()
+    assert quiet is not None
+    assert touched is not None
+    assert after is not None
+    assert [seen.bumped for seen in (quiet, touched, after)] == [False, True, False]
+    assert [seen.kidnapped for seen in (quiet, touched, after)] == [False, True, False]
 
 
 def test_ticks_without_image_and_images_after_them(robot: CheckedRobot, camera: LateCamera) -> None:
