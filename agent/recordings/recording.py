@@ -40,6 +40,7 @@ class Recording:
         increments: (N, 2) way of the middle of the axle, m, and turn, rad, since the image before.
         notes: what was guessed or left out, a line each.
         damage: what cannot be read of it, a line each; what comes before is used.
+        kidnapped: (N,) whether the robot was lifted since the image before; None if the format does not say.
     """
 
     path: Path
@@ -51,6 +52,7 @@ class Recording:
     increments: Array
     notes: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
+    kidnapped: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         """How many images there are."""
