@@ -66,10 +66,12 @@ class Images:
     Attributes:
         stamps_ns: (N,) ascending.
         read: gives an image by its number, (H, W) grey.
+        damage: what follows and cannot be read, in one line; empty if nothing does.
     """
 
     stamps_ns: Stamps
     read: Callable[[int], NDArray[np.uint8]]
+    damage: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +167,7 @@ def assembled(
         DeviceError: they do not fit together.
     """
     stamps, read = images.stamps_ns, images.read
+    damage = (images.damage, *damage) if images.damage else damage
     if len(stamps) < 2:
         raise DeviceError(f"{path}: {len(stamps)} images are no drive")
     if (np.diff(stamps) <= 0).any():

@@ -175,6 +175,8 @@ def _recorded(collection: ViewCollection, path: Path, console: Console) -> None:
             console.print(f"{len(collection.views)} of {len(paths)} images show the target", highlight=False)
         return
     images = video_images(path)
+    if images.damage:
+        console.print(images.damage, highlight=False)
     for k in track(range(len(images.stamps_ns)), "frames", console=console, transient=True, disable=quiet):
         collection.see(images.read(k), f"frame {k}")
     if collection.views:
