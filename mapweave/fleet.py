@@ -34,8 +34,10 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-SOON = 2.0
-"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
+SOON = 1.0
+"""s; a router that is there is found sooner. Commands say within 2 s of their start that there is none."""
+ANSWERED = 2.0
+"""s; a server or robot that is there answers sooner."""
 PACKING = 120.0
 """How long a server may take to pack a large map, s."""
 TRIES = 3
@@ -49,10 +51,37 @@ def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0)
         NotConnected: the robot does not answer, or does not take it.
     """
     replies = bus.ask(keys.mission(order.robot), encode(order), timeout)
-    if not replies or replies[0].error:
-        why = replies[0].error if replies else "no answer"
-        raise NotConnected(f"robot {order.robot} did not take its mission: {why}")
+    if not replies:
+        raise NotConnected(
+            f"robot {order.robot} does not answer: is its agent running? `mapweave status` lists the robots"
+        )
+    if replies[0].error:
+        raise NotConnected(f"robot {order.robot} did not take its mission: {replies[0].error}")
     return decode(replies[0].payload, MissionReport)
+
+
+def reach(endpoints: Sequence[str], advice: str = "give --connect") -> ZenohBus:
+    """A connection of a client that needs a router now.
+
+    Args:
+        endpoints: of routers; the first in reach is taken.
+        advice: what else a person can do.
+
+    Raises:
+        NotConnected: there is none.
+    """
+    bus = ZenohBus(BusSettings(mode="client", endpoints=tuple(endpoints), attempt=SOON / len(endpoints)))
+    if not bus.wait_connected(SOON):
+        bus.close()
+        raise NotConnected(f"no router at {', '.join(endpoints)}: start `mapweave server`, or {advice}")
+    return bus
+
+
+def no_server(fleet: str) -> NotConnected:
+    """The error that no map server answers."""
+    return NotConnected(
+        f"a router is up, but no map server of fleet {fleet} answers: start `mapweave server` or give --fleet"
+    )
 
 
 def login() -> str:
@@ -89,12 +118,7 @@ class Fleet:
         self._own: ZenohBus | None = None
         if bus is None:
             endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-            bus = self._own = ZenohBus(BusSettings(mode="client", endpoints=endpoints))
-            if not self._own.wait_connected(SOON):
-                self._own.close()
-                raise NotConnected(
-                    f"no router at {', '.join(endpoints)}: start `mapweave server`, or give --connect"
-                )
+            bus = self._own = reach(endpoints)
         self._bus = bus
 
     def __enter__(self) -> Fleet:
@@ -113,13 +137,19 @@ class Fleet:
             self._own.close()
 
     def status(self) -> FleetStatus:
-        """All robots, as the map server sees them; without one, those that answer themselves."""
-        for reply in self._ask(self._keys.any_robots(), b"", SOON):
+        """All robots, as the map server sees them; without one, those that answer themselves.
+
+        Raises:
+            NotConnected: no map server and no robot answers.
+        """
+        for reply in self._ask(self._keys.any_robots(), b"", ANSWERED):
             return decode(reply.payload, FleetStatus)
         robots = []
-        for reply in self._ask(self._keys.agent_statuses(), b"", SOON):
+        for reply in self._ask(self._keys.agent_statuses(), b"", ANSWERED):
             status = decode(reply.payload, AgentStatus)
             robots.append(RobotEntry(status.robot, True, 0.0, status))
+        if not robots:
+            raise no_server(self._keys.fleet)
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
@@ -131,9 +161,9 @@ class Fleet:
         Raises:
             NotConnected: no map server answers.
         """
-        replies = self._ask(self._keys.any_missions(), b"", SOON)
+        replies = self._ask(self._keys.any_missions(), b"", ANSWERED)
         if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+            raise no_server(self._keys.fleet)
         reports = decode(replies[0].payload, Missions).reports
         return tuple(report for report in reports if robot in ("", report.order.robot))
 
@@ -221,7 +251,7 @@ class Fleet:
         """
         replies = self._ask(self._keys.any_server_map(), b"", PACKING)
         if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+            raise no_server(self._keys.fleet)
         unpack_map_file(replies[0].payload)
         return replies[0].payload
 
@@ -236,7 +266,7 @@ class Fleet:
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
             request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal)
-            replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * SOON)
+            replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * ANSWERED)
             taken = [reply for reply in replies if not reply.error]
             if not taken and replies:
                 raise InvalidValue(replies[0].error.removeprefix("refused: "))
@@ -254,7 +284,7 @@ class Fleet:
         after_ns = 0
         for _ in range(TRIES):
             order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal)
-            report = send_order(self._bus, self._keys, order, SOON)
+            report = send_order(self._bus, self._keys, order, ANSWERED)
             if report.state is not MissionState.REPLACED:
                 break
             after_ns = self._newest(robot)
@@ -262,7 +292,7 @@ class Fleet:
 
     def _newest(self, robot: str) -> int:
         """Stamp of the mission that holds a robot."""
-        for reply in self._ask(self._keys.agent_status(robot), b"", SOON):
+        for reply in self._ask(self._keys.agent_status(robot), b"", ANSWERED):
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0

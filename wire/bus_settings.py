@@ -35,6 +35,8 @@ class BusSettings:
         listen: where a router waits for clients.
         session: id of the Zenoh session, hexadecimal; empty for a random one.
         timestamps: whether what is published gets a time, without which nothing is kept for late subscribers.
+        attempt: of a client to open a connection, s: so long a host that does not answer holds up the next
+            endpoint, and the end of the process. Zenoh's own default is 10.
     """
 
     mode: Literal["client", "router"] = "client"
@@ -42,6 +44,7 @@ class BusSettings:
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     session: str = ""
     timestamps: bool = False
+    attempt: float = 10.0
 
     def __post_init__(self) -> None:
         """Refuse what cannot work.

@@ -20,7 +20,7 @@ SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 INDEXED = {".mp4", ".mov", ".m4v"}
 """Their index stands at the end."""
 OTHER_TRACK = 1.0
-"""An AVI says how many frames it has; others how long they are, to which sound that goes on may add this, s."""
+"""An AVI says how many frames it has; others how long they are, to which sound may add this, s."""
 
 
 def video(path: Path, options: RecordingOptions) -> Recording:

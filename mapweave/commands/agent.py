@@ -14,6 +14,7 @@ from mapweave.commands.network import (
     add_network,
     connect,
     network_of,
+    reach,
     settings_of,
     stop_on_signals,
     warn_without_router,
@@ -23,8 +24,10 @@ if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
     from mapweave.agent.drivers.settings import RobotSettings
     from mapweave.agent.synchronization import Synchronization
+    from mapweave.settings import NetworkSettings
     from mapweave.wire.bus import Bus
     from mapweave.wire.ros2.settings import Ros2Link
+    from mapweave.wire.zenoh_bus import ZenohBus
 
 
 def add_to(commands: Any) -> None:
@@ -208,6 +211,18 @@ def open_robot(
     if lockstep or arguments.body:
         raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
     return find_driver(driver)(settings), FreeRunning()
+
+
+def bus_of(arguments: argparse.Namespace, settings: RobotSettings, network: NetworkSettings) -> ZenohBus:
+    """A connection of a command that needs the network only if the robot's base is behind it.
+
+    Raises:
+        NotConnected: the base is, and there is no router.
+    """
+    from mapweave.agent.drivers.settings import REMOTE
+
+    remote = (arguments.robot or settings.driver) == REMOTE
+    return (reach(network) if remote else connect(network))[0]
 
 
 def close_on(stop: threading.Event, robot: Robot) -> None:

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.agent import add_calibration, calibration_of, close_on, open_robot
-from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.agent import add_calibration, bus_of, calibration_of, close_on, open_robot
+from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 from mapweave.commands.replay import add_recording, name_of, options_of
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def _live(
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     stop = stop_on_signals()
-    bus, _ = connect(network)
+    bus = bus_of(arguments, settings.robot, network)
     opened, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
     threading.Thread(target=close_on, args=(stop, opened), name="stop", daemon=True).start()
     robot = CheckedRobot(opened)

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
-SOON = 2.0
-"""s; a router that is there is found sooner."""
+SOON = 1.0
+"""s; a router that is there is found sooner. As `mapweave.fleet.SOON`, which an agent does not import."""
 
 
 def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
@@ -59,6 +59,18 @@ def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
     from mapweave.wire.zenoh_bus import ZenohBus
 
     return ZenohBus(BusSettings(mode="client", endpoints=network.endpoints)), Keys(network.fleet)
+
+
+def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[ZenohBus, Keys]:
+    """A client connection of a command that needs a router now.
+
+    Raises:
+        NotConnected: there is none; one line says what to do.
+    """
+    from mapweave import fleet
+    from mapweave.wire.keys import Keys
+
+    return fleet.reach(network.endpoints, advice), Keys(network.fleet)
 
 
 def warn_without_router(bus: ZenohBus, name: str) -> None:

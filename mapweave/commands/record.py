@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.agent import add_robot, close_on, open_robot, print_error
-from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.agent import add_robot, bus_of, close_on, open_robot, print_error
+from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 
 
 def add_to(commands: Any) -> None:
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     if arguments.body:
         network = replace(network, endpoints=(arguments.body,))
-    bus, _ = connect(network)
+    bus = bus_of(arguments, settings.robot, network)
     try:
         robot, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
         threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.network import add_network, connect, network_of, settings_of
+from mapweave.commands.network import add_network, network_of, reach, settings_of
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.node import Node, NodeId
@@ -47,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from mapweave.agent.recordings.camera_file import read_camera
     from mapweave.drawing.match_picture import draw_matches
+    from mapweave.fleet import no_server
     from mapweave.hybridmap.errors import DeviceError
     from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
     from mapweave.mapserver.http.json_values import json_values
@@ -67,12 +68,14 @@ def run(arguments: argparse.Namespace) -> int:
         raise DeviceError(f"{arguments.draw}: the picture will be a PNG; end its name with .png")
     camera, distortion = read_camera(camera_file)
     grey = read_grey(arguments.image, camera, str(camera_file))
-    lens = Lens(camera, distortion)
-    view = Sift(lens).extract(grey).view(camera)
     network = network_of(arguments, settings_of(arguments))
-    bus, keys = connect(network)
+    bus, keys = reach(network)
     node: Node | None = None
     try:
+        if not bus.ask(keys.server_statuses(), b"", arguments.timeout):
+            raise no_server(network.fleet)  # said before the work
+        lens = Lens(camera, distortion)
+        view = Sift(lens).extract(grey).view(camera)
         payload = _ask(bus, network, keys.any_relocalize(), encode_view(view), arguments.timeout)
         answer = decode(payload, RelocalizeAnswer)
         if arguments.draw is not None and answer.candidates:
@@ -93,20 +96,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
     """Ask until a server answers; a busy server is asked again at its retry time."""
+    from mapweave.fleet import no_server
     from mapweave.hybridmap.errors import NotConnected
 
-    where, end = ", ".join(network.endpoints), time.monotonic() + patience
-    if not bus.wait_connected(patience):
-        raise NotConnected(f"no router at {where}: start `mapweave server` or give --connect")
+    end = time.monotonic() + patience
     while True:
         replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
         for reply in replies:
             if not reply.error:
                 return reply.payload
         if not replies:
-            raise NotConnected(
-                f"a router is up at {where}, but no map server of fleet {network.fleet} answered"
-            )
+            raise no_server(network.fleet)
         pause = replies[0].retry_after
         if not pause or time.monotonic() + pause > end:
             raise NotConnected(f"the map server refused: {replies[0].error}")

@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.agent import add_calibration, calibration_of
-from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.network import (
+    add_network,
+    connect,
+    network_of,
+    settings_of,
+    stop_on_signals,
+    warn_without_router,
+)
 from mapweave.hybridmap.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -97,6 +104,8 @@ def run(arguments: argparse.Namespace) -> int:
     )
     stop = stop_on_signals()
     bus, keys = connect(network)
+    if not arguments.offline:
+        warn_without_router(bus, name)
     try:
         run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:

@@ -48,6 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.live import Live
 
+    from mapweave.hybridmap.errors import NotConnected
+
     with fleet_of(arguments) as fleet:
         if arguments.json:
             while True:
@@ -64,7 +66,11 @@ def run(arguments: argparse.Namespace) -> int:
         with Live(table(fleet.status(), console.width), console=console, auto_refresh=False) as live:
             while True:
                 time.sleep(EVERY)
-                live.update(table(fleet.status(), console.width), refresh=True)
+                try:
+                    shown: Table | str = table(fleet.status(), console.width)
+                except NotConnected as error:  # it may come back
+                    shown = str(error)
+                live.update(shown, refresh=True)
 
 
 def table(status: FleetStatus, width: int) -> Table:

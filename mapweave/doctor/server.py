@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from mapweave.wire.zenoh_bus import ZenohBus
 
 SUBJECT = "server"
-PATIENCE = 3.0
-"""s for a connection, and for an answer."""
+PATIENCE = 1.5
+"""s for a connection, and for an answer; what is there answers sooner."""
 
 
 def examine(network: NetworkSettings) -> Iterator[Finding]:
@@ -32,7 +32,7 @@ def examine(network: NetworkSettings) -> Iterator[Finding]:
             "start `mapweave server` or `mapweave router` there, or give --connect; --offline skips it",
         )  # fmt: skip
         return
-    bus = ZenohBus(BusSettings(endpoints=network.endpoints))
+    bus = ZenohBus(BusSettings(endpoints=network.endpoints, attempt=PATIENCE / len(network.endpoints)))
     try:
         if not bus.wait_connected(PATIENCE):
             yield wrong(

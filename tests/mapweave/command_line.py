@@ -22,19 +22,25 @@ def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     return output[0]
 
 
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """The parser of every command, by its words: `map`, `map show` ..."""
+
+    def walk(words: list[str], at: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+        if words:
+            yield " ".join(words), at
+        for action in at._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for name, choice in action.choices.items():
+                    yield from walk([*words, name], choice)
+
+    return dict(walk([], parser()))
+
+
 def commands(runnable: bool = False) -> list[str]:
-    """Every command that the parser has, as words: `map`, `map show` ...
+    """Every command that the parser has, as words.
 
     Args:
         runnable: only those that do something; not `map`, which has actions of its own.
     """
-
-    def walk(words: list[str], at: argparse.ArgumentParser) -> Iterator[list[str]]:
-        inner = [action for action in at._actions if isinstance(action, argparse._SubParsersAction)]
-        if words and not (inner and runnable):
-            yield words
-        for action in inner:
-            for name, choice in action.choices.items():
-                yield from walk([*words, name], choice)
-
-    return [" ".join(words) for words in walk([], parser())]
+    words = list(parsers())
+    return [w for w in words if not (runnable and any(other.startswith(f"{w} ") for other in words))]

@@ -172,7 +172,8 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
 @pytest.mark.parametrize(
     ("name", "codec", "share", "says"),
     [("walk.avi", "MJPG", 0.999, "the file ends before its index"),
-     ("walk.avi", "MJPG", 0.3, "the file ends before its index"), ("walk.mkv", "mp4v", 0.6, "its header says 9.0 s"),
+     ("walk.avi", "MJPG", 0.3, "the file ends before its index"),
+     ("walk.mkv", "mp4v", 0.6, "its header says 9.0 s"),
      ("walk.webm", "VP80", 1.0, "")],
 )  # fmt: skip
 def test_a_video_that_was_cut_off_says_so(
