@@ -90,7 +90,7 @@ class Runner:
         return step
 
     def _hand_over(self, observation: Observation, step: Step) -> None:
-        """Changes come last: the thread that writes them then works while the robot waits for its next image."""
+        """Changes come last: the thread that writes them works while the robot waits for its next image."""
         line = self._monitor.see(observation, step.status, step.command)
         if line:
             self._print(line)

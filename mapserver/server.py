@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 
-from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
@@ -115,7 +115,7 @@ class MapServer:
         self._missions = MissionRelay(
             self._bus, self._keys, self._store, lambda: worker.current().router, clock.time_ns
         )
-        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
+        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear)
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
@@ -227,6 +227,10 @@ class MapServer:
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file."""
         return self._services.map_file()
+
+    def _hear(self, status: AgentStatus) -> None:
+        self._schedule.observe(status.stamp_ns)
+        self._missions.hear(status)
 
     def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))

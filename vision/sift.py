@@ -109,7 +109,7 @@ class Sift:
         return [found[k] for k in kept], np.asarray(descriptors, np.float32)[kept]
 
     def _trackable(self, keypoints: Sequence[cv2.KeyPoint], image: NDArray[np.uint8]) -> list[int]:
-        """Numbers of those that are held in both directions by the image around them (Shi and Tomasi 1994)."""
+        """Numbers of those that the image around them holds in both directions (Shi and Tomasi 1994)."""
         smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
         at = np.array([k.pt for k in keypoints]).round().astype(int)
         # The structure tensor of the whole image, and its eigenvalues at the keypoints alone.
