@@ -127,7 +127,7 @@ class Reservations:
     def _yields(self, robot: str, router: Router) -> _Aside | None:
         """Where a robot steps aside; None if robots do not wait for each other in a circle, or another does.
 
-        It is the one with the shortest way to a place where it is in nobody's way: one that is past its
+        It is the one with the shortest way to a place where it is in no other's way: one that is past its
         last such place cannot yield, however late it came.
         """
         circle, name = [robot], self._leases[robot].waits_for

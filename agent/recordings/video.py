@@ -65,14 +65,14 @@ def _cut_off(path: Path, capture: cv2.VideoCapture, frames: int, last_s: float) 
 
     Stamps are compared, not counts: a recorder may skip frames and leave their places empty.
     """
-    rate, told = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    rate, stated = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
     with path.open("rb") as file:
         kind, size = file.read(4), int.from_bytes(file.read(4), "little")
     avi = kind == b"RIFF"
     if avi and not 0 < size <= path.stat().st_size - 8:
         return f"{path}: cut off after {frames} frames, {last_s:.1f} s: the file ends before its index"
-    if rate > 0.0 and told / rate - (last_s + 1.0 / rate) > (0.5 / rate if avi else OTHER_TRACK):
-        return f"{path}: cut off after {frames} frames, {last_s:.1f} s: its header says {told / rate:.1f} s"
+    if rate > 0.0 and stated / rate - (last_s + 1.0 / rate) > (0.5 / rate if avi else OTHER_TRACK):
+        return f"{path}: cut off after {frames} frames, {last_s:.1f} s: its header says {stated / rate:.1f} s"
     return ""
 
 

@@ -181,8 +181,10 @@ def ros2_link(arguments: argparse.Namespace, settings: RobotSettings) -> Ros2Lin
 
 
 def print_error(line: str) -> None:
-    """Print a line for people, beside the output proper."""
-    print(line, file=sys.stderr, flush=True)
+    """Print an event for people, with the time, beside the output proper."""
+    from mapweave.terminal import stamped
+
+    print(stamped(line), file=sys.stderr, flush=True)
 
 
 def open_robot(

@@ -75,17 +75,12 @@ def merged_with_progress(
     maps: dict[MapId, HybridMap], constraints: ManualConstraints, settings: MergeSettings | None = None
 ) -> MergedMap:
     """Merge, with a bar on stderr for people."""
-    from rich.console import Console
-    from rich.progress import Progress
-
     from mapweave.offline_merge import merge_parts
+    from mapweave.terminal import Bar, plain_or_terminal
 
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("reading nodes")
+    with Bar(plain_or_terminal(), "reading nodes", None, transient=True) as bar:
 
         def report(done: int, of: int) -> None:
-            words = "reading nodes" if done < of else "comparing and joining"
-            bar.update(task, description=words, completed=done, total=of if done < of else None)
+            bar.update(done, "comparing and joining" if done == of else "", of)
 
         return merge_parts(maps, constraints, report, settings)

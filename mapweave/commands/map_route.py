@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import add_network
+from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import RouteExplanation
@@ -23,7 +24,7 @@ def add_to(actions: Any) -> None:
         description="Explain the route from one node to another (r0.1.17 r1.1.5), step by step; "
         "why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
         "blocked, or which maps would have to be one. A running server is asked, or a map file. "
-        "Exit status 0: there is a way; 2: there is none; 1: could not ask.",
+        "Exit status 0: there is a way; 4: there is none; 1: could not ask.",
     )
     parser.add_argument("start", metavar="START", help="a node")
     parser.add_argument("goal", metavar="GOAL", help="another one")
@@ -59,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(json.dumps(values) if arguments.json else "\n".join(lines))
     if arguments.draw is not None and not explanation.found:
         print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
-    return 0 if explanation.found else 2
+    return DONE if explanation.found else NO
 
 
 def draw_route(arguments: argparse.Namespace, explanation: RouteExplanation) -> None:

@@ -75,13 +75,16 @@ def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[Zen
 
 def warn_without_router(bus: ZenohBus, name: str) -> None:
     """Warn on stderr if no router is reached soon; does not wait."""
+    from mapweave.terminal import stamped
+
     began = time.monotonic()
 
     def look() -> None:
         # A process that ends earlier has not waited long enough to know.
         if not bus.wait_connected(SOON) and time.monotonic() - began >= SOON:
             advice = "start `mapweave server` or `mapweave router`, or give --connect"
-            print(f"{name} finds no router: {advice}; it goes on looking", file=sys.stderr, flush=True)
+            line = stamped(f"{name} finds no router: {advice}; it goes on looking")
+            print(line, file=sys.stderr, flush=True)
 
     threading.Thread(target=look, name="router", daemon=True).start()
 

@@ -31,11 +31,10 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Record until the robot ends or the process is stopped."""
-    from rich.console import Console
-
     from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.recorded import RecordedRobot
     from mapweave.hybridmap.node import check_name
+    from mapweave.terminal import Bar, plain_or_terminal
 
     name = check_name(arguments.name)
     settings = settings_of(arguments)
@@ -49,11 +48,12 @@ def run(arguments: argparse.Namespace) -> int:
         threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
         recorded = RecordedRobot(robot, arguments.out, arguments.lossless, print_error)
         try:
-            with Console(stderr=True).status(f"{name}: waits for its robot") as status:
-                checked = CheckedRobot(recorded)
-                checked.describe()
+            print_error(f"{name}: waits for its robot")
+            checked = CheckedRobot(recorded)
+            checked.describe()
+            with Bar(plain_or_terminal(), f"{name}: observations in {arguments.out}", None) as bar:
                 while not stop.is_set() and checked.sense() is not None:
-                    status.update(f"{name}: {recorded.written} observations in {arguments.out}")
+                    bar.update(recorded.written)
         finally:
             recorded.close()
     finally:

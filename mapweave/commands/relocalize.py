@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import add_network, network_of, reach, settings_of
+from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.node import Node, NodeId
@@ -26,7 +27,7 @@ def add_to(commands: Any) -> None:
         "relocalize",
         help="ask a running server where an image was taken",
         description="Extract an image's features and ask the map server where it was taken. "
-        "Exit status 0: found; 2: unknown, ambiguous, or the place without a pose; 1: could not ask.",
+        "Exit status 0: found; 4: unknown, ambiguous, or the place without a pose; 1: could not ask.",
     )
     parser.add_argument("image", type=Path, help="png, jpg, pgm or bmp")
     parser.add_argument(
@@ -91,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         draw_matches(arguments.draw, grey, lens, node, view, best)
     elif arguments.draw is not None:
         print(f"{arguments.draw} is not drawn: no place was recognised", file=sys.stderr)
-    return 0 if answer.certainty is Certainty.FOUND else 2
+    return DONE if answer.certainty is Certainty.FOUND else NO
 
 
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:

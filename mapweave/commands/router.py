@@ -23,6 +23,7 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Route until stopped."""
+    from mapweave.terminal import stamped
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -30,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:
-        print(f"router listens at {', '.join(network.endpoints)}", flush=True)
+        print(stamped(f"router listens at {', '.join(network.endpoints)}"), flush=True)
         stop.wait()
     finally:
         bus.close()

@@ -48,12 +48,13 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
+    from mapweave.terminal import STAMP, stamped
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
-    logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
+    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
     logging.getLogger("mapweave.mapserver").setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
@@ -71,21 +72,21 @@ def run(arguments: argparse.Namespace) -> int:
         with ExitStack() as stack:
             path = arguments.data / f"{name}.sqlite"
             if path.exists() and path.stat().st_size > LARGE:
-                print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
+                print(stamped(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ..."), flush=True)
             server = MapServer(bus, keys, path, name, how, schedule)
             stack.enter_context(server)
             where = ", ".join(network.endpoints)
-            print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
+            print(stamped(f"map server {name} of fleet {network.fleet} listens at {where}"), flush=True)
             if address is not None:
                 stack.enter_context(Web(address, server, commands=arguments.http_commands))
-                print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
+                print(stamped(f"for people: http://{':'.join(map(str, address))}/"), flush=True)
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):
                 manager.alive()
                 now = server.summary()
                 if now != last_line:
-                    print(now, flush=True)
+                    print(stamped(now), flush=True)
                     last_line = now
     finally:
         bus.close()

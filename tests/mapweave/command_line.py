@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 
 import pytest
 
 from mapweave.cli import main, parser
+from mapweave.commands.examples import parsers_of
 
 CAMERA = "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m = 0.3\n"
 
@@ -24,16 +24,7 @@ def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
     """The parser of every command, by its words: `map`, `map show` ..."""
-
-    def walk(words: list[str], at: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-        if words:
-            yield " ".join(words), at
-        for action in at._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                for name, choice in action.choices.items():
-                    yield from walk([*words, name], choice)
-
-    return dict(walk([], parser()))
+    return parsers_of(parser())
 
 
 def commands(runnable: bool = False) -> list[str]:

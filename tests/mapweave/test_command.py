@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 
 from mapweave.cli import main
-from mapweave.commands.missions import NOT_DONE
 from mapweave.commands.status import cells, table
+from mapweave.exit_status import NO
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
@@ -105,7 +105,7 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
             assert len(read_map_file(tmp_path / "m.mapweave", "merged").poses) >= 2
             assert "r0.7.1 is not in the merged map" in complaint(capfd, "go", "r0", "r0.7.1", *network)
             code, printed = shell("go", "r0", "r0.1.999")
-            assert code == NOT_DONE and "refused: there is no node r0.1.999" in printed
+            assert code == NO and "refused: there is no node r0.1.999" in printed
             code, printed = shell("status")
             assert code == 0 and "r0" in printed and "go to r0.1.1" in printed
             code, printed = shell("stop", "--all")
@@ -119,7 +119,8 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
 ASKING = {
     "status": [], "go": ["r0", "home"], "explore": ["r0"], "stop": ["r0"], "map fetch": ["out.mapweave"],
     "map explain": ["r0.1", "r1.1"], "map route": ["r0.1.1", "r0.1.2"], "map history": [],
-    "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"], "relocalize": ["walk/images/0.png"],
+    "missions": [], "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"],
+    "relocalize": ["walk/images/0.png"],
     "record": ["r0", "--out", "drive"], "drive": ["r0", "--gamepad", "/dev/null"],
     "calibrate drive": ["--robot", "remote", "--name", "r0"],
     "map from-photos": ["walk/images", "--camera", "walk/camera.toml", "--spacing", "0.5", "--out",

@@ -15,6 +15,7 @@ import skimage.data
 
 from mapweave.cli import main
 from mapweave.drawing.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
+from mapweave.exit_status import NO
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import Busy
@@ -120,7 +121,7 @@ def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Pat
 def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
     cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
     drawn = tmp_path / "matches.png"
-    assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == 2
+    assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == NO
     output = capfd.readouterr()
     assert output.out.startswith("unknown: ")
     assert output.err == f"{drawn} is not drawn: no place was recognised\n"
