@@ -14,6 +14,7 @@ import pytest
 from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.cli import main
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint
@@ -54,7 +55,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert replicator.wait_acknowledged(30)
     book = ConstraintRecord(fleet.store)
     for k in range(5):
-        book.add(ManualConstraint((MapId("r0", 1), MapId(f"r{k + 1}", 1)), True, "anna", k, "two kitchens"))
+        book.add(
+            ManualConstraint(Apart((MapId("r0", 1), MapId(f"r{k + 1}", 1))), True, "anna", k, "two kitchens")
+        )
     fleet.stop_robots()
     fleet.stop_server()
     return fleet.folder
