@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_reading import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.map_reading import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 
 FORMATS = ("g2o", "tum", "graphml", "geojson")
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.map_reading import SOURCES
+from mapweave.commands.map_input import SOURCES
 
 
 def add_to(actions: Any) -> None:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_reading import SOURCES, opened
+from mapweave.commands.map_input import SOURCES, opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_reading import SOURCES, opened
+from mapweave.commands.map_input import SOURCES, opened
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.hybrid_map import HybridMap
@@ -78,7 +78,7 @@ def merged_with_progress(
     maps: dict[MapId, HybridMap], constraints: ManualConstraints, settings: MergeSettings | None = None
 ) -> MergedMap:
     """Merge, with a bar on stderr for people."""
-    from mapweave.commands.map_reading import merge_progress
+    from mapweave.commands.map_input import merge_progress
     from mapweave.offline_merge import merge_parts
 
     with merge_progress() as report:

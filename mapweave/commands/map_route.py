@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_reading import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:

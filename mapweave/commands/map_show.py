@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.map_reading import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 
 
 def add_to(actions: Any) -> None:

@@ -10,9 +10,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
+from http.client import HTTPConnection
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -30,11 +34,13 @@ from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
 from mapweave.opened_map import MapSource, open_map
+from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, RefusedPair, pack_map_file, unpack_map_file, write_map_file
 from mapweave.wire.codec import encode_change
 from mapweave.wire.messages import KeptHistory, encode
 from synthetic.world import room, take_map
 from tests.mapweave.command_line import complaint
+from tests.waiting import eventually
 
 R0, R1 = MapId("r0", 1), MapId("r1", 1)
 SAID = ManualConstraint((R0, MapId("r9", 1)), True, "anna", 5, "two kitchens")
@@ -201,6 +207,54 @@ def test_a_cut_off_or_newer_file_is_reported_in_one_line(
     at = 8 if name == "merged" else 60
     path.write_bytes(data[:at] + b"\1\1\1\1" + data[at + 4 :])
     assert "format" in complaint(capfd, "map", "show", path)
+
+
+def test_a_map_is_served_to_people_and_never_changed(folder: Path, tmp_path: Path) -> None:
+    before = state(folder)
+    with Children(tmp_path) as children:
+        ports = {name: free_port() for name in ("store", "journal")}
+        for name, port in ports.items():
+            children.start(name, ["open", str(folder / name), "--http", str(port)])
+
+        def ask(name: str, path: str, body: bytes | None = None) -> tuple[int, Any]:
+            connection = HTTPConnection("127.0.0.1", ports[name], timeout=60)
+            connection.request("GET" if body is None else "POST", path, body)
+            reply = connection.getresponse()
+            content = reply.read()
+            connection.close()
+            return reply.status, json.loads(content) if "json" in reply.headers["Content-Type"] else content
+
+        def up(name: str) -> bool:
+            children.check()
+            with suppress(OSError):
+                return ask(name, "/status")[0] == 200
+            return False
+
+        for name in ports:
+            eventually(lambda name=name: up(name), 90.0)
+        status, page = ask("store", "/")
+        assert status == 200 and b"<html" in page
+        counts = {name: ask(name, "/status")[1] for name in ports}
+        links = open_map(folder / "merged").merged().links
+        assert counts["store"]["links"] == len(links) > 0
+        assert (counts["journal"]["maps"], counts["journal"]["source"]) == (1, "agent's journal")
+        assert ask("store", "/robots")[1]["robots"] == ask("store", "/missions")[1]["reports"] == []
+        kinds = [event["kind"] for event in ask("store", "/history")[1]["history"]]
+        assert kinds == ["constrained", "joined"]
+        link = links[0].pair
+        assert ask("store", f"/explain?a={link[0]}&b={link[1]}")[1]["standing"] == "linked"
+        assert ask("store", f"/route?a={link[0]}&b={link[1]}")[1]["found"]
+        content = unpack_map_file(ask("store", "/map")[1])
+        assert content_hash(content) == content_hash(open_map(folder / "merged").content)
+        for path in ("/robots/r0/go?goal=r0.1.1", "/robots/r0/explore", "/robots/r0/stop"):
+            status, answer = ask("store", path, b"")
+            assert status == 400 and "is only shown, and nothing of it changes" in answer["error"]
+        grey = np.random.default_rng(0).integers(0, 255, (120, 160)).astype(np.uint8)
+        status, answer = ask("journal", "/relocalize", cv2.imencode(".png", grey)[1].tobytes())
+        assert status == 200 and answer["certainty"] == "unknown"
+        for name in ports:
+            children.end(name)
+    assert state(folder) == before
 
 
 CONTENTS = [body for changes in LOGS.values() for body in changes]
