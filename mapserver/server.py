@@ -159,19 +159,10 @@ class MapServer:
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
         merged = self._worker.answers.merged
-        loops = sum(link.within for link in merged.links)
         traffic = self._store.traffic()
         return {
-            "nodes": len(merged.poses),
-            "superseded": len(merged.superseded),
-            "maps": len(merged.maps),
-            "components": len(merged.components),
-            "links": len(merged.links) - loops,
-            "loops": loops,
-            "refused": sum(refusal.link is not None for refusal in merged.refused),
+            **merged.counts(),
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
-            "constraints": len(merged.constraints.in_force),
-            "set_apart": len(merged.set_apart),
             "event": self._ingest.failure or self._worker.event,
             "settled": self._worker.settled,
             "bytes": traffic.payload_bytes,
