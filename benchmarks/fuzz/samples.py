@@ -17,8 +17,8 @@ from mapweave.agent.recordings.mcap_writer import McapWriter
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.ros_messages import making
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
-from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionRequest
 from mapweave.hybridmap.node import EdgeKind, MapId, Node
