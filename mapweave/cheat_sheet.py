@@ -17,9 +17,11 @@ GROUPS = {
     "Run": ("server", "router", "agent", "record"),
     "Command": ("status", "go", "explore", "stop", "missions", "drive"),
     "Maps": (
-        "map show", "map explain", "map route", "map history", "map unmerge", "map retire", "map merge",
+        "map show", "open", "map explain", "map route", "map history", "map link", "map unmerge",
+        "map retire", "map undo", "map merge",
         "map fetch", "map export", "map extract", "map import", "map from-photos", "relocalize",
     ),
+    "Keys": ("keys init", "keys add", "keys list", "keys revoke", "keys bundle"),
     "Recordings": ("info", "replay", "eval replay", "eval relocalize", "eval merge"),
 }  # fmt: skip
 """Commands by what a person wants; the rest comes last."""

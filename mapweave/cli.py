@@ -19,8 +19,10 @@ from mapweave.commands import (
     find_cameras,
     find_port,
     info,
+    keys,
     map_file,
     missions,
+    open_map,
     record,
     relocalize,
     replay,
@@ -69,8 +71,9 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, drive, status, missions, robots, doctor, find_port, find_cameras,
-        calibrate, map_file, record, replay, info, relocalize, evaluate, settings, completion,
+        demo, server, router, sim, agent, drive, status, missions, keys, robots, doctor, find_port,
+        find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize, evaluate, settings,
+        completion,
     ):  # fmt: skip
         command.add_to(commands)
     add_examples(top)

@@ -13,8 +13,11 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 
+from mapweave.connection import ANSWERED, no_server, reach
+from mapweave.fleet_constraints import FleetConstraints
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import (
@@ -27,17 +30,15 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
+from mapweave.identities.key_file import read_key_file
 from mapweave.storage.map_file import MapFile, unpack_map_file
-from mapweave.wire.bus import Bus, Reply, Sample
+from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-SOON = 1.0
-"""s; a router that is there is found sooner. Commands say within 2 s of their start that there is none."""
-ANSWERED = 2.0
-"""s; a server or robot that is there answers sooner."""
 PACKING = 120.0
 """How long a server may take to pack a large map, s."""
 TRIES = 3
@@ -60,30 +61,6 @@ def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0)
     return decode(replies[0].payload, MissionReport)
 
 
-def reach(endpoints: Sequence[str], advice: str = "give --connect") -> ZenohBus:
-    """A connection of a client that needs a router now.
-
-    Args:
-        endpoints: of routers; the first in reach is taken.
-        advice: what else a person can do.
-
-    Raises:
-        NotConnected: there is none.
-    """
-    bus = ZenohBus(BusSettings(mode="client", endpoints=tuple(endpoints), attempt=SOON / len(endpoints)))
-    if not bus.wait_connected(SOON):
-        bus.close()
-        raise NotConnected(f"no router at {', '.join(endpoints)}: start `mapweave server`, or {advice}")
-    return bus
-
-
-def no_server(fleet: str) -> NotConnected:
-    """The error that no map server answers."""
-    return NotConnected(
-        f"a router is up, but no map server of fleet {fleet} answers: start `mapweave server` or give --fleet"
-    )
-
-
 def login() -> str:
     """Name of the person, for records."""
     try:
@@ -92,7 +69,7 @@ def login() -> str:
         return "a person"
 
 
-class Fleet:
+class Fleet(FleetConstraints):
     """A connection to a fleet. A context manager; its methods may be called from any thread."""
 
     def __init__(
@@ -100,6 +77,7 @@ class Fleet:
         connect: str | Sequence[str] = "tcp/127.0.0.1:7447",
         fleet: str = "demo",
         by: str = "",
+        keys: str | Path = "",
         bus: Bus | None = None,
     ) -> None:
         """Connect.
@@ -108,6 +86,7 @@ class Fleet:
             connect: Zenoh endpoint of the router, or several, of which the first in reach is taken.
             fleet: its name.
             by: gives the missions; the login name by default.
+            keys: key file of an operator or viewer, where the router asks for one.
             bus: a connection to use instead; it stays the caller's.
 
         Raises:
@@ -116,9 +95,12 @@ class Fleet:
         self._keys = Keys(check_name(fleet))
         self._by = (by or login())[:64]
         self._own: ZenohBus | None = None
+        self._role: Role | None = None
         if bus is None:
+            credentials = read_key_file(Path(keys)).credentials if keys else None
+            self._role = None if credentials is None else credentials.role
             endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-            bus = self._own = reach(endpoints)
+            bus = self._own = reach(BusSettings(endpoints=endpoints, credentials=credentials))
         self._bus = bus
 
     def __enter__(self) -> Fleet:
@@ -194,6 +176,7 @@ class Fleet:
         Raises:
             NotConnected: one does not answer; the others are stopped.
         """
+        self._check_role()
         names = [robot] if robot else [entry.robot for entry in self.status().robots if entry.alive]
         reports, silent = [], []
         for name in names:
@@ -262,6 +245,7 @@ class Fleet:
     def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
         """By way of the map server; without one directly."""
         check_name(robot)
+        self._check_role()
         report, after_ns = None, 0
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
@@ -280,6 +264,11 @@ class Fleet:
         assert report is not None, "it was tried"
         return self.wait(report, wait) if wait > 0.0 else report
 
+    def _check_role(self) -> None:
+        """The router drops what a role may not send; without a word, so that is said here."""
+        if self._role in (Role.VIEWER, Role.ROBOT):
+            raise InvalidValue(f"this is the key of a {self._role}: missions need an operator's")
+
     def _direct(self, robot: str, kind: MissionKind, node: NodeId | None, goal: str) -> MissionReport:
         after_ns = 0
         for _ in range(TRIES):
@@ -296,9 +285,6 @@ class Fleet:
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0
-
-    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
-        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
 
 
 def _node(goal: str) -> NodeId | None:

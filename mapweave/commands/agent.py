@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import (
-    SOON,
     add_network,
     connect,
     network_of,
@@ -19,6 +18,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.connection import SOON
 
 if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
     if resume is not None and not (arguments.data / f"{name}.sqlite").exists():
         raise InvalidValue(f"{arguments.data}: there is no journal of {name} with a map to resume")
     settings = settings_of(arguments)
-    network = network_of(arguments, settings)
+    network = network_of(arguments, settings, name)
     stop = stop_on_signals()
     bus, keys = connect(network)
     body, claim = bus, None
@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         warn_without_router(bus, name)
         if arguments.body:
-            body, _ = connect(replace(network, endpoints=(arguments.body,)))
+            body, _ = connect(replace(network, endpoints=(arguments.body,), keys=""))
         if body.wait_connected(SOON):
             claim = Claim(body, keys, name)
         robot, synchronization = open_robot(

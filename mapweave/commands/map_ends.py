@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable
 
 from mapweave.commands.network import network_of, reach, settings_of
+from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
-from mapweave.hybridmap.manual_constraint import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.keys import Keys
@@ -75,7 +75,7 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
     Raises:
         NotConnected: no server answers, or all refuse.
     """
-    from mapweave.fleet import no_server
+    from mapweave.connection import no_server
 
     network = network_of(arguments, settings_of(arguments))
     bus, keys = reach(network, "give --connect, or --map FILE")

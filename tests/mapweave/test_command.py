@@ -119,7 +119,8 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
 ASKING = {
     "status": [], "go": ["r0", "home"], "explore": ["r0"], "stop": ["r0"], "map fetch": ["out.mapweave"],
     "map explain": ["r0.1", "r1.1"], "map route": ["r0.1.1", "r0.1.2"], "map history": [],
-    "missions": [], "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"],
+    "missions": [], "map link": ["r0.1.1", "r1.1.2"], "map undo": [],
+    "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"],
     "relocalize": ["walk/images/0.png"],
     "record": ["r0", "--out", "drive"], "drive": ["r0", "--gamepad", "/dev/null"],
     "calibrate drive": ["--robot", "remote", "--name", "r0"],
@@ -143,7 +144,7 @@ def test_without_a_router_one_line_says_so_and_what_to_do(
 ) -> None:
     """Within the time for that, and no other: whatever listens there accepts, and says nothing."""
     monkeypatch.chdir(recording.parent)
-    monkeypatch.setattr("mapweave.fleet.SOON", 0.1)
+    monkeypatch.setattr("mapweave.connection.SOON", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         where = f"tcp/127.0.0.1:{deaf.getsockname()[1]}"
         began = time.monotonic()

@@ -1,0 +1,50 @@
+"""Maps that commands read: one option text, one progress bar, one way to report what is damaged."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mapweave.merge.pose_graph.merged_map import MergedMap
+    from mapweave.merge.settings import MergeSettings
+    from mapweave.offline_merge import Progress
+    from mapweave.opened_map import OpenedMap
+
+SOURCES = "a map file (.mapweave), a server's store or an agent's journal (.sqlite)"
+
+
+def opened(path: Path) -> OpenedMap:
+    """Open a map; what of it is damaged is reported on stderr.
+
+    Raises:
+        InvalidFile: it is none, or cannot be read.
+    """
+    from mapweave.opened_map import open_map
+
+    one = open_map(path)
+    for complaint in one.complaints.values():
+        print(f"mapweave: {complaint}", file=sys.stderr)
+    return one
+
+
+def merged_with_progress(one: OpenedMap, settings: MergeSettings | None = None) -> MergedMap:
+    """The merged map of a file, store or journal."""
+    with merge_progress() as report:
+        return one.merged(settings, report)
+
+
+@contextmanager
+def merge_progress() -> Iterator[Progress]:
+    """A bar on stderr for people."""
+    from mapweave.terminal import Bar, plain_or_terminal
+
+    with Bar(plain_or_terminal(), "reading nodes", None, transient=True) as bar:
+
+        def report(done: int, of: int) -> None:
+            bar.update(done, "comparing and joining" if done == of else "", of)
+
+        yield report
