@@ -19,6 +19,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import MOST_WORDS
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.wall_time import utc_words
 
 MAX_NAME = 64
 MAX_ANNOTATIONS = 10_000
@@ -92,8 +93,10 @@ class Closure:
 
     @property
     def words(self) -> str:
-        """What it is about, for people."""
-        return _edge_or_area(self.edge, self.area)
+        """For people."""
+        begin = "" if self.begin_ns is None else f" from {utc_words(self.begin_ns)}"
+        end = "" if self.end_ns is None else f" until {utc_words(self.end_ns)}"
+        return f"{_edge_or_area(self.edge, self.area)}, closed{begin}{end}"
 
 
 @dataclass(frozen=True, slots=True)

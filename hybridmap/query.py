@@ -205,12 +205,14 @@ class ReserveAnswer:
         holder: the robot that holds what comes then; empty if none does.
         aside: both wait for each other: this robot steps aside, to this node; None if it only waits.
         reason: in words.
+        closed: whether a person has closed the way ahead; the robot asks for another one.
     """
 
     granted: Annotated[int, Meta(ge=0, le=MAX_LEGS)]
     holder: Annotated[str, Meta(max_length=32)]
     aside: NodeId | None
     reason: Words
+    closed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

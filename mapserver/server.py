@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +22,7 @@ from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Mission
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.annotator import AnnotationRecord, Annotator
+from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
@@ -120,12 +121,12 @@ class MapServer:
         self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
         self._missions.roster = self._roster
         self._services = Services(
-            self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
+            self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
             lambda: self._history.events, self._missions, self._roster,
             clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places,
         )  # fmt: skip
         self._explainer = Explainer(
-            self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,
+            self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
             worker.constrain, lambda: worker.settled, self._settings.merge.consistency,
             lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
             lambda: self._annotations.annotations,
@@ -237,9 +238,17 @@ class MapServer:
         """
         return self._missions.command(request)
 
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+    def give(
+        self,
+        robot: str,
+        kind: MissionKind,
+        goal: str,
+        by: str,
+        mission_id: str = "",
+        via: tuple[str, ...] = (),
+    ) -> MissionReport:
         """Give a robot a mission that is newer than the one that holds it; see `command`."""
-        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id))
+        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id, via))
 
     def missions(self) -> Missions:
         """The missions that are known, oldest first."""
@@ -253,8 +262,14 @@ class MapServer:
         """The merged map as a map file."""
         return self._services.map_file()
 
+    def _answers(self) -> Answers:
+        """The newest ones, with routes by what is closed now."""
+        answers = self._worker.current()
+        router = answers.router.at(self._annotations.annotations, self._schedule.time_ns())
+        return replace(answers, router=router)
+
     def _named_places(self) -> Places:
-        return Places(self._worker.current().router, self._annotations.annotations)
+        return Places(self._answers().router, self._annotations.annotations)
 
     def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))

@@ -10,6 +10,7 @@ from typing import Any
 from mapweave.commands import (
     agent,
     calibrate,
+    closures,
     demo,
     doctor,
     drive,
@@ -69,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, drive, status, missions, place, keys, robots, doctor,
+        demo, server, router, sim, agent, drive, status, missions, place, closures, keys, robots, doctor,
         find_port, find_cameras, calibrate, map_file, record, replay, info, relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)

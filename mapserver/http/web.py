@@ -99,7 +99,9 @@ class Answering(Annotating, Protocol):
     def missions(self) -> Missions:
         """The missions that are known."""
 
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+    def give(
+        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str, via: tuple[str, ...]
+    ) -> MissionReport:
         """Give a robot a mission; waits for its answer."""
 
     def map_file(self) -> Future[bytes]:
@@ -287,8 +289,9 @@ class Questions:
         query = request.query_params
         goal, by, mission_id = query.get("goal", ""), query.get("by", BY), query.get("id", "")
         report = await run_in_threadpool(
-            self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id
-        )
+            self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id,
+            tuple(query.getlist("via")),
+        )  # fmt: skip
         return json_values(report)
 
     async def _stop(self, request: Request) -> Mapping[str, Any]:
@@ -298,7 +301,7 @@ class Questions:
         def stop() -> Mapping[str, Any]:
             names = [entry.robot for entry in self._server.robots().robots if entry.alive]
             return json_values(
-                Missions(tuple(self._server.give(name, MissionKind.STOP, "", by) for name in names))
+                Missions(tuple(self._server.give(name, MissionKind.STOP, "", by, "", ()) for name in names))
             )
 
         return await run_in_threadpool(stop)

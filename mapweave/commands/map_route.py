@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +33,9 @@ def add_to(actions: Any) -> None:
         "--blocked", nargs=2, action="append", default=[], metavar="NODE",
         help="as if a robot could not get through between these two; may be given again",
     )  # fmt: skip
+    parser.add_argument(
+        "--via", action="append", default=[], metavar="PLACE", help="pass this first; may be given again"
+    )
     parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
     parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -48,9 +53,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.draw is not None:
         need("viz")
-    words = [arguments.start, arguments.goal, *(word for pair in arguments.blocked for word in pair)]
-    start, goal, *rest = map(node_of, resolved(arguments, words))
+    stops = [arguments.start, *arguments.via, arguments.goal]
+    words = [*stops, *(word for pair in arguments.blocked for word in pair)]
+    nodes = list(map(node_of, resolved(arguments, words)))
+    start, goal, rest = nodes[0], nodes[len(stops) - 1], nodes[len(stops) :]
     blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
+    if arguments.via:
+        return _run_via(arguments, nodes[: len(stops)], blocked)
     explanation = explained_route(arguments, start, goal, blocked)
     values, lines = json_values(explanation), route_words(explanation)
     if arguments.draw is not None and explanation.found:
@@ -61,6 +70,25 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.draw is not None and not explanation.found:
         print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
     return 0 if explanation.found else 2
+
+
+def _run_via(
+    arguments: argparse.Namespace, stops: list[NodeId], blocked: tuple[tuple[NodeId, NodeId], ...]
+) -> int:
+    """Explain the way from stop to stop."""
+    from mapweave.explanation_text import route_words
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.http.json_values import json_values
+
+    if arguments.draw is not None:
+        raise InvalidValue("--draw and --via do not go together: draw the way from one place to the next")
+    legs = [explained_route(arguments, a, b, blocked) for a, b in pairwise(stops)]
+    found = all(leg.found for leg in legs)
+    if arguments.json:
+        print(json.dumps({"found": found, "legs": [json_values(leg) for leg in legs]}))
+    else:
+        print("\n".join(line for leg in legs for line in route_words(leg)))
+    return 0 if found else 2
 
 
 def draw_route(arguments: argparse.Namespace, explanation: RouteExplanation) -> None:
@@ -102,11 +130,13 @@ def explained_route(
         replies = ask(arguments, Keys.any_explain, encode(request))
         return decode(replies[0].payload, RouteExplanation)
     from mapweave.commands.network import settings_of
+    from mapweave.hybridmap.annotation import Annotations
     from mapweave.mapserver.map_files import merged_of
     from mapweave.mapserver.route_explaining import explain_route
     from mapweave.mapserver.routes import Router
     from mapweave.storage.map_file import read_map_file
 
     settings = settings_of(arguments).merge
-    router = Router(merged_of(read_map_file(arguments.map), settings))
+    content = read_map_file(arguments.map)
+    router = Router(merged_of(content, settings)).at(Annotations(content.annotations), time.time_ns())
     return explain_route(router, start, goal, blocked)
