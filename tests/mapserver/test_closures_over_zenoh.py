@@ -71,7 +71,7 @@ def test_what_is_closed_from_the_shell_holds_for_all(
             request = encode(RouteRequest(first, last))
             refused = decode(robot.ask(KEYS.any_route(), request, 5.0)[0].payload, RouteAnswer)
             assert refused.legs == () and "is in kitchen, which is closed by bob" in refused.reason
-            with pytest.raises(InvalidValue, match='is in kitchen, which is closed by bob .*"paint"'):
+            with pytest.raises(InvalidValue, match=r'is in kitchen, which is closed by bob .*"paint"'):
                 fleet.go("r0", "kitchen")
             status, out, _ = shell("map", "route", str(first), "kitchen")
             assert status == 2 and "closed by bob" in out
