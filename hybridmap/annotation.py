@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 from msgspec import Meta
 
@@ -41,6 +41,7 @@ class Place:
         area: its extent; None if it is a node.
     """
 
+    TAG: ClassVar[str] = "place"
     node: NodeId | None = None
     area: Area | None = None
 
@@ -70,6 +71,7 @@ class Closure:
         end_ns: until when; None: until it is withdrawn.
     """
 
+    TAG: ClassVar[str] = "closure"
     edge: Pair | None = None
     area: Area | None = None
     begin_ns: Stamp | None = None
@@ -109,6 +111,7 @@ class Preference:
         area: None if it is an edge.
     """
 
+    TAG: ClassVar[str] = "preference"
     factor: Annotated[float, Meta(ge=0.1, le=100.0)]
     edge: Pair | None = None
     area: Area | None = None
@@ -133,9 +136,8 @@ class Preference:
 
 
 Body = Place | Closure | Preference
-BODIES: dict[str, type[Body]] = {"place": Place, "closure": Closure, "preference": Preference}
+BODIES: dict[str, type[Body]] = {body.TAG: body for body in (Place, Closure, Preference)}
 """Kinds of annotations, by the word that names them in messages."""
-KINDS: dict[type, str] = {body: kind for kind, body in BODIES.items()}
 AnyBody = TypeVar("AnyBody", bound=Body)
 
 
@@ -176,7 +178,7 @@ class Annotation:
     @property
     def kind(self) -> str:
         """Of the body: place, closure and so on."""
-        return KINDS[type(self.body)]
+        return self.body.TAG
 
     @property
     def words(self) -> str:

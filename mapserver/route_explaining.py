@@ -57,7 +57,7 @@ class _Hindrances:
         return ""
 
     def preferred(self, pair: frozenset[NodeId]) -> str:
-        """By whom a pair is preferred or avoided; empty if it is not."""
+        """Who prefers or avoids a pair, in words; empty if it is not so."""
         return "; ".join(map(rule_words, self.rules.preferences.get(pair, ())))
 
 

@@ -75,6 +75,7 @@ class Router:
     Attributes:
         merged: the map.
         costs: what a way costs.
+        annotations: the record, with closures and preferences.
     """
 
     def __init__(
@@ -93,12 +94,12 @@ class Router:
         self.merged = merged
         self.costs = costs or RouteSettings()
         self._shared = _Shared(merged, reaches)
-        self._annotations, self._stamp_ns = Annotations(), 0
+        self.annotations, self._stamp_ns = Annotations(), 0
 
     def at(self, annotations: Annotations, stamp_ns: int) -> Router:
         """The same router, by closures and preferences at a time (wall time, ns); costs nothing."""
         router = copy(self)
-        router._annotations, router._stamp_ns = annotations, stamp_ns
+        router.annotations, router._stamp_ns = annotations, stamp_ns
         return router
 
     @property
@@ -109,7 +110,7 @@ class Router:
     @property
     def rules(self) -> RouteRules:
         """What is closed, preferred and avoided."""
-        return self._shared.rules(self._annotations, self._stamp_ns)
+        return self._shared.rules(self.annotations, self._stamp_ns)
 
     def route(
         self,
@@ -154,7 +155,7 @@ class Router:
         """Why no route can exist, in words; empty if there may be one."""
         for name, node in (("start", start), ("goal", goal)):
             if node not in self.merged.poses:
-                retired = self.merged.constraints.retired.get(node.map)
+                retired = self.merged.constraints.retires(node)
                 apart = self.merged.set_apart.get(node.map)
                 why = f": {reason_of(retired)}" if retired is not None else ""
                 why = why or (f": map {node.map} is set apart, {apart}" if apart is not None else "")

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from mapweave.fleet_constraints import SOON, FleetConstraints
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
@@ -34,7 +35,7 @@ from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.identities.key_file import read_key_file
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.storage.map_file import MapFile, unpack_map_file
-from mapweave.wire.bus import Bus, Reply, Sample
+from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
@@ -42,8 +43,6 @@ from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-SOON = 2.0
-"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
 ANSWER = 10.0
 """A server that merges answers questions about its map late, s."""
 PACKING = 120.0
@@ -73,7 +72,7 @@ def login() -> str:
         return "a person"
 
 
-class Fleet:
+class Fleet(FleetConstraints):
     """A connection to a fleet. A context manager; its methods may be called from any thread."""
 
     def __init__(
@@ -356,9 +355,6 @@ class Fleet:
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0
-
-    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
-        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
 
 
 def _node(goal: str) -> NodeId | None:

@@ -1,4 +1,4 @@
-"""Annotations of a map file, without a server; the same methods as of mapweave.fleet.Fleet."""
+"""Annotations of a map file or store, without a server; the same methods as of mapweave.fleet.Fleet."""
 
 from __future__ import annotations
 
@@ -10,36 +10,39 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.annotator import check_annotation
-from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
 from mapweave.merge.settings import MergeSettings
+from mapweave.opened_map import MapSource, open_map
 from mapweave.storage.atomic_file import check_place
-from mapweave.storage.map_file import read_map_file, write_map_file
+from mapweave.storage.map_file import write_map_file
 
 
 class OfflineAnnotations:
-    """The annotations of one map file."""
+    """The annotations of one map. Map files are written; a store is only read, since it is its server's."""
 
     def __init__(
         self, path: Path, out: Path | None = None, by: str = "a person", settings: MergeSettings | None = None
     ) -> None:
-        """Read a map file.
+        """Read a map.
 
         Args:
-            path: of the file.
-            out: where the file with new annotations is written; over the old one by default.
+            path: of the file or store.
+            out: where the file with new annotations is written; over the old file by default.
             by: says so.
             settings: with which the file was merged.
 
         Raises:
             InvalidFile: it cannot be read.
         """
-        self._out, self._by, self._settings = out or path, by, settings
-        self._content = read_map_file(path)
+        self._by, self._settings = by, settings
+        self._opened = open_map(path)
+        self._out = path if out is None and self._opened.source is MapSource.FILE else out
+        self._made = Annotations(self._opened.content.annotations)
 
     def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
         """See Fleet.annotate; the file is written.
@@ -55,7 +58,7 @@ class OfflineAnnotations:
 
     def annotations(self) -> Annotations:
         """What people say about the map."""
-        return Annotations(self._content.annotations)
+        return self._made
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words.
@@ -67,14 +70,19 @@ class OfflineAnnotations:
 
     @cached_property
     def _router(self) -> Router:
-        return Router(merged_of(self._content, self._settings))
+        return Router(self._opened.merged(self._settings))
 
     def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
+        if self._out is None:
+            raise InvalidValue(
+                f"{self._opened.path} is a {self._opened.source}, which is not written: give -o"
+            )
         check_place(self._out)
         annotation = annotation_of_words(
             name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
         )
         check_annotation(self._router.merged, self.annotations(), annotation)
-        self._content = replace(self._content, annotations=(*self._content.annotations, annotation))
-        write_map_file(self._out, self._content)
+        self._made = Annotations((*self._made.made, annotation))
+        content = self._opened.file(self._router.merged)
+        write_map_file(self._out, replace(content, annotations=self._made.made))
         return annotation.words

@@ -11,8 +11,10 @@
     GET /map          the merged map, a map file
     GET /annotations  what people say about the map: named places and so on, JSON
     POST /annotations JSON: adds an annotation, or withdraws one
+    GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
+    POST /constraints links, unmerges, retires, or takes back, JSON in and out; see constraint_request.py
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
 An error comes back as one JSON object with `error`. A busy server answers 503 with
@@ -25,11 +27,12 @@ import asyncio
 import ipaddress
 import logging
 import math
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import Future
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -40,19 +43,19 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_ends
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
-from mapweave.hybridmap.explanation import Explanation
-from mapweave.hybridmap.manual_constraint import EXAMPLE, Ends, read_ends
-from mapweave.hybridmap.map_event import History, MapEvent
-from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveRequest, View
-from mapweave.mapserver.http.annotations import Annotating, annotate, annotations_json
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.map_event import History
+from mapweave.hybridmap.mission_order import MissionKind, Missions
+from mapweave.hybridmap.query import ExplainRequest, ResolveRequest
+from mapweave.mapserver.http.annotations import annotate, annotations_json
+from mapweave.mapserver.http.answering import Answering
+from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
-from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
-from mapweave.wire.log_messages import Scalar
 
 log = logging.getLogger(__name__)
 
@@ -67,45 +70,18 @@ MOST_AT_ONCE = 32
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
-METHODS = dict.fromkeys(
-    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/annotations"),
-    "GET",
-) | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+METHODS = (
+    dict.fromkeys(
+        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+    )
+    | dict.fromkeys(("/constraints", "/annotations"), "GET or POST")
+    | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+)
 BY = "http"
 """Gives a mission, if the request does not say."""
 
 
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
-
-
-class Answering(Annotating, Protocol):
-    """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
-
-    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
-        """Where a view was taken."""
-
-    def explain(self, request: ExplainRequest) -> Future[Explanation]:
-        """Explain a merge or a route."""
-
-    def status(self) -> dict[str, Scalar]:
-        """What the server holds and does."""
-
-    def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps."""
-
-    def robots(self) -> FleetStatus:
-        """The robots, and where they are."""
-
-    def missions(self) -> Missions:
-        """The missions that are known."""
-
-    def give(
-        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str, via: tuple[str, ...]
-    ) -> MissionReport:
-        """Give a robot a mission; waits for its answer."""
-
-    def map_file(self) -> Future[bytes]:
-        """The merged map as a map file."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -139,7 +115,7 @@ class Web(HttpThread):
             server: answers.
             patience: time limit for a body, and for an answer, s.
             limits: of connections.
-            commands: whether other machines may move robots, too.
+            commands: whether other machines may move robots and correct the map, too.
 
         Raises:
             NotConnected: the port cannot be used, for example since it is taken.
@@ -219,6 +195,7 @@ class Questions:
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
+            Route("/constraints", self._answering(self._constraints), methods=["GET", "POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such})
@@ -306,13 +283,27 @@ class Questions:
 
         return await run_in_threadpool(stop)
 
+    async def _constraints(self, request: Request) -> Mapping[str, Any]:
+        if request.method != "POST":
+            return await run_in_threadpool(
+                lambda: constraint_values(ManualConstraints(self._server.constraints().made))
+            )
+        self._check_commands(request)
+        body = await self._body(request, "JSON")
+
+        def constrain() -> Mapping[str, Any]:
+            record = self._server.constraints().made
+            return {"said": self._server.constrain(read_request(body, BY, time.time_ns(), record))}
+
+        return await run_in_threadpool(constrain)
+
     def _check_commands(self, request: Request) -> None:
-        """There is no password: unless it is set otherwise, only this machine moves robots and annotates."""
+        """There is no password: robots are moved and maps corrected from this machine, unless it is set."""
         host = "" if request.client is None else request.client.host
         if not self._commands and not is_loopback(host):
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
-                "missions and annotations come from this machine alone: start the server with "
+                "missions and corrections are taken from this machine alone: start the server with "
                 "--http-commands",
             )
 

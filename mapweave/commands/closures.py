@@ -1,4 +1,4 @@
-"""`mapweave close`, `open`, `prefer`, `avoid` and `closures`: which ways robots may take, and should."""
+"""`mapweave close`, `reopen`, `prefer`, `avoid` and `closures`: which ways robots may take, and should."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def add_to(commands: Any) -> None:
     )
     _add_where(close)
     close.add_argument("--from", dest="begin", metavar="TIME", help=f"from when on (default: now): {TIMES}")
-    close.add_argument("--until", dest="end", metavar="TIME", help="until when (default: until `open`)")
+    close.add_argument("--until", dest="end", metavar="TIME", help="until when (default: until `reopen`)")
     close.set_defaults(run=run_close)
 
     reopen: argparse.ArgumentParser = commands.add_parser(
-        "open",
+        "reopen",
         help="withdraw a closure",
-        description="Withdraw a closure by its name, or by what was closed: `mapweave open kitchen`, "
-        "`mapweave open r0.1.17 r0.1.19`. `mapweave closures` lists the names.",
+        description="Withdraw a closure by its name, or by what was closed: `mapweave reopen kitchen`, "
+        "`mapweave reopen r0.1.17 r0.1.19`. `mapweave closures` lists the names.",
     )
     reopen.add_argument("where", nargs="+", metavar="NAME|NODE", help="the name, or the two nodes")
     add_record_options(reopen, changes=True)

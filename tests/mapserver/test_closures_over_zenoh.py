@@ -76,8 +76,8 @@ def test_what_is_closed_from_the_shell_holds_for_all(
             status, out, _ = shell("map", "route", str(first), "kitchen")
             assert status == 2 and "closed by bob" in out
             assert "closure kitchen is an area" in shell("closures")[1]
-            assert shell("open", "kitchen")[0] == 0
-            assert shell("open", "kitchen")[::2] == (1, "mapweave: there is no closure kitchen\n")
+            assert shell("reopen", "kitchen")[0] == 0
+            assert shell("reopen", "kitchen")[::2] == (1, "mapweave: there is no closure kitchen\n")
             assert asks().closed is False and fleet.go("r0", "kitchen").state is MissionState.RUNNING
 
             # One that ends by itself.
@@ -93,7 +93,7 @@ def test_what_is_closed_from_the_shell_holds_for_all(
             for wrong in (
                 ["close", "nowhere"], ["close"], ["close", "a", "b", "c"], ["close", str(first), str(first)],
                 ["close", "kitchen", "--until", "soon"], ["close", "kitchen", "--until", "1999-01-01"],
-                ["prefer", "kitchen", "--factor", "2"], ["open", "nothing"],
+                ["prefer", "kitchen", "--factor", "2"], ["reopen", "nothing"],
             ):  # fmt: skip
                 status, _, err = shell(*wrong)
                 assert status == 1 and err.count("\n") == 1, wrong
