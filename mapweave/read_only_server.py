@@ -95,6 +95,15 @@ class ReadOnlyServer:
             "source": str(self._opened.source),
         }
 
+    @property
+    def read_only(self) -> bool:
+        """Nothing can be changed."""
+        return True
+
+    def merged(self) -> MergedMap:
+        """The map."""
+        return self._merged
+
     def history(self) -> tuple[MapEvent, ...]:
         """What became of the maps until the file was written, and what people decided."""
         content = self._opened.content

@@ -1,7 +1,9 @@
 """The map server for people: a photograph in, JSON out, explanations of merges and routes, and pages.
 
-    GET /             the page for photographs
-    GET /why          the page that explains why maps are one, or are not
+    GET /             the page: the merged map live, robots, and where a photograph was taken
+    GET /why          the same page, with an explanation: ?a=r0.1.17&b=r1.1.5
+    WebSocket /live   what the page draws, see live.py
+    GET /nodes/NODE   one node, JSON
     GET /status       what the server holds, JSON
     GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
@@ -39,28 +41,31 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
-from starlette.routing import Mount, Route
+from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_ends
+from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
 from mapweave.hybridmap.mission_order import MissionKind, Missions
-from mapweave.hybridmap.query import ExplainRequest, ResolveRequest
-from mapweave.mapserver.http.annotations import annotate, annotations_json
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.query import ExplainRequest
+from mapweave.mapserver.http.annotations import annotate, annotations_json, ends_of_words
 from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
+from mapweave.mapserver.http.live import Live
+from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
 
 log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).with_name("static")
-PAGES = {"/": "index.html", "/why": "why.html"}
+PAGES = ("/", "/why")
 MOST_BYTES = 16 * 2**20
 """Longest body, 16 MiB."""
 PATIENCE = 10.0
@@ -72,7 +77,8 @@ WHOLE = "mapweave.whole"
 MISSION = "/robots/ROBOT/go?goal=GOAL"
 METHODS = (
     dict.fromkeys(
-        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/nodes/NODE"),
+        "GET",
     )
     | dict.fromkeys(("/constraints", "/annotations"), "GET or POST")
     | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
@@ -186,12 +192,13 @@ class Questions:
         answering: dict[str, Answer] = {
             "/status": self._status, "/history": self._history, "/explain": self._explain,
             "/route": self._explain, "/robots": self._robots, "/missions": self._missions, "/map": self._map,
-            "/annotations": self._annotations,
+            "/nodes/{node}": self._node,
         }  # fmt: skip
         routes = [
-            *(Route(path, _page(name)) for path, name in PAGES.items()),
+            *(Route(path, _page("index.html")) for path in PAGES),
+            WebSocketRoute("/live", Live(server, self._may_command).serve),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
-            Route("/annotations", self._answering(self._annotate), methods=["POST"]),
+            Route("/annotations", self._answering(self._annotations), methods=["GET", "POST"]),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
@@ -245,13 +252,16 @@ class Questions:
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
 
-    async def _annotations(self, _: Request) -> Mapping[str, Any]:
-        return await run_in_threadpool(annotations_json, self._server)
-
-    async def _annotate(self, request: Request) -> Mapping[str, Any]:
+    async def _annotations(self, request: Request) -> Mapping[str, Any]:
+        if request.method != "POST":
+            return await run_in_threadpool(annotations_json, self._server)
         self._check_commands(request)
         body = await self._body(request, "JSON")
         return await run_in_threadpool(annotate, self._server, body, request.query_params.get("by", BY))
+
+    async def _node(self, request: Request) -> Mapping[str, Any]:
+        node = NodeId.parse(request.path_params["node"])
+        return await run_in_threadpool(lambda: json_values(node_details(self._server.merged(), node)))
 
     async def _map(self, _: Request) -> Response:
         data = await self._result(self._server.map_file)
@@ -297,10 +307,13 @@ class Questions:
 
         return await run_in_threadpool(constrain)
 
+    def _may_command(self, host: str) -> bool:
+        return self._commands or is_loopback(host)
+
     def _check_commands(self, request: Request) -> None:
         """There is no password: robots are moved and maps corrected from this machine, unless it is set."""
         host = "" if request.client is None else request.client.host
-        if not self._commands and not is_loopback(host):
+        if not self._may_command(host):
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
                 "missions and corrections are taken from this machine alone: start the server with "
@@ -315,7 +328,7 @@ class Questions:
             if query.keys() != {"a", "b"}:
                 raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
             words = query["a"].strip(), query["b"].strip()
-            ends = await run_in_threadpool(_ends, words, self._server)
+            ends = await run_in_threadpool(ends_of_words, self._server, words)
         asked = ExplainRequest(ends, route)
         explanation = await self._result(lambda: self._server.explain(asked))
         return await run_in_threadpool(json_values, explanation)
@@ -355,15 +368,6 @@ def _length(request: Request, what: str) -> int:
     if int(text) == 0:
         raise InvalidValue(f"send {what} as the body")
     return int(text)
-
-
-def _ends(words: tuple[str, str], server: Answering) -> Ends:
-    """Two nodes or maps; a word that is none may be the name of a place, or a position."""
-    known = server.annotations()
-    if any(known.last("place", word) or "," in word for word in words):
-        first, second = server.resolve(ResolveRequest(words)).found
-        return first.node, second.node
-    return read_ends(*words)
 
 
 def is_loopback(host: str) -> bool:
