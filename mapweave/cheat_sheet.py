@@ -16,6 +16,9 @@ GROUPS = {
     ),
     "Run": ("server", "router", "agent", "record"),
     "Command": ("status", "go", "explore", "stop", "missions", "drive"),
+    "Places and closures": (
+        "place add", "place list", "place remove", "close", "reopen", "prefer", "avoid", "closures",
+    ),
     "Maps": (
         "map show", "open", "map explain", "map route", "map history", "map link", "map unmerge",
         "map retire", "map undo", "map merge",

@@ -120,6 +120,8 @@ ASKING = {
     "status": [], "go": ["r0", "home"], "explore": ["r0"], "stop": ["r0"], "map fetch": ["out.mapweave"],
     "map explain": ["r0.1", "r1.1"], "map route": ["r0.1.1", "r0.1.2"], "map history": [],
     "missions": [], "map link": ["r0.1.1", "r1.1.2"], "map undo": [],
+    "place add": ["kitchen", "r0.1.17"], "place list": [], "place remove": ["kitchen"], "close": ["r0.1.1"],
+    "reopen": ["kitchen"], "prefer": ["r0.1.1", "r0.1.2"], "avoid": ["r0.1.1", "r0.1.2"], "closures": [],
     "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"],
     "relocalize": ["walk/images/0.png"],
     "record": ["r0", "--out", "drive"], "drive": ["r0", "--gamepad", "/dev/null"],
