@@ -34,6 +34,7 @@ from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -154,6 +155,15 @@ class MapServer:
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
         return self._worker.settle(timeout)
+
+    @property
+    def read_only(self) -> bool:
+        """Whether nothing can be changed, as with a map file."""
+        return False
+
+    def merged(self) -> MergedMap:
+        """The newest merged map."""
+        return self._worker.current().merged
 
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""

@@ -1,7 +1,9 @@
 """The map server for people: a photograph in, JSON out, explanations of merges and routes, and pages.
 
-    GET /             the page for photographs
-    GET /why          the page that explains why maps are one, or are not
+    GET /             the page: the merged map live, robots, and where a photograph was taken
+    GET /why          the same page, with an explanation: ?a=r0.1.17&b=r1.1.5
+    WebSocket /live   what the page draws, see live.py
+    GET /nodes/NODE   one node, JSON
     GET /status       what the server holds, JSON
     GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
@@ -34,27 +36,28 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
-from starlette.routing import Mount, Route
+from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.manual_constraint import EXAMPLE, read_ends
-from mapweave.hybridmap.map_event import History, MapEvent
+from mapweave.hybridmap.map_event import History
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.http.live import Live, Shown
+from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
-from mapweave.wire.log_messages import Scalar
 
 log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).with_name("static")
-PAGES = {"/": "index.html", "/why": "why.html"}
+PAGES = ("/", "/why")
 MOST_BYTES = 16 * 2**20
 """Longest body, 16 MiB."""
 PATIENCE = 10.0
@@ -65,7 +68,8 @@ WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
 METHODS = dict.fromkeys(
-    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/nodes/NODE"),
+    "GET",
 ) | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
 BY = "http"
 """Gives a mission, if the request does not say."""
@@ -74,23 +78,14 @@ BY = "http"
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
 
 
-class Answering(Protocol):
-    """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
+class Answering(Shown, Protocol):
+    """The questions, as of a MapServer or a map file: from any thread; a MapweaveError refuses one."""
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         """Where a view was taken."""
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
         """Explain a merge or a route."""
-
-    def status(self) -> dict[str, Scalar]:
-        """What the server holds and does."""
-
-    def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps."""
-
-    def robots(self) -> FleetStatus:
-        """The robots, and where they are."""
 
     def missions(self) -> Missions:
         """The missions that are known."""
@@ -204,9 +199,11 @@ class Questions:
         answering: dict[str, Answer] = {
             "/status": self._status, "/history": self._history, "/explain": self._explain,
             "/route": self._explain, "/robots": self._robots, "/missions": self._missions, "/map": self._map,
+            "/nodes/{node}": self._node,
         }  # fmt: skip
         routes = [
-            *(Route(path, _page(name)) for path, name in PAGES.items()),
+            *(Route(path, _page("index.html")) for path in PAGES),
+            WebSocketRoute("/live", Live(server, self._may_command).serve),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
@@ -260,6 +257,10 @@ class Questions:
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
 
+    async def _node(self, request: Request) -> Mapping[str, Any]:
+        node = NodeId.parse(request.path_params["node"])
+        return await run_in_threadpool(lambda: json_values(node_details(self._server.merged(), node)))
+
     async def _map(self, _: Request) -> Response:
         data = await self._result(self._server.map_file)
         headers = {"Content-Disposition": 'attachment; filename="merged.mapweave"'}
@@ -289,10 +290,13 @@ class Questions:
 
         return await run_in_threadpool(stop)
 
+    def _may_command(self, host: str) -> bool:
+        return self._commands or is_loopback(host)
+
     def _check_commands(self, request: Request) -> None:
         """There is no password: unless it is set otherwise, robots are moved from this machine alone."""
         host = "" if request.client is None else request.client.host
-        if not self._commands and not is_loopback(host):
+        if not self._may_command(host):
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
                 "robots take missions from this machine alone: start the server with --http-commands",

@@ -170,3 +170,7 @@ def _print(answer: RelocalizeAnswer) -> None:
             f"(sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
             f"{place.inliers} landmarks agree, probability {place.probability:.3f}"
         )
+    for near in answer.similar:
+        side = "left" if (near.turn or 0.0) > 0.0 else "right"
+        turn = "" if near.turn is None else f"; turn {abs(math.degrees(near.turn)):.0f} deg {side}"
+        print(f"  looks like {near.node}: {near.lacks}{turn}")
