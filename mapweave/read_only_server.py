@@ -58,6 +58,15 @@ class ReadOnlyServer:
         self._admission.close()
         self._background.shutdown(cancel_futures=True)
 
+    @property
+    def read_only(self) -> bool:
+        """Nothing can be changed."""
+        return True
+
+    def merged(self) -> MergedMap:
+        """The map."""
+        return self._merged
+
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         """Where a view was taken; see `MapServer.locate`.
 

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from websockets.sync.client import connect
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
@@ -232,6 +233,10 @@ def test_a_map_is_served_to_people_and_never_changed(folder: Path, tmp_path: Pat
 
         for name in ports:
             eventually(lambda name=name: up(name), 90.0)
+        with connect(f"ws://127.0.0.1:{ports['store']}/live") as live:
+            assert json.loads(live.recv(30)) == {"kind": "hello", "read_only": True, "commands": False}
+            shown = json.loads(live.recv(30))
+            assert shown["kind"] == "map" and shown["nodes"]["count"] == len(NODES)
         status, page = ask("store", "/")
         assert status == 200 and b"<html" in page
         counts = {name: ask(name, "/status")[1] for name in ports}
