@@ -12,7 +12,7 @@ from typing import NoReturn
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Explanation
-from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
@@ -118,6 +118,18 @@ class ReadOnlyServer:
             InvalidValue: always.
         """
         self._refuse("there are no robots to send")
+
+    def constraints(self) -> ConstraintList:
+        """The record of manual constraints."""
+        return ConstraintList(self._opened.content.constraints)
+
+    def constrain(self, request: ConstraintRequest) -> str:
+        """Refuse a manual constraint.
+
+        Raises:
+            InvalidValue: always.
+        """
+        self._refuse("with --map FILE the commands `map link`, `unmerge` and `retire` rewrite a map file")
 
     def map_file(self) -> Future[bytes]:
         """The map as a map file."""

@@ -128,6 +128,7 @@ class MergedMap:
             mapweave.merge.map_maintenance.landmark_removal. Nodes without faded landmarks are left out.
         set_apart: maps that are not among these, because the merge fails with them, and why.
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
+        contradicted: links by hand that the rest of the map contradicts, by their nodes, and how.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -141,6 +142,7 @@ class MergedMap:
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     set_apart: Mapping[MapId, str] = field(default_factory=dict)
     wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
+    contradicted: Mapping[tuple[NodeId, NodeId], str] = field(default_factory=dict)
 
     @staticmethod
     def empty() -> MergedMap:
@@ -244,7 +246,8 @@ class MergedMap:
     def summary(self) -> str:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 1 loop, 2 refused, 4 superseded`.
 
-        Links are between maps, loops within one; superseded nodes and retired maps count as nodes and maps.
+        Links are between maps, loops within one; superseded nodes and retired maps count as nodes and maps;
+        retired nodes count as no nodes.
         """
         counts = self.counts()
         named = [
@@ -253,9 +256,11 @@ class MergedMap:
             if name != "loops" or counts[name]
         ]
         words = [f"{count} {name[:-1] if count == 1 else name}" for count, name in named]
+        nodes = len(self.constraints.nodes)
         more = (
             (counts["superseded"], "superseded"),
             (len(self.constraints.retired), "retired"),
+            (nodes, "retired node" if nodes == 1 else "retired nodes"),
             (counts["set_apart"], "set apart"),
         )
         words += [f"{counts['refused']} refused", *(f"{count} {word}" for count, word in more if count)]

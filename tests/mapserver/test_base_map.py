@@ -14,6 +14,7 @@ from mapweave.agent.replication.epochs import newest_on_server
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -147,7 +148,7 @@ def test_another_map_of_the_same_name_is_refused_and_the_base_stays(tmp_path: Pa
 
 
 def test_constraints_of_the_base_hold(tmp_path: Path) -> None:
-    apart = ManualConstraint((R0, R1), True, "anna", 5, "two kitchens")
+    apart = ManualConstraint(Apart((R0, R1)), True, "anna", 5, "two kitchens")
     content = map_file_of(merge_parts(BASE.maps, ManualConstraints([apart])))
     with serving(tmp_path, BaseMap.of("apart.mapweave", content)) as (server, _):
         assert server.status()["components"] == 2 and server.status()["constraints"] == 1

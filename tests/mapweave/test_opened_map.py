@@ -26,6 +26,7 @@ from websockets.sync.client import connect
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
@@ -44,7 +45,7 @@ from tests.mapweave.command_line import complaint
 from tests.waiting import eventually
 
 R0, R1 = MapId("r0", 1), MapId("r1", 1)
-SAID = ManualConstraint((R0, MapId("r9", 1)), True, "anna", 5, "two kitchens")
+SAID = ManualConstraint(Apart((R0, MapId("r9", 1))), True, "anna", 5, "two kitchens")
 EVENT = MapEvent(7, MapEventKind.JOINED, "r0.1 and r1.1 are one map now")
 
 
@@ -271,7 +272,7 @@ LINK = Edge(
 WHOLE = MapFile(
     "merged", "two robots", (*CONTENTS, EdgePut(LINK)), {NODES[0]: (0, LINK.a_from_b)},
     (RefusedPair(NODES[1], NODES[5], "too far"), RefusedPair(NODES[2], NODES[5], "too far")),
-    (SAID, replace(SAID, apart=False, stamp_ns=6)),
+    (SAID, replace(SAID, holds=False, stamp_ns=6)),
     {NODES[1]: Superseded(NODES[2], 12, 0.1, 0.2), NODES[3]: Superseded(NODES[4], 12, 0.1, 0.2)},
     {}, (EVENT,),
 )  # fmt: skip
