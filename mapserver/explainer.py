@@ -63,7 +63,11 @@ class ConstraintRecord:
                 made.append(decode(body, ManualConstraint))
             except InvalidMessage as error:
                 log.error("a manual constraint cannot be read (%s); it is left out", error)
-        self._constraints = self._base.constraints + ManualConstraints(made)
+        both = dict.fromkeys((*self._base.constraints.made, *made))
+        # By date only where there are two records: clocks differ, and one record is in order.
+        self._constraints = ManualConstraints(
+            sorted(both, key=lambda one: one.stamp_ns) if self._base.constraints.made else made
+        )
 
     @property
     def constraints(self) -> ManualConstraints:
