@@ -58,15 +58,6 @@ class ReadOnlyServer:
         self._admission.close()
         self._background.shutdown(cancel_futures=True)
 
-    @property
-    def read_only(self) -> bool:
-        """Nothing can be changed."""
-        return True
-
-    def merged(self) -> MergedMap:
-        """The map."""
-        return self._merged
-
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         """Where a view was taken; see `MapServer.locate`.
 
@@ -98,6 +89,15 @@ class ReadOnlyServer:
             "source": str(self._opened.source),
         }
 
+    @property
+    def read_only(self) -> bool:
+        """Nothing can be changed."""
+        return True
+
+    def merged(self) -> MergedMap:
+        """The map."""
+        return self._merged
+
     def history(self) -> tuple[MapEvent, ...]:
         """What became of the maps until the file was written, and what people decided."""
         content = self._opened.content
@@ -120,16 +120,16 @@ class ReadOnlyServer:
         self._refuse("there are no robots to send")
 
     def constraints(self) -> ConstraintList:
-        """The record of manual constraints."""
-        return ConstraintList(self._opened.content.constraints)
+        """What people decided, in order."""
+        return ConstraintList(tuple(self._opened.content.constraints))
 
     def constrain(self, request: ConstraintRequest) -> str:
-        """Refuse a manual constraint.
+        """Refuse a correction.
 
         Raises:
             InvalidValue: always.
         """
-        self._refuse("with --map FILE the commands `map link`, `unmerge` and `retire` rewrite a map file")
+        self._refuse("`mapweave map link | unmerge | retire --map FILE -o OUT` write a corrected copy")
 
     def map_file(self) -> Future[bytes]:
         """The map as a map file."""

@@ -281,9 +281,6 @@ class Questions:
 
         return await run_in_threadpool(stop)
 
-    def _may_command(self, host: str) -> bool:
-        return self._commands or is_loopback(host)
-
     async def _constraints(self, request: Request) -> Mapping[str, Any]:
         if request.method != "POST":
             return await run_in_threadpool(
@@ -297,6 +294,9 @@ class Questions:
             return {"said": self._server.constrain(read_request(body, BY, time.time_ns(), record))}
 
         return await run_in_threadpool(constrain)
+
+    def _may_command(self, host: str) -> bool:
+        return self._commands or is_loopback(host)
 
     def _check_commands(self, request: Request) -> None:
         """There is no password: robots are moved and maps corrected from this machine, unless it is set."""
