@@ -26,7 +26,9 @@ from mapweave.commands import (
 def add_to(commands: Any) -> None:
     """Declare the command and its actions."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        "map", help="show, explain, merge, export and extract maps"
+        "map",
+        help="show, explain, merge, export and extract maps",
+        description="Show, explain, correct, merge, fetch, export and extract maps.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (

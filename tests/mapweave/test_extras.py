@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.cli import MISSING_EXTRA, main
+from mapweave.cli import main
+from mapweave.exit_status import MISSING_EXTRA
 from mapweave.extras import MODULES
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -68,6 +69,8 @@ CASES: list[tuple[str, str, str]] = [
     ("calibrate camera", "--source {tmp}/none.avi --http 0", SERVER),
     ("calibrate drive", "{recording}", "too short"),
     ("settings", "", "[network]"),
+    ("completion", "bash", "mapweave"),
+    ("missions", "R0 --connect {closed}", "R0"),
     ("relocalize", "{recording}/images/0.png --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("eval relocalize", "{recording}", SERVER),
     ("eval replay", "{recording} --out {tmp}/replay", "frames"),

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
+from mapweave.exit_status import NO
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -146,7 +147,7 @@ def test_a_route_is_explained(
     others = json.loads(said("map", "route", start, goal, *barred, "--json", "--map", files[3]))
     assert others["gaps"] and "reported as blocked" in others["gaps"][0]["words"]
     none = tmp_path / "none.png"
-    assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3]), "--draw", str(none)]) == 2
+    assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3]), "--draw", str(none)]) == NO
     out, err = capfd.readouterr()
     assert f"{none} is not drawn: there is no way" in err and not none.exists()
     assert "there is no way: " in out and "r0.1 and r2.1 are not one map" in out
