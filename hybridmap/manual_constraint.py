@@ -110,6 +110,10 @@ class ManualConstraints:
         """The same with other retired nodes."""
         return ManualConstraints(self.made, nodes)
 
+    def without(self, kind: type[Subject]) -> ManualConstraints:
+        """Only those that are about something else."""
+        return ManualConstraints(c for c in self.made if not isinstance(c.about, kind))
+
     @property
     def in_force(self) -> tuple[ManualConstraint, ...]:
         """Those that hold, in the order of what they are about."""
@@ -183,7 +187,7 @@ def reason_of(constraint: ManualConstraint) -> str:
             return f"undone{scope} {how}"
         case Linked():
             return f"linked by hand {how}"
-    return f"{about} {_verb(about)} retired {how}"
+    return f"{about} {verb_of(about)} retired {how}"
 
 
 def event_words(constraint: ManualConstraint) -> str:
@@ -196,8 +200,9 @@ def event_words(constraint: ManualConstraint) -> str:
             return f"{about}: may be linked again, by {who}"
         case Linked():
             return f"{about}: the link by hand is taken back, by {who}"
-    return reason_of(constraint) if constraint.holds else f"{about} {_verb(about)} in use again, by {who}"
+    return reason_of(constraint) if constraint.holds else f"{about} {verb_of(about)} in use again, by {who}"
 
 
-def _verb(about: Subject) -> str:
+def verb_of(about: Subject) -> str:
+    """Of a sentence on what is retired: `is`, or `are`."""
     return "are" if isinstance(about, RetiredNodes) and len(about.nodes) > 1 else "is"

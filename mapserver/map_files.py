@@ -12,7 +12,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import Edge, MapId
+from mapweave.hybridmap.node import Edge, MapId, NodeId
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
@@ -50,6 +50,7 @@ def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
         merged.superseded,
         merged.faded,
         tuple(history),
+        _numbered(merged.constraints),
     )
 
 
@@ -77,7 +78,8 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         InvalidFile: its measurements determine no poses.
     """
     s = settings or MergeSettings()
-    maps, constraints = maps_of(content), ManualConstraints(content.constraints)
+    nodes = {node: content.constraints[number] for node, number in content.retired.items()}
+    maps, constraints = maps_of(content), ManualConstraints(content.constraints, nodes)
     links = tuple(_links(change.edge for change in content.changes if isinstance(change, EdgePut)))
     try:
         parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency)
@@ -106,6 +108,12 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         superseded,
         faded,
     )
+
+
+def _numbered(constraints: ManualConstraints) -> dict[NodeId, int]:
+    """Retired nodes with the numbers of their constraints."""
+    number = {constraint: k for k, constraint in enumerate(constraints.made)}
+    return {node: number[constraint] for node, constraint in constraints.nodes.items()}
 
 
 def _is_link(edge: Edge) -> bool:
