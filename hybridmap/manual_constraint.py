@@ -125,7 +125,9 @@ class ManualConstraints:
         return {
             (link.a, link.b): link
             for constraint in self.in_force
-            if isinstance(link := constraint.about, Linked) and self.against(link.a, link.b) is None
+            if isinstance(link := constraint.about, Linked)
+            and link.covariance
+            and self.against(link.a, link.b) is None
         }
 
     def standing(self, about: Subject) -> ManualConstraint | None:

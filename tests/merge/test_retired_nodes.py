@@ -41,7 +41,7 @@ def constrained(*subjects: Subject) -> ManualConstraints:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_bridges_keep_the_rest_where_all_measurements_put_it(seed: int) -> None:
-    """Poses and covariances against the whole drive with the retired nodes as unknowns nobody asks for.
+    """Poses and covariances against the whole drive with the retired nodes as unknowns.
 
     Of a chain the two are the same to first order: a bridge is what marginalising the nodes leaves.
     """
