@@ -95,7 +95,7 @@ class Islands:
             [merged for merged, _ in merged_islands.values()], maps, verdicts.across(island_of), constraints
         )
         contradicted = self._contradicted(maps, verdicts, touched, constraints)
-        return replace(whole, contradicted=contradicted | whole.contradicted) if contradicted else whole
+        return replace(whole, contradicted={**contradicted, **whole.contradicted}) if contradicted else whole
 
     def _decided(
         self,
