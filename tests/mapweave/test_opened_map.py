@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
@@ -43,7 +44,7 @@ from tests.mapweave.command_line import complaint
 from tests.waiting import eventually
 
 R0, R1 = MapId("r0", 1), MapId("r1", 1)
-SAID = ManualConstraint((R0, MapId("r9", 1)), True, "anna", 5, "two kitchens")
+SAID = ManualConstraint(Apart((R0, MapId("r9", 1))), True, "anna", 5, "two kitchens")
 EVENT = MapEvent(7, MapEventKind.JOINED, "r0.1 and r1.1 are one map now")
 
 
@@ -266,9 +267,9 @@ LINK = Edge(
 WHOLE = MapFile(
     "merged", "two robots", (*CONTENTS, EdgePut(LINK)), {NODES[0]: (0, LINK.a_from_b)},
     (RefusedPair(NODES[1], NODES[5], "too far"), RefusedPair(NODES[2], NODES[5], "too far")),
-    (SAID, replace(SAID, apart=False, stamp_ns=6)),
+    (SAID, replace(SAID, holds=False, stamp_ns=6)),
     {NODES[1]: Superseded(NODES[2], 12, 0.1, 0.2), NODES[3]: Superseded(NODES[4], 12, 0.1, 0.2)},
-    {}, (EVENT,),
+    {}, (EVENT,), {NODES[6]: 0, NODES[7]: 0},
 )  # fmt: skip
 
 
@@ -292,6 +293,7 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
     other = replace(
         WHOLE, title="renamed", changes=changes, poses={}, history=(), refused=WHOLE.refused[::-1],
         superseded=dict(reversed(list(WHOLE.superseded.items()))),
+        retired=dict(reversed(list(WHOLE.retired.items()))),
     )  # fmt: skip
     expected = content_hash(WHOLE)
     assert content_hash(other) == expected == content_hash(unpack_map_file(pack_map_file(other)))
@@ -306,6 +308,7 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
         replace(WHOLE, refused=WHOLE.refused[:1]),
         replace(WHOLE, constraints=WHOLE.constraints[::-1]),
         replace(WHOLE, superseded={}),
+        replace(WHOLE, retired={NODES[6]: 0, NODES[7]: 1}),
         replace(WHOLE, faded={NODES[0]: np.zeros(len(CONTENTS[0].node.landmarks), bool)}),  # type: ignore[union-attr]
     ],
 )
