@@ -26,6 +26,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.annotation import Annotation
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import Number, Words
@@ -81,6 +82,7 @@ class MapFile:
         retired: of a merged map: retired nodes, and which of the constraints retires each, from 0; of retired
             maps none.
         history: of a merged map: what has become of its maps by itself, in order.
+        annotations: what people say about the map, in order.
     """
 
     kind: Kind
@@ -92,6 +94,7 @@ class MapFile:
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     history: tuple[MapEvent, ...] = ()
+    annotations: tuple[Annotation, ...] = ()
     retired: Mapping[NodeId, Number] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
