@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 from mapweave.hybridmap.constraint_subject import (
-    NANOSECONDS,
     Apart,
     Ends,
     Linked,
@@ -20,6 +18,7 @@ from mapweave.hybridmap.constraint_subject import (
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.wall_time import utc_words
 
 MOST_WORDS = 300
 """Characters of a reason."""
@@ -175,9 +174,8 @@ class ManualConstraints:
 
 def decided(constraint: ManualConstraint) -> str:
     """For example `by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
-    when = datetime.fromtimestamp(constraint.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
     why = f': "{constraint.because}"' if constraint.because else ""
-    return f"by {constraint.who or 'a person'} on {when}{why}"
+    return f"by {constraint.who or 'a person'} on {utc_words(constraint.stamp_ns)}{why}"
 
 
 def reason_of(constraint: ManualConstraint) -> str:

@@ -269,7 +269,7 @@ WHOLE = MapFile(
     (RefusedPair(NODES[1], NODES[5], "too far"), RefusedPair(NODES[2], NODES[5], "too far")),
     (SAID, replace(SAID, holds=False, stamp_ns=6)),
     {NODES[1]: Superseded(NODES[2], 12, 0.1, 0.2), NODES[3]: Superseded(NODES[4], 12, 0.1, 0.2)},
-    {}, (EVENT,), {NODES[6]: 0, NODES[7]: 0},
+    {}, (EVENT,), retired={NODES[6]: 0, NODES[7]: 0},
 )  # fmt: skip
 
 
