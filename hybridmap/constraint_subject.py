@@ -275,8 +275,10 @@ class RetiredWindow:
         return node.id.map == self.map and self.begin_ns <= node.stamp_ns <= self.end_ns
 
     def __str__(self) -> str:
-        """For example `map r0.1 from 2026-03-01 12:00:00 to 2026-03-01 12:05:00 UTC`."""
-        return f"map {self.map} from {_time(self.begin_ns)} to {_time(self.end_ns)} UTC"
+        """For example `map r0.1 from 2026-03-01 12:00:00 UTC until 2026-03-01 12:05:00 UTC`."""
+        begin = f" from {_time(self.begin_ns)}" if self.begin_ns else ""
+        end = f" until {_time(self.end_ns)}" if self.end_ns < MAX_STAMP_NS else ""
+        return f"map {self.map}{begin}{end}"
 
 
 Subject = Apart | Linked | RetiredMap | RetiredNodes | RetiredArea | RetiredWindow
@@ -377,4 +379,4 @@ def _upper(covariance: Array) -> tuple[float, ...]:
 
 
 def _time(stamp_ns: int) -> str:
-    return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -78,7 +78,9 @@ def _by_images(merged: MergedMap, asked: Linked, because: str, s: ConsistencySet
         words = f"{_landmarks(verdict)} of the images agree on one pose"
         return Linked.of(asked.a, asked.b, pose, verdict.shared, verdict.evidence), words
     found = examine(a, b)
-    evidence = f"{found.matches} features match, {found.inliers} of them agree on a pose: {verdict.reason}"
+    evidence = verdict.reason
+    if found.inliers:
+        evidence = f"{found.matches} features match, {found.inliers} of them agree on a pose: {evidence}"
     if asked.pose is None:
         raise InvalidValue(
             f"the images of {asked} do not show one place: {evidence}. If you know that they do, give the "

@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:
-    from mapweave.commands.map_ends import map_of, node_of
+    from mapweave.commands.map_ends import map_of, node_of, resolved
     from mapweave.hybridmap.area import Area, read_corner
     from mapweave.hybridmap.constraint_subject import RetiredArea, read_retired, read_window
     from mapweave.hybridmap.errors import InvalidValue
@@ -54,7 +54,8 @@ def _subject(arguments: argparse.Namespace) -> Subject:
         raise InvalidValue("give a map or nodes, or --area; --from and --to go with one map")
     if arguments.area is not None:
         anchor, corners = arguments.area
-        return RetiredArea(Area(node_of(anchor), tuple(map(read_corner, corners.split()))))
+        (node,) = map(node_of, resolved(arguments, [anchor]))
+        return RetiredArea(Area(node, tuple(map(read_corner, corners.split()))))
     if in_time:
         return read_window(map_of(arguments.which[0]), arguments.begin, arguments.end, time.time_ns(), None)
     return read_retired(arguments.which)

@@ -222,7 +222,8 @@ def test_linking_in_a_file_and_taking_it_back(
     assert main(wrong) == 1
     assert "do not show one place: " in capfd.readouterr().err
     by_hand = [*wrong, "--pose=-1,0.5,90", "--because", "the same door", "--by", "anna"]
-    assert said(*by_hand, "--check").startswith("r0.1.1 and r2.1.3: linked by hand by anna")
+    only_checked = "only checked, nothing is changed: r0.1.1 and r2.1.3: linked by hand by anna"
+    assert said(*by_hand, "--check").startswith(only_checked)
     assert path.read_bytes() == files[3].read_bytes(), "only checked"
     assert "1 component" in said(*by_hand)
     out = said("map", "explain", "r0.1.1", "r2.1.3", "--map", path)
