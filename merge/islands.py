@@ -3,7 +3,7 @@
 Maps that links tie together, directly or by way of others, are an island. Nothing in one island bears on
 another, so an island that nothing has touched is kept as it is.
 
-Two sorts of manual constraints need a second merge, kept as the first: which nodes lie in a retired area says
+Two sorts of manual constraints need a second merge of their islands: which nodes lie in a retired area says
 the merge without retired areas, and whether a link by hand is contradicted the merge without links by hand.
 """
 
@@ -94,7 +94,7 @@ class Islands:
         whole = _together(
             [merged for merged, _ in merged_islands.values()], maps, verdicts.across(island_of), constraints
         )
-        contradicted = self._contradicted(maps, verdicts, touched, constraints)
+        contradicted = self._contradicted(_around(maps, islands, constraints), verdicts, touched, constraints)
         return replace(whole, contradicted={**contradicted, **whole.contradicted}) if contradicted else whole
 
     def _decided(
@@ -128,7 +128,8 @@ class Islands:
         self._without_areas = self._without_areas or _Reference(self._settings, self._exact)
         others = constraints.without(RetiredArea)
         others = others.with_nodes(retired_nodes(maps, others, ()))
-        merged = self._without_areas.merge(maps, verdicts, touched, others)
+        inside = _around(maps, self._ties(maps, verdicts, others), constraints)
+        merged = self._without_areas.merge(inside, verdicts, touched, others)
         return retired_nodes(maps, constraints, merged.graphs)
 
     def _contradicted(
@@ -154,7 +155,8 @@ class Islands:
                 off = (linked.a_from_b.mean.inverse() @ measured.mean).vector
                 out[pair] = (
                     f"without it robots' measurements put {linked.b} {np.hypot(off[0], off[1]):.2f} m and "
-                    f"{abs(np.degrees(off[2])):.1f} deg from there, {np.sqrt(distance2):.1f} sigmas"
+                    f"{abs(np.degrees(off[2])):.1f} deg from there: {np.sqrt(distance2):.1f} standard "
+                    "deviations"
                 )
         return out
 
@@ -197,6 +199,19 @@ class _Reference(Islands):
         constraints: ManualConstraints,
     ) -> dict[Pair, str]:
         return {}
+
+
+def _around(
+    maps: Mapping[MapId, HybridMap], islands: Iterable[frozenset[MapId]], constraints: ManualConstraints
+) -> dict[MapId, HybridMap]:
+    """Maps of the islands with links by hand or with anchors of retired areas: no others bear on these."""
+    ends = {
+        which
+        for constraint in constraints.in_force
+        if isinstance(constraint.about, Linked | RetiredArea)
+        for which in constraint.about.maps
+    }
+    return {one: maps[one] for island in islands if island & ends for one in sorted(island)}
 
 
 def _touched_by(before: ManualConstraints, now: ManualConstraints) -> set[MapId]:

@@ -121,7 +121,7 @@ def test_links_by_hand_and_retired_nodes_hold_in_whatever_order_all_comes(exact:
     for _ in range(60):
         life.step()
         if life.rng.random() < 0.4:
-            life.correct()
+            life.correct(areas=exact > 0)
         if life.rng.random() < 0.4:
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
             life.touched, fresh = set(), life.rebuilt()
