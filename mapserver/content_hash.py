@@ -9,6 +9,7 @@ lines are sorted, each ends with a line feed, and the hash is the SHA-256 of thi
     constraint   MessagePack [its number from 0, the constraint]: a later one may undo an earlier one
     superseded   MessagePack [node, the node that replaces it]
     faded        MessagePack [node, the flags of its landmarks]
+    retired      MessagePack [node, the number of the constraint that retires it]
 
 What follows from these is left out: poses and probabilities, which are computed again whenever a file is
 read, and words for people (title, reasons, history).
@@ -53,6 +54,8 @@ def _items(content: MapFile) -> Iterator[tuple[str, bytes]]:
         yield "superseded", _packed([node, fate.by])
     for node, flags in content.faded.items():
         yield "faded", _packed([node, flags])
+    for node, number in content.retired.items():
+        yield "retired", _packed([node, number])
 
 
 def _packed(item: list[Any]) -> bytes:

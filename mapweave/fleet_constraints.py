@@ -75,7 +75,7 @@ class FleetConstraints:
         Args:
             which: one map, `r0.1`, or nodes, `r0.1.17`; none with an area.
             area: where all nodes are retired, of all maps.
-            begin: of one map alone nodes from then on: ns since 1970, or `2026-03-01T12:00` (UTC).
+            begin: of one map alone nodes from then on: ns since 1970, or `2026-03-01 12:00` (UTC).
             end: and until then.
             because: why.
             check: only say what it would do.
@@ -90,7 +90,7 @@ class FleetConstraints:
             if begin or end:
                 if not isinstance(about, RetiredMap):
                     raise InvalidValue("a time window is of one map")
-                about = read_window(about.map, begin, end)
+                about = read_window(about.map, begin, end, time.time_ns())
         return self.constrain(about, True, because, check=check)
 
     def undo(self, what: int | ManualConstraint, because: str = "", *, check: bool = False) -> str:

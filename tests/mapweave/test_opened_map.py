@@ -269,7 +269,7 @@ WHOLE = MapFile(
     (RefusedPair(NODES[1], NODES[5], "too far"), RefusedPair(NODES[2], NODES[5], "too far")),
     (SAID, replace(SAID, holds=False, stamp_ns=6)),
     {NODES[1]: Superseded(NODES[2], 12, 0.1, 0.2), NODES[3]: Superseded(NODES[4], 12, 0.1, 0.2)},
-    {}, (EVENT,),
+    {}, (EVENT,), retired={NODES[6]: 0, NODES[7]: 0},
 )  # fmt: skip
 
 
@@ -293,6 +293,7 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
     other = replace(
         WHOLE, title="renamed", changes=changes, poses={}, history=(), refused=WHOLE.refused[::-1],
         superseded=dict(reversed(list(WHOLE.superseded.items()))),
+        retired=dict(reversed(list(WHOLE.retired.items()))),
     )  # fmt: skip
     expected = content_hash(WHOLE)
     assert content_hash(other) == expected == content_hash(unpack_map_file(pack_map_file(other)))
@@ -307,6 +308,7 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
         replace(WHOLE, refused=WHOLE.refused[:1]),
         replace(WHOLE, constraints=WHOLE.constraints[::-1]),
         replace(WHOLE, superseded={}),
+        replace(WHOLE, retired={NODES[6]: 0, NODES[7]: 1}),
         replace(WHOLE, faded={NODES[0]: np.zeros(len(CONTENTS[0].node.landmarks), bool)}),  # type: ignore[union-attr]
     ],
 )
