@@ -289,11 +289,6 @@ class MapServer:
         """The merged map as a map file."""
         return self._services.map_file()
 
-    def _events(self) -> tuple[MapEvent, ...]:
-        """What has become of the maps, those of the base included."""
-        events = dict.fromkeys((*self._base.history, *self._history.events))
-        return tuple(sorted(events, key=lambda event: event.stamp_ns))
-
     def _answers(self) -> Answers:
         """The newest ones, with routes by what is closed now."""
         answers = self._worker.current()
@@ -302,6 +297,11 @@ class MapServer:
 
     def _named_places(self) -> Places:
         return Places(self._answers().router, self._annotations.annotations)
+
+    def _events(self) -> tuple[MapEvent, ...]:
+        """What has become of the maps, those of the base included."""
+        events = dict.fromkeys((*self._base.history, *self._history.events))
+        return tuple(sorted(events, key=lambda event: event.stamp_ns))
 
     def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))
