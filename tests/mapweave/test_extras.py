@@ -87,6 +87,7 @@ CASES: list[tuple[str, str, str]] = [
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said
     ("map show", "{own} --out {tmp}/own.png", VIZ),
+    ("map diff", "{own} {own}", SERVER),
     ("map fetch", "{tmp}/none/map.mapweave --connect {closed}", "there is no folder"),
     ("map explain", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map explain", "r0.1.1 r1.1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
