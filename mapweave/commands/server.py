@@ -88,8 +88,13 @@ def run(arguments: argparse.Namespace) -> int:
         how = ServerSettings(settings.admission_control, settings.merge)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
-            demo = stack.enter_context(TemporaryDirectory()) if arguments.demo else None
-            path = Path(demo or arguments.data or DATA) / f"{name}.sqlite"
+            data = arguments.data or DATA
+            if arguments.demo:
+                from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
+
+                data = Path(stack.enter_context(TemporaryDirectory()))
+                prepare(data, data / f"{name}.sqlite")
+            path = data / f"{name}.sqlite"
             if path.exists() and path.stat().st_size > LARGE:
                 print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
             server = MapServer(bus, keys, path, name, how, schedule)
@@ -99,10 +104,8 @@ def run(arguments: argparse.Namespace) -> int:
             if address is not None:
                 stack.enter_context(Web(address, server, commands=arguments.http_commands))
                 print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
-            if demo is not None:
-                from mapweave.recorded_fleet.fleet import RecordedFleet
-
-                stack.enter_context(RecordedFleet(bus, keys, name, Path(demo)))
+            if arguments.demo:
+                stack.enter_context(RecordedFleet(bus, keys, name, data))
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):

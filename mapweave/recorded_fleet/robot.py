@@ -17,7 +17,7 @@ from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.agent_status import Status
-from mapweave.hybridmap.change import ChangeBody, NodePut
+from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
@@ -55,25 +55,24 @@ class RecordedRobot:
         keys: Keys,
         server: str,
         map_id: MapId,
-        changes: Sequence[ChangeBody],
-        folder: Path,
-        known: int,
+        known: Sequence[ChangeBody],
+        later: Sequence[ChangeBody],
+        journal: Path,
     ) -> None:
-        """Put the first part of the map into a journal; the rest follows as the robot gets there.
+        """Go on from a journal, and map what is left when the robot gets there.
 
         Args:
             bus: the connection; stays the caller's.
             keys: of the fleet.
             server: that gets the map.
             map_id: the robot and its map.
-            changes: its whole map, in the order in which it was made.
-            folder: for the journal.
-            known: nodes that are known at the beginning, at least one.
+            known: the part of the map that the journal has, at least one node.
+            later: the rest, in the order in which it was made.
+            journal: its file.
         """
-        self._name, self._map, self._later = map_id.agent, HybridMap(), list(changes)
+        self._name, self._map, self._later = map_id.agent, HybridMap(known), list(later)
         self._began = time.monotonic()
-        self._journal = Journal(folder / f"{self._name}.sqlite", self._name)
-        self._journal.open_map(map_id.epoch)
+        self._journal = Journal(journal, self._name)
         self._replicator = Replicator(bus, keys, self._journal, map_id, servers=(server,))
         self._control = MissionControl(self._name)
         self._control.unknown_goal = self._unknown
@@ -81,8 +80,6 @@ class RecordedRobot:
             bus, keys, map_id, self._control, server=server,
             unsent=self._replicator.unacknowledged, placed=lambda: len(self._map.nodes),
         )  # fmt: skip
-        for _ in range(known):
-            self._discover()
         first = next(iter(self._map.nodes.values()))
         self._motion = _Motion(first.map_from_robot.mean, [])
         self._mission: Mission = Explore()
@@ -115,8 +112,7 @@ class RecordedRobot:
         """Map the next node; None if there is none left."""
         if not self._later:
             return None
-        end = next((k for k in range(1, len(self._later)) if isinstance(self._later[k], NodePut)), None)
-        some, self._later = self._later[:end], [] if end is None else self._later[end:]
+        some, self._later = self._later[:2], self._later[2:]
         for change in some:
             self._map.apply(change)
         self._replicator.submit(some, time.time_ns())

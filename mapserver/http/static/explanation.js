@@ -144,6 +144,8 @@ function showRoute(route) {
 
 export const explanation = { commands: false, shown: () => {} };
 
+let asked = 0;
+
 // Ask, show, and put the question into the address.
 export async function explain({ a = "", b = "", route = false }, keep = true) {
   byId("a").value = a; byId("b").value = b;
@@ -153,7 +155,9 @@ export async function explain({ a = "", b = "", route = false }, keep = true) {
   if (keep) history.pushState(null, "", "why" + (a || b ? "?" + address : ""));
   document.title = a || b ? `${a} ${route ? "to" : "and"} ${b} - Mapweave` : "Mapweave";
   result.textContent = "Asking ...";
+  const number = ++asked;
   const answer = await ask((route ? "route" : "explain") + (a || b ? "?" + query : ""));
+  if (number !== asked) return;
   result.textContent = "";
   if (answer.error) add(result, "section", answer.error, "box failed");
   else if (answer.hops) showRoute(answer);
@@ -163,9 +167,9 @@ export async function explain({ a = "", b = "", route = false }, keep = true) {
   explanation.shown(answer);
 }
 export function explainAddress() {
-  const asked = new URLSearchParams(location.search);
-  const [a, b] = ["a", "b"].map(name => (asked.get(name) || "").trim());
-  return explain({ a, b, route: Boolean(asked.get("route")) }, false);
+  const query = new URLSearchParams(location.search);
+  const [a, b] = ["a", "b"].map(name => (query.get(name) || "").trim());
+  return explain({ a, b, route: Boolean(query.get("route")) }, false);
 }
 byId("form").addEventListener("submit", event => {
   event.preventDefault();

@@ -173,6 +173,8 @@ watch({
     byId("summary").textContent = server.summary + (server.settled === false ? ", still merging" : "");
     listRobots(robots, name => selectRobot(name));
     updateRobot(robots);
+    // Lists are shown once they are filled, so that nothing jumps.
+    byId("fleet").classList.remove("waiting");
     painter.ask();
   },
   events({ history }) {

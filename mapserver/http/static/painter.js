@@ -10,6 +10,8 @@ const QUICK = 12;         // ms: a bitmap that takes no longer is drawn at once
 const NAMED = 38;         // px a metre, from which on nodes have names
 const SIGMAS = 2;         // of the ellipse about a robot
 
+const words = robot => robot.name + (robot.doing ? `: ${robot.doing}` : "");
+
 export class Painter {
   constructor(canvas, model, viewport) {
     Object.assign(this, { canvas, model, viewport, robots: [], overlays: [], selected: -1, link: -1, robot: "" });
@@ -155,7 +157,9 @@ export class Painter {
       if (taken.some(t => t[0] < box[2] && t[2] > box[0] && t[1] < box[3] && t[3] > box[1])) return false;
       return taken.push(box);
     };
-    c.font = "12px system-ui, sans-serif"; c.textBaseline = "alphabetic";
+    c.textBaseline = "alphabetic";
+    for (const robot of this.robots) free(...Object.values(this.label(c, robot)));
+    c.font = "12px system-ui, sans-serif";
     if (m.components.length > 1) {
       m.components.forEach(({ anchor }, k) => {
         const box = m.boxes[k], [dx, dy] = m.offset(k);
@@ -174,6 +178,12 @@ export class Painter {
       if (taken.length < 400 && free(u + 9, w - 4, 6.2 * text.length)) c.fillText(text, u + 9, w - 4);
     }
   }
+  label(c, robot) {
+    const { viewport: v } = this, [u, w] = v.toScreen(robot.x, robot.y);
+    c.font = "600 12px system-ui, sans-serif";
+    const wide = c.measureText(words(robot)).width, beyond = u + 14 + wide > v.width && u < v.width;
+    return { left: beyond ? u - 14 - wide : u + 14, base: w - 10, wide };
+  }
   drawRobot(c, robot) {
     const { viewport: v } = this, colour = robot.alive ? colours.robot : colours.soft;
     const [u, w] = v.toScreen(robot.x, robot.y);
@@ -190,11 +200,9 @@ export class Painter {
     c.fillStyle = colour; c.fill();
     c.strokeStyle = robot.name === this.robot ? colours.select : colours.ground; c.lineWidth = 2; c.stroke();
     c.restore();
-    c.font = "600 12px system-ui, sans-serif";
-    const text = robot.name + (robot.doing ? `: ${robot.doing}` : "");
-    const wide = c.measureText(text).width, left = u + 14 + wide > v.width && u < v.width ? u - 14 - wide : u + 14;
-    c.lineWidth = 3; c.strokeStyle = colours.ground; c.strokeText(text, left, w - 10);
-    c.fillStyle = colour; c.fillText(text, left, w - 10);
+    const { left, base } = this.label(c, robot);
+    c.lineWidth = 3; c.strokeStyle = colours.ground; c.strokeText(words(robot), left, base);
+    c.fillStyle = colour; c.fillText(words(robot), left, base);
   }
   // A ruler of a round length.
   rule(c) {
