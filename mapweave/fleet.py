@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
+from mapweave.fleet_constraints import SOON, FleetConstraints
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import (
@@ -30,15 +31,13 @@ from mapweave.hybridmap.mission_order import (
 from mapweave.hybridmap.node import NodeId, check_name
 from mapweave.identities.key_file import read_key_file
 from mapweave.storage.map_file import MapFile, unpack_map_file
-from mapweave.wire.bus import Bus, Reply, Sample
+from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-SOON = 2.0
-"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
 PACKING = 120.0
 """How long a server may take to pack a large map, s."""
 TRIES = 3
@@ -66,7 +65,7 @@ def login() -> str:
         return "a person"
 
 
-class Fleet:
+class Fleet(FleetConstraints):
     """A connection to a fleet. A context manager; its methods may be called from any thread."""
 
     def __init__(
@@ -281,9 +280,6 @@ class Fleet:
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0
-
-    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
-        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
 
 
 def _node(goal: str) -> NodeId | None:

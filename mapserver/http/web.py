@@ -11,8 +11,10 @@
     GET /robots       what every robot is doing, JSON
     GET /missions     the missions that are known, JSON
     GET /map          the merged map, a map file
+    GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
+    POST /constraints links, unmerges, retires, or takes back, JSON in and out; see constraint_request.py
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
 An error comes back as one JSON object with `error`. A busy server answers 503 with
@@ -25,11 +27,12 @@ import asyncio
 import ipaddress
 import logging
 import math
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import Future
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -40,16 +43,18 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from mapweave.hybridmap.constraint_subject import EXAMPLE, read_ends
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
-from mapweave.hybridmap.explanation import Explanation
-from mapweave.hybridmap.manual_constraint import EXAMPLE, read_ends
+from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
-from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
+from mapweave.hybridmap.mission_order import MissionKind, Missions
 from mapweave.hybridmap.node import NodeId
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.hybridmap.query import ExplainRequest
+from mapweave.mapserver.http.answering import Answering
+from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
-from mapweave.mapserver.http.json_values import json_values
-from mapweave.mapserver.http.live import Live, Shown
+from mapweave.mapserver.http.json_values import constraint_values, json_values
+from mapweave.mapserver.http.live import Live
 from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
@@ -67,34 +72,19 @@ MOST_AT_ONCE = 32
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
-METHODS = dict.fromkeys(
-    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/nodes/NODE"),
-    "GET",
-) | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+METHODS = (
+    dict.fromkeys(
+        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/nodes/NODE"),
+        "GET",
+    )
+    | {"/constraints": "GET or POST"}
+    | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+)
 BY = "http"
 """Gives a mission, if the request does not say."""
 
 
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
-
-
-class Answering(Shown, Protocol):
-    """The questions, as of a MapServer or a map file: from any thread; a MapweaveError refuses one."""
-
-    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
-        """Where a view was taken."""
-
-    def explain(self, request: ExplainRequest) -> Future[Explanation]:
-        """Explain a merge or a route."""
-
-    def missions(self) -> Missions:
-        """The missions that are known."""
-
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
-        """Give a robot a mission; waits for its answer."""
-
-    def map_file(self) -> Future[bytes]:
-        """The merged map as a map file."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -128,7 +118,7 @@ class Web(HttpThread):
             server: answers.
             patience: time limit for a body, and for an answer, s.
             limits: of connections.
-            commands: whether other machines may move robots, too.
+            commands: whether other machines may move robots and correct the map, too.
 
         Raises:
             NotConnected: the port cannot be used, for example since it is taken.
@@ -208,6 +198,7 @@ class Questions:
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
+            Route("/constraints", self._answering(self._constraints), methods=["GET", "POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such})
@@ -290,16 +281,31 @@ class Questions:
 
         return await run_in_threadpool(stop)
 
+    async def _constraints(self, request: Request) -> Mapping[str, Any]:
+        if request.method != "POST":
+            return await run_in_threadpool(
+                lambda: constraint_values(ManualConstraints(self._server.constraints().made))
+            )
+        self._check_commands(request)
+        body = await self._body(request, "JSON")
+
+        def constrain() -> Mapping[str, Any]:
+            record = self._server.constraints().made
+            return {"said": self._server.constrain(read_request(body, BY, time.time_ns(), record))}
+
+        return await run_in_threadpool(constrain)
+
     def _may_command(self, host: str) -> bool:
         return self._commands or is_loopback(host)
 
     def _check_commands(self, request: Request) -> None:
-        """There is no password: unless it is set otherwise, robots are moved from this machine alone."""
+        """There is no password: robots are moved and maps corrected from this machine, unless it is set."""
         host = "" if request.client is None else request.client.host
         if not self._may_command(host):
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
-                "robots take missions from this machine alone: start the server with --http-commands",
+                "missions and corrections are taken from this machine alone: start the server with "
+                "--http-commands",
             )
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
@@ -326,9 +332,9 @@ class Questions:
         async with asyncio.timeout(self._patience):
             return await asyncio.wrap_future(await run_in_threadpool(ask))
 
-    async def _body(self, request: Request) -> bytes:
+    async def _body(self, request: Request, what: str = "a JPEG or PNG image") -> bytes:
         """All of it, in the time that a body may take; refused before it is sent if it is too long."""
-        length = _length(request)
+        length = _length(request, what)
         body = bytearray()
         async with asyncio.timeout(self._patience):
             async for piece in request.stream():
@@ -339,14 +345,14 @@ class Questions:
         return bytes(body)
 
 
-def _length(request: Request) -> int:
+def _length(request: Request, what: str) -> int:
     text = request.headers.get("Content-Length", "")
     if "Transfer-Encoding" in request.headers or not (text.isascii() and text.isdigit()):
-        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the image with Content-Length")
+        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the body with Content-Length")
     if len(text) > 12 or int(text) > MOST_BYTES:
         raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES >> 20} MiB are taken")
     if int(text) == 0:
-        raise InvalidValue("send a JPEG or PNG image as the body")
+        raise InvalidValue(f"send {what} as the body")
     return int(text)
 
 
