@@ -122,6 +122,16 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
             eventually(lambda: ": linked: " in page.run(TEXT.format("result")))
             assert page.run("return document.querySelectorAll('#result svg .agree').length") >= 10
             assert page.run("return mapweave.painter.link") >= 0
+            # It is undone, and taken back.
+            a, b = page.run("return ['a', 'b'].map(name => document.getElementById(name).value)")
+            standing = f"explain?a={a}&b={b}"
+            page.run("document.querySelector('#result form input').value = 'two kitchens'")
+            page.run("document.querySelector('#result form').requestSubmit()")
+            eventually(lambda: "two kitchens" in page.run(TEXT.format("corrections")))
+            eventually(lambda: get(http, standing).get("standing") == "undone")
+            page.run("document.querySelector('#corrections button').click()")
+            eventually(lambda: get(http, standing).get("standing") == "linked")
+            assert not any(one["in_force"] for one in get(http, "constraints")["constraints"])
             assert page.run("return window.shift") < 0.02, page.run("return window.shifted")
         eventually(lambda: "no server" in page.run(TEXT.format("connection")))
         with demo(http, zenoh):

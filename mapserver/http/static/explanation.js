@@ -1,5 +1,6 @@
 // Why two nodes or maps are one, or are not, and why a route leads as it does: GET /explain and GET /route.
-import { add, ask, button, byId, degrees, draw, metres, percent } from "./dom.js";
+import { add, ask, byId, degrees, draw, metres, percent } from "./dom.js";
+import { correct } from "./corrections.js";
 
 const BAD_PX = 10;
 const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
@@ -65,8 +66,7 @@ function showPair(pair) {
     `${metres(pair.misfit.off)}, ${deviations(pair.misfit.strain2)}` +
     (pair.misfit.alone ? "; nothing else connects them." : "."));
   if (pair.other_links.length) showOthers(box, pair.other_links);
-  for (const words of pair.claims) add(box, "p", words);
-  showConstraints(box, pair.constraints);
+  for (const words of [...pair.claims, ...pair.constraints.map(one => one.words)]) add(box, "p", words);
   if (pair.standing === "linked") offerUndo(box, pair.a.id, pair.b.id);
 }
 function showOthers(box, links) {
@@ -82,17 +82,6 @@ function showOthers(box, links) {
     item.append(`: ${w.agrees ? "agrees" : "contradicts"}, ${deviations(w.distance2)}, ${w.kept ? "stands" : "refused"}`);
   }
 }
-// Constraints in the server's own words where it gives them.
-function showConstraints(box, constraints) {
-  for (const one of constraints) add(box, "p", one.words || constraintWords(one));
-}
-function constraintWords(r) {
-  const time = new Date(r.stamp_ns / 1e6).toISOString().slice(0, 16).replace("T", " ");
-  const ends = [...new Set((r.ends || []).map(String))].join(" and ");
-  const what = (r.ends || [])[0] === (r.ends || [])[1] ? (r.apart ? "is retired" : "is in use again")
-    : r.apart ? "shall not be linked" : "may be linked again";
-  return `${time} UTC ${r.who || "a person"} decided: ${ends} ${what}` + (r.because ? `: \u201c${r.because}\u201d` : "");
-}
 function offerUndo(box, a, b) {
   if (!explanation.commands) return;
   const line = add(box, "form", "", "actions"), why = add(line, "input");
@@ -100,12 +89,8 @@ function offerUndo(box, a, b) {
   add(line, "button", "Undo this link");
   line.addEventListener("submit", async event => {
     event.preventDefault();
-    const body = JSON.stringify({ unmerge: [a, b], because: why.value, by: "page" });
-    const headers = { "Content-Type": "application/json" };
-    const answer = await ask("constraints", { method: "POST", body, headers });
-    const words = answer.status === 404 || answer.status === 405
-      ? `This server takes no corrections here: mapweave map unmerge ${a} ${b}` : answer.error || answer.said;
-    add(box, "p", words, answer.error ? "bad" : "good").setAttribute("role", "status");
+    const answer = await correct({ unmerge: [a, b], because: why.value });
+    add(box, "p", answer.error || answer.said, answer.error ? "bad" : "good").setAttribute("role", "status");
   });
 }
 function showTwo(one) {
@@ -121,7 +106,7 @@ function showTwo(one) {
     const lacks = n.lacks.split("; ").filter(words => !one.reason.includes(words));
     item.append(": " + [`${n.matches} match, ${n.inliers} agree`, ...lacks].join("; "));
   }
-  showConstraints(box, one.constraints);
+  for (const { words } of one.constraints) add(box, "p", words);
 }
 function showHops(box, hops) {
   const list = add(box, "ol");

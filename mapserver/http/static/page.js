@@ -2,6 +2,7 @@
 import { add, button, byId, draw } from "./dom.js";
 import { colours, edgeColour, followTheme, hue } from "./colours.js";
 import { drawAnnotations, loadAnnotations, nodeOf, placeNamed } from "./annotations.js";
+import { listCorrections } from "./corrections.js";
 import { explain, explainAddress, explanation } from "./explanation.js";
 import { forget, showNode } from "./node_panel.js";
 import { leaveRobot, listRobots, poseOf, showRobot, updateRobot } from "./robot_panel.js";
@@ -181,6 +182,7 @@ watch({
     addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name));
     if (page.heard) byId("announcement").textContent = history.at(-1)?.words || "";
     page.heard = true;
+    listCorrections(page.commands);
   },
 }, up => {
   byId("connection").className = up ? "" : "lost";
