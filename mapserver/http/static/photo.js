@@ -32,7 +32,9 @@ function whyNot(similar, show) {
   for (const place of similar) {
     const item = add(list, "li");
     button(item, place.node, () => show(place.node));
-    item.append(` ${place.lacks}. ${place.matches} landmarks match, ${place.inliers} agree on one pose; ${place.needed} are needed.`);
+    const counts = place.lacks.includes("are needed") ? ""
+      : ` ${place.matches} landmarks match, ${place.inliers} agree on one pose; ${place.needed} are needed.`;
+    item.append(` ${place.lacks}.${counts}`);
     if (place.turn !== null && Math.abs(place.turn) > 0.12) item.append(` Turn by ${side(place.turn)} and try again.`);
     else if (place.turn !== null) item.append(" Go a step aside and try again.");
   }

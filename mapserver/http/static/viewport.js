@@ -1,6 +1,7 @@
 // Which part of the plane is shown: metres to pixels and back.
 const LEAST = 0.05, MOST = 2000; // pixels a metre
 const MARGIN = 36;               // px around what is fitted
+const TOOLS = 44;                // px at the right, where the buttons are
 
 export class Viewport {
   constructor() { this.x = this.y = 0; this.scale = 30; this.width = this.height = 1; this.touched = false; }
@@ -16,9 +17,9 @@ export class Viewport {
   fit(bounds, most = 120) {
     if (!bounds) return;
     const wide = Math.max(bounds[2] - bounds[0], 1), high = Math.max(bounds[3] - bounds[1], 1);
-    const across = (this.width - 2 * MARGIN) / wide, down = (this.height - 2 * MARGIN) / high;
+    const across = (this.width - 2 * MARGIN - TOOLS) / wide, down = (this.height - 2 * MARGIN) / high;
     this.scale = Math.min(most, MOST, Math.max(LEAST, Math.min(across, down)));
-    this.x = (bounds[0] + bounds[2]) / 2; this.y = (bounds[1] + bounds[3]) / 2;
+    this.x = (bounds[0] + bounds[2] + TOOLS / this.scale) / 2; this.y = (bounds[1] + bounds[3]) / 2;
   }
   show(x, y, least = 40) {
     this.x = x; this.y = y; this.scale = Math.max(this.scale, least); this.touched = true;

@@ -64,13 +64,13 @@ def test_a_picture_is_answered_on_the_page(page: Browser, services: StubServices
 
 
 def test_an_unknown_place_is_explained(page: Browser, services: StubServices, image: Path) -> None:
-    near = SimilarPlace(NodeId("r0", 1, 3), 14, 9, 10, "9 landmarks agree on a pose; 10 are needed", 0.6)
+    near = SimilarPlace(NodeId("r0", 1, 3), 14, 9, 10, "only 31% of the matches agree on one pose", 0.6)
     services.answer = RelocalizeAnswer(Certainty.UNKNOWN, (), "not recognised", (near,))
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "unknown")
     words = page.run(RESULT)
     assert (
-        "unknown: not recognised" in words and "r0.1.3 9 landmarks agree on a pose; 10 are needed." in words
+        "unknown: not recognised" in words and "r0.1.3 only 31% of the matches agree on one pose." in words
     )
     assert "14 landmarks match, 9 agree on one pose; 10 are needed." in words
     assert "Turn by 34° to the left and try again." in words
