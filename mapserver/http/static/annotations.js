@@ -27,9 +27,9 @@ export async function loadAnnotations(select) {
 }
 export function drawAnnotations(c, viewport, model) {
   for (const { name, body } of annotations) {
-    const colour = body.kind === "closure" ? colours.bad : body.kind === "preference" ? colours.good : colours.accent;
+    const colour = { closure: colours.bad, preference: colours.good }[body.kind] || colours.accent;
     c.strokeStyle = c.fillStyle = colour; c.lineWidth = 2;
-    const at = id => { const row = id === undefined ? undefined : model.rowOf(id); return row === undefined ? null : row; };
+    const at = id => model.rowOf(id) ?? null;
     let label = null;
     if (body.area) {
       const anchor = at(body.area.anchor);
@@ -37,7 +37,7 @@ export function drawAnnotations(c, viewport, model) {
       const corners = body.area.corners.map(([x, y]) => viewport.toScreen(...model.inNode(anchor, x, y)));
       c.beginPath(); corners.forEach(([u, v], k) => k ? c.lineTo(u, v) : c.moveTo(u, v)); c.closePath();
       c.globalAlpha = 0.15; c.fill(); c.globalAlpha = 1; c.stroke();
-      label = [corners.reduce((sum, p) => sum + p[0], 0) / corners.length, corners.reduce((sum, p) => sum + p[1], 0) / corners.length];
+      label = [0, 1].map(k => corners.reduce((sum, corner) => sum + corner[k], 0) / corners.length);
     } else if (body.edge) {
       const [a, b] = body.edge.map(at);
       if (a === null || b === null) continue;

@@ -18,4 +18,4 @@ export function hue(anchor) {
   if (!given.has(anchor)) given.set(anchor, given.size);
   return colours.hues[given.get(anchor) % colours.hues.length];
 }
-export const edgeColour = kind => ({ driven: colours.driven, loop: colours.loop, merged: colours.merged })[kind] || colours.own;
+export const edgeColour = kind => ["driven", "loop", "merged"].includes(kind) ? colours[kind] : colours.own;

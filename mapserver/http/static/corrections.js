@@ -5,7 +5,8 @@ const list = byId("corrections");
 
 export async function correct(request) {
   const headers = { "Content-Type": "application/json" };
-  const answer = await ask("constraints", { method: "POST", headers, body: JSON.stringify({ by: "page", ...request }) });
+  const body = JSON.stringify({ by: "page", ...request });
+  const answer = await ask("constraints", { method: "POST", headers, body });
   await listCorrections(true);
   return answer;
 }

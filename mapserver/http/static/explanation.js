@@ -113,12 +113,14 @@ function showHops(box, hops) {
   for (const hop of hops) {
     const item = add(list, "li");
     to(item, hop.a, hop.b, `${hop.a} - ${hop.b}`);
-    item.append(`: ${hop.distance.toFixed(2)} m, ${degrees(hop.turn)}, cost ${hop.cost.toFixed(2)}; ${hop.kind}: ${hop.words}`);
+    item.append(`: ${hop.distance.toFixed(2)} m, ${degrees(hop.turn)}, cost ${hop.cost.toFixed(2)}; ` +
+      `${hop.kind}: ${hop.words}`);
   }
 }
 function showRoute(route) {
   const box = add(result, "section", "", route.found ? "box good" : "box failed");
-  add(box, "p", `${route.start} to ${route.goal}: ${route.found ? "the route is" : "there is no way"}: ${route.reason}.`);
+  const outcome = route.found ? "the route is" : "there is no way";
+  add(box, "p", `${route.start} to ${route.goal}: ${outcome}: ${route.reason}.`);
   if (route.hops.length) showHops(box, route.hops);
   if (route.gaps.length) {
     add(box, "p", route.found ? "Not driven, and so not taken:" : "What is missing:");

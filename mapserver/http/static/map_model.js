@@ -104,7 +104,7 @@ export class MapModel {
   }
   offset(component) { return this.offsets.get(this.components[component]?.anchor) || [0, 0]; }
   name(row) { return `${this.maps[this.nodes.map[row]]}.${this.nodes.number[row]}`; }
-  rowOf(name) {
+  rowOf(name = "") {
     const at = name.lastIndexOf("."), map = this.numbers?.get(name.slice(0, at));
     return map === undefined ? undefined : this.rows.get(map * 2 ** 32 + Number(name.slice(at + 1)));
   }

@@ -30,7 +30,7 @@ export async function showNode(name, { select, why, send }) {
     ["map", node.map],
     ["in the merged map", node.merged_from_robot ? pose(node.merged_from_robot) : "nowhere"],
     ["in its own map", pose(node.map_from_robot)],
-    ["landmarks", `${node.landmarks}, ${node.with_depth} with a depth` + (node.faded.length ? `, ${node.faded.length} faded` : "")],
+    ["landmarks", `${node.landmarks}, ${node.with_depth} with a depth, ${node.faded.length} faded`],
     ["on the wire", `${node.bytes} bytes`],
     ["taken", node.stamp_ns > 1e18 ? when(node.stamp_ns) : `${(node.stamp_ns / 1e9).toFixed(1)} s`],
     ["superseded", fate ? `by ${fate.by}, ${fate.distance.toFixed(2)} m off, ${fate.found} landmarks found again` : "no"],

@@ -37,7 +37,10 @@ function selectNode(name, move = true) {
 function offerToSend(parent, name) {
   if (!page.commands) return;
   for (const { robot, alive } of page.robots)
-    if (alive) button(parent, `Send ${robot} here`, () => { selectRobot(robot, name); byId("goal").form.requestSubmit(); });
+    if (alive) button(parent, `Send ${robot} here`, () => {
+      selectRobot(robot, name);
+      byId("goal").form.requestSubmit();
+    });
 }
 function selectRobot(name, goal = page.node) {
   page.robot = painter.robot = name;
@@ -118,8 +121,9 @@ function drawLegend() {
     ["merged", "link between maps"], ["doubtful", "link below 90 %"]];
   for (const [kind, words] of kinds) {
     const item = add(list, "li"), svg = draw(item, "svg", { viewBox: "0 0 30 10", "aria-hidden": true });
-    draw(svg, "line", { x1: 0, y1: 5, x2: 30, y2: 5, "stroke-width": 2.5, stroke: edgeColour(kind === "doubtful" ? "merged" : kind),
-      "stroke-dasharray": kind === "doubtful" ? "5 4" : "none" });
+    const doubtful = kind === "doubtful", stroke = edgeColour(doubtful ? "merged" : kind);
+    draw(svg, "line", { x1: 0, y1: 5, x2: 30, y2: 5, "stroke-width": 2.5, stroke,
+      "stroke-dasharray": doubtful ? "5 4" : "none" });
     item.append(words);
   }
   const shapes = [["M2 5a4 4 0 1 0 8 0a4 4 0 1 0-8 0M6 5H20", colours.hues[0], "node, its heading"],

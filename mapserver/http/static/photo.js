@@ -1,5 +1,5 @@
 // Where a photo was taken, or why that is not known: POST /relocalize.
-import { add, ask, button, byId, percent, side } from "./dom.js";
+import { add, ask, button, byId, degrees, side } from "./dom.js";
 
 const LONGEST = 2048; // px; the server makes photos smaller anyway
 const result = byId("answer");
@@ -21,8 +21,8 @@ function table(candidates, show) {
     const [x, y, turn] = c.node_from_robot.mean, row = made.insertRow();
     const away = m => c.distance_known ? m.toFixed(2) + " m" : "not known";
     button(add(row, "td"), c.node, () => show(c.node));
-    for (const text of [away(x), away(y), (turn * 180 / Math.PI).toFixed(0) + "\u00b0", (100 * c.probability).toFixed(0) + " %"])
-      add(row, "td", text);
+    const probability = (100 * c.probability).toFixed(0) + " %";
+    for (const text of [away(x), away(y), degrees(turn), probability]) add(row, "td", text);
   }
 }
 function whyNot(similar, show) {

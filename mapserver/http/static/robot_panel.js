@@ -1,5 +1,5 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
-import { add, ask, button, byId, facts, percent, seconds } from "./dom.js";
+import { add, ask, button, byId, degrees, facts, percent, seconds } from "./dom.js";
 
 const QUIET = 5; // s without a status
 let panel = null;
@@ -21,8 +21,8 @@ const life = robot => !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["sil
 function missionWords(mission) {
   if (!mission) return "";
   const { order, state, progress, reason } = mission, goal = order.goal || order.node || "";
-  return `${order.kind}${goal ? " to " + goal : ""}, ${state}` + (state === "running" && progress ? ` ${percent(progress)}` : "") +
-    (reason ? `: ${reason}` : "") + ` (by ${order.by})`;
+  const share = state === "running" && progress ? ` ${percent(progress)}` : "", why = reason ? `: ${reason}` : "";
+  return `${order.kind}${goal ? " to " + goal : ""}, ${state}${share}${why} (by ${order.by})`;
 }
 export function listRobots(robots, select) {
   const list = byId("robots"), focus = document.activeElement?.dataset?.robot;
@@ -72,14 +72,14 @@ export function updateRobot(robots) {
   panel.facts.textContent = "";
   if (!robot) { add(panel.facts, "p", "It is not known to the server any more.", "warn"); return; }
   const status = robot.status, [word, kind] = life(robot), pose = robot.merged_from_robot;
-  const sigma = status?.status.covariance, spread = sigma && sigma[0] + sigma[2] > 0
-    ? ` (sigma ${Math.sqrt(sigma[0]).toFixed(3)}, ${Math.sqrt(sigma[2]).toFixed(3)} m, ${(Math.sqrt(sigma[3]) * 180 / Math.PI).toFixed(1)}\u00b0)` : "";
+  const [xx = 0, , yy = 0, hh = 0] = (status?.status.covariance || []).map(Math.sqrt);
+  const spread = xx + yy > 0 ? ` (sigma ${xx.toFixed(3)}, ${yy.toFixed(3)} m, ${degrees(hh)})` : "";
   facts(panel.facts, [
     ["state", word, kind],
     ["last heard", `${seconds(robot.age)} ago`],
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
-    ["on the map", pose ? `${pose[0].toFixed(2)}, ${pose[1].toFixed(2)} m, ${(pose[2] * 180 / Math.PI).toFixed(0)}\u00b0${spread}` : "not known"],
+    ["on the map", pose ? `${pose[0].toFixed(2)}, ${pose[1].toFixed(2)} m, ${degrees(pose[2])}${spread}` : "not known"],
     ["nodes", status && `${status.status.nodes}, ${status.placed} placed by the server`],
     ["not yet on the server", status && `${status.unsent} changes`],
     ["images skipped", status && status.skipped],

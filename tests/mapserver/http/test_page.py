@@ -69,9 +69,7 @@ def test_an_unknown_place_is_explained(page: Browser, services: StubServices, im
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "unknown")
     words = page.run(RESULT)
-    assert (
-        "unknown: not recognised" in words and "r0.1.3 only 31% of the matches agree on one pose." in words
-    )
+    assert "unknown: not recognised" in words and "r0.1.3 only 31% of the matches agree on one pose." in words
     assert "14 landmarks match, 9 agree on one pose; 10 are needed." in words
     assert "Turn by 34° to the left and try again." in words
     page.run("document.querySelector('#answer li button').click()")
