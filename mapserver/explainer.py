@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
     Explanation,
@@ -94,6 +95,7 @@ class Explainer:
         settings: MergeSettings,
         wary: Callable[[], Collection[tuple[NodeId, NodeId]]],
         events: Callable[[], Iterable[MapEvent]],
+        annotations: Callable[[], Annotations] = Annotations,
     ) -> None:
         """Begin to answer.
 
@@ -109,6 +111,7 @@ class Explainer:
             settings: of the merge.
             wary: pairs of nodes between which robots of late did not get through.
             events: what has become of the maps.
+            annotations: the record.
         """
         self._answers = answers
         self._admission = admission
@@ -118,6 +121,7 @@ class Explainer:
         self._settings = settings
         self._wary = wary
         self._events = events
+        self._annotations = annotations
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
@@ -162,8 +166,8 @@ class Explainer:
         return _still(explanation, settled)
 
     def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps and the manual constraints, in order."""
-        return with_constraints(self._events(), self._record.constraints)
+        """The history of the maps, the manual constraints and the annotations, in order."""
+        return with_constraints(self._events(), self._record.constraints, self._annotations())
 
     def constraints(self) -> ConstraintList:
         """The record of manual constraints, in order."""
