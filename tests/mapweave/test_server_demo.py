@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 import pytest
 
@@ -64,6 +64,12 @@ def get(http: int, path: str) -> dict:
         return {}
 
 
+def post(http: int, path: str, content: dict) -> dict:
+    request = Request(f"http://127.0.0.1:{http}/{path}", json.dumps(content).encode())
+    with urlopen(request, timeout=10) as reply:
+        return json.load(reply)
+
+
 def test_the_recording_is_small_and_whole() -> None:
     assert RECORDING.stat().st_size < 200_000
     maps = recorded_maps()
@@ -112,6 +118,13 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
                 ".find(one => one.textContent === 'Stop').click()"
             )
             eventually(lambda: "stop, done" in page.run(TEXT.format("selected")))
+            # A place with a name is found by it.
+            place = {"name": "kitchen", "body": {"kind": "place", "node": "ada.1.15"}}
+            post(http, "annotations", place)
+            eventually(lambda: "kitchen place" in page.run(TEXT.format("places")))
+            page.run("document.getElementById('query').value = 'kitchen'")
+            page.run("document.getElementById('search').requestSubmit()")
+            eventually(lambda: "Node ada.1.15" in page.run(TEXT.format("selected")))
             # A link between two maps shows what both views share.
             page.run(
                 "const m = mapweave.model, link = m.links[0];"

@@ -17,7 +17,7 @@ import { watch } from "./live.js";
 
 const PICK = 14;              // px about what is pressed
 const MOST_NAMES = 500;       // in the list that helps searching
-const ANNOTATIONS_EVERY = 30000;
+const ANNOTATIONS_EVERY = 10000;
 
 const model = new MapModel(), viewport = new Viewport(), painter = new Painter(byId("canvas"), model, viewport);
 const page = { robots: [], commands: false, node: "", robot: "", photo: [], places: [], readOnly: false };
