@@ -10,7 +10,6 @@ from typing import TypeVar
 
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
-    MAX_MAPS_LISTED,
     Explanation,
     FleetExplanation,
     MapsExplanation,
@@ -24,11 +23,9 @@ from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.constraint_history import said_of, with_constraints
+from mapweave.mapserver.explanations import explained
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.services import guarded
-from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
-from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.manual_constraints import check_manual_constraint
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.wire.bus import Bus, Closing, Request
@@ -38,7 +35,7 @@ from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
 
-AnyExplanation = TypeVar("AnyExplanation", PairExplanation, MapsExplanation, RouteExplanation)
+AnyExplanation = TypeVar("AnyExplanation", bound=PairExplanation | MapsExplanation | RouteExplanation)
 
 
 class ConstraintRecord:
@@ -142,19 +139,10 @@ class Explainer:
         """
         # Asked first: later changes may be missing in the answers.
         settled = self._settled()
-        answers = self._answers()
-        merged = answers.merged
-        if request.ends is None:
-            maps = explain_fleet(merged, MAX_MAPS_LISTED)
-            return FleetExplanation(tuple(_still(pair, settled) for pair in maps))
-        first, second = request.ends
-        if isinstance(first, NodeId) and isinstance(second, NodeId):
-            if request.route:
-                explanation = explain_route(answers.router, first, second, request.blocked, self._wary())
-                return _still(explanation, settled)
-            return _still(explain_nodes(merged, first, second, None, self._consistency), settled)
-        two = explain_maps(merged, MapId(*first[:2]), MapId(*second[:2]))
-        return FleetExplanation((_still(two, settled),))
+        explanation = explained(request, self._answers().router, self._consistency, self._wary())
+        if isinstance(explanation, FleetExplanation):
+            return FleetExplanation(tuple(_still(pair, settled) for pair in explanation.maps))
+        return _still(explanation, settled)
 
     def history(self) -> tuple[MapEvent, ...]:
         """The history of the maps and the manual constraints, in order."""

@@ -1,22 +1,32 @@
-"""A running fleet, from Python: who is doing what, missions, the merged map.
+"""A running fleet, from Python: its merged map, who is doing what, missions, events.
 
-with mapweave.Fleet() as fleet:
+with mapweave.connect("tcp/127.0.0.1:7447") as fleet:
     for robot in fleet.status().robots:
         print(robot.robot, robot.status.status.doing)
     fleet.go("r0", "r1.1.5", wait=120.0)
+    fleet.plot()
 """
 
 from __future__ import annotations
 
 import getpass
+import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from types import TracebackType
 
+from mapweave.fleet_events import FleetEvent, FleetEvents
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.explanation import (
+    Explanation,
+    FleetExplanation,
+    PairExplanation,
+    RouteExplanation,
+)
+from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import (
     MissionKind,
     MissionOrder,
@@ -27,19 +37,39 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
-from mapweave.storage.map_file import MapFile, unpack_map_file
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.map import Map
+from mapweave.map_reading import MapReading
+from mapweave.storage.map_file import unpack_map_file
 from mapweave.wire.bus import Bus, Reply, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
-from mapweave.wire.messages import decode, encode
+from mapweave.wire.messages import decode, encode, encode_view
+from mapweave.wire.patience import ask_patiently
 from mapweave.wire.zenoh_bus import ZenohBus
 
 SOON = 2.0
 """s; a router that is there is found sooner, and a robot that is there answers sooner."""
 PACKING = 120.0
 """How long a server may take to pack a large map, s."""
+THINKING = 20.0
+"""How long a server may take to find out where a view was taken, or to explain, s."""
 TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
+
+
+def connect(endpoint: str | Sequence[str] = "tcp/127.0.0.1:7447", fleet: str = "demo", by: str = "") -> Fleet:
+    """Connect to a running fleet.
+
+    Args:
+        endpoint: Zenoh endpoint of the router, or several, of which the first in reach is taken.
+        fleet: its name.
+        by: gives the missions; the login name by default.
+
+    Raises:
+        NotConnected: there is no router.
+    """
+    return Fleet(endpoint, fleet, by)
 
 
 def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0) -> MissionReport:
@@ -63,8 +93,12 @@ def login() -> str:
         return "a person"
 
 
-class Fleet:
-    """A connection to a fleet. A context manager; its methods may be called from any thread."""
+class Fleet(Map):
+    """A connection to a fleet, and its merged map. A context manager; it may be used from any thread.
+
+    The merged map is fetched when it is first looked at, and again by `refresh`. Whereabouts, routes and
+    explanations are the map server's, so they are of its newest map and need no extra here.
+    """
 
     def __init__(
         self,
@@ -96,6 +130,13 @@ class Fleet:
                     f"no router at {', '.join(endpoints)}: start `mapweave server`, or give --connect"
                 )
         self._bus = bus
+        self._lock = threading.Lock()
+        self._fetched: MapReading | None = None
+        self._closed = False
+
+    def __repr__(self) -> str:
+        """For example `<Fleet demo>`; asks nothing."""
+        return f"<Fleet {self._keys.fleet}>"
 
     def __enter__(self) -> Fleet:
         """Nothing more to do."""
@@ -109,6 +150,7 @@ class Fleet:
 
     def close(self) -> None:
         """Disconnect. Idempotent."""
+        self._closed = True
         if self._own is not None:
             self._own.close()
 
@@ -131,10 +173,7 @@ class Fleet:
         Raises:
             NotConnected: no map server answers.
         """
-        replies = self._ask(self._keys.any_missions(), b"", SOON)
-        if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
-        reports = decode(replies[0].payload, Missions).reports
+        reports = decode(self._question(self._keys.any_missions(), b"", SOON), Missions).reports
         return tuple(report for report in reports if robot in ("", report.order.robot))
 
     def go(self, robot: str, goal: str, wait: float = 0.0) -> MissionReport:
@@ -219,15 +258,66 @@ class Fleet:
         Raises:
             NotConnected: no map server answers.
         """
-        replies = self._ask(self._keys.any_server_map(), b"", PACKING)
-        if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
-        unpack_map_file(replies[0].payload)
-        return replies[0].payload
+        packed = self._packed()
+        unpack_map_file(packed)  # what is damaged is not handed on
+        return packed
 
-    def map(self) -> MapFile:
-        """The merged map; see `map_bytes`."""
-        return unpack_map_file(self.map_bytes())
+    def refresh(self) -> None:
+        """Fetch the merged map again: from now on it is what `nodes`, `graph`, `plot` and `export` show.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        fetched = MapReading(unpack_map_file(self._packed()))
+        with self._lock:
+            self._fetched = fetched
+
+    def history(self) -> tuple[MapEvent, ...]:
+        """What has become of the maps, oldest first: joined, parted, kept apart and why, with dates.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._question(self._keys.any_history(), b"", SOON), History).history
+
+    def events(self, seconds: float = math.inf) -> Iterator[FleetEvent]:
+        """What happens from now on: robots' statuses, events of the maps, and another merged map.
+
+        Of a robot whose statuses come quicker than they are read, the newest is given.
+
+        Args:
+            seconds: how long; without end if not given.
+        """
+        # From here on, not from when the first is read.
+        return self._events(FleetEvents(self._bus, self._keys, self.history), time.monotonic() + seconds)
+
+    def _events(self, events: FleetEvents, end: float) -> Iterator[FleetEvent]:
+        try:
+            yield from events.until(end, lambda: self._closed)
+        finally:
+            events.close()
+
+    @property
+    def _reading(self) -> MapReading:
+        if self._fetched is None:
+            self.refresh()
+        assert self._fetched is not None, "it was fetched"
+        return self._fetched
+
+    def _packed(self) -> bytes:
+        return self._question(self._keys.any_server_map(), b"", PACKING)
+
+    def _answer(self, view: View) -> RelocalizeAnswer:
+        payload = self._question(self._keys.any_relocalize(), encode_view(view), THINKING)
+        return decode(payload, RelocalizeAnswer)
+
+    def _explained(self, request: ExplainRequest) -> Explanation:
+        payload = self._question(self._keys.any_explain(), encode(request), THINKING)
+        if request.route:
+            return decode(payload, RouteExplanation)
+        if request.ends is not None and isinstance(request.ends[0], NodeId):
+            return decode(payload, PairExplanation)
+        return decode(payload, FleetExplanation)
 
     def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
         """By way of the map server; without one directly."""
@@ -266,6 +356,22 @@ class Fleet:
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0
+
+    def _question(self, key: str, payload: bytes, timeout: float) -> bytes:
+        """The answer of a map server; one that is busy is asked again at its time.
+
+        Raises:
+            NotConnected: no map server answers, or all stay busy.
+            InvalidValue: it refuses the question.
+        """
+        replies = ask_patiently(self._bus, key, payload, timeout)
+        for reply in replies:
+            if not reply.error:
+                return reply.payload
+        if not replies:
+            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+        reason = f"the map server refused: {replies[0].error}"
+        raise NotConnected(reason) if replies[0].retry_after else InvalidValue(reason)
 
     def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
         return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]

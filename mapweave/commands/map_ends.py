@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Callable
 
 from mapweave.commands.network import connect, network_of, settings_of
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.manual_constraint import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.wire.bus import Bus, Reply
+from mapweave.wire.bus import Reply
 from mapweave.wire.keys import Keys
+from mapweave.wire.patience import ask_patiently
 
 
 def ends_of(words: list[str]) -> Ends:
@@ -24,17 +24,6 @@ def ends_of(words: list[str]) -> Ends:
     if len(words) != 2:
         raise InvalidValue(f"give two nodes or two maps, not {len(words)}: {EXAMPLE}")
     return read_ends(words[0], words[1])
-
-
-def _patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Reply]:
-    """Ask, and ask busy servers again at their time, until the patience is over."""
-    end = time.monotonic() + timeout
-    while True:
-        replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
-        pause = max((reply.retry_after for reply in replies), default=0.0)
-        if pause <= 0.0 or time.monotonic() + pause > end:
-            return replies
-        time.sleep(pause)
 
 
 def map_of(word: str) -> MapId:
@@ -83,7 +72,7 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
             raise NotConnected(
                 f"no router at {where}: start `mapweave server`, give --connect, or --map FILE"
             )
-        replies = _patiently(bus, key_of(keys), payload, arguments.timeout)
+        replies = ask_patiently(bus, key_of(keys), payload, arguments.timeout)
     finally:
         bus.close()
     if not replies:

@@ -113,6 +113,23 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     figure = Figure(figsize=(WIDTH, _height(picture)), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
+    draw_on(axes, picture)
+    if axes.get_legend_handles_labels()[0]:
+        # Below the plan, wherever that ends: the layout makes room for it.
+        figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = io.BytesIO()
+    figure.savefig(image, format="png")
+    write_whole(path, image.getvalue())
+
+
+def draw_on(axes: Any, picture: MapPicture) -> None:
+    """Draw into a picture of one's own.
+
+    Args:
+        axes: of matplotlib.
+        picture: what to draw.
+    """
     _draw_outline(axes, picture.outline)
     if len(picture.landmarks):
         axes.plot(*picture.landmarks.T, ".", color="#999999", markersize=1.2, zorder=1, alpha=0.6)
@@ -126,13 +143,6 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     axes.set_title(picture.title)
-    if axes.get_legend_handles_labels()[0]:
-        # Below the plan, wherever that ends: the layout makes room for it.
-        figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image = io.BytesIO()
-    figure.savefig(image, format="png")
-    write_whole(path, image.getvalue())
 
 
 def _height(picture: MapPicture) -> float:
