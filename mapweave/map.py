@@ -101,7 +101,7 @@ class Map(ABC):
             raise InvalidValue(f"the map has no pose of node {node}")
         return found[1]
 
-    def graph(self) -> nx.MultiGraph:
+    def graph(self) -> nx.MultiGraph[str]:
         """Nodes and edges as a networkx graph; see `mapweave.formats.graph` for their attributes.
 
         Among others, nodes have `x`, `y`, `heading` and `component`, edges `kind`, `length` and, for links

@@ -18,7 +18,7 @@ def graph_of(
     placed: Mapping[NodeId, tuple[int, Pose2]],
     edges: Iterable[Edge],
     numbers: Callable[[Edge], Numbers],
-) -> nx.MultiGraph:
+) -> nx.MultiGraph[str]:
     """The graph of a map; its values are text and numbers alone, as GraphML takes them.
 
     Nodes are named as people write them (`r0.1.17`), keys of edges likewise. A node has `map`, `component`,
@@ -31,7 +31,7 @@ def graph_of(
         edges: among the nodes.
         numbers: more numbers of an edge.
     """
-    graph: nx.MultiGraph = nx.MultiGraph()
+    graph: nx.MultiGraph[str] = nx.MultiGraph()
     for node_id in sorted(nodes.keys() & placed.keys()):
         node, (component, pose) = nodes[node_id], placed[node_id]
         x, y, heading = (float(value) for value in pose.vector)
