@@ -151,6 +151,7 @@ class Map(ABC):
         points = np.concatenate([np.zeros((0, 2)), *seen])
         edges = list(reading.graph.edges.values())
         draw_on(axes, MapPicture(self.content.title, poses, edges, landmarks=points))
+        axes.legend(loc="best", fontsize="small")
         return axes
 
     def relocalize(
