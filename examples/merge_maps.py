@@ -18,7 +18,7 @@ for pair in office.explain_maps():
     print(f"{pair.first} and {pair.second}: {'one map' if pair.joined else 'apart'}: {pair.reason}")
 for a, b, link in office.graph().edges(data=True):
     if link["kind"] == "merged":
-        print(f"{a} and {b} show the same: {link['inliers']:.0f} landmarks agree, p = {link['probability']:.3f}")
+        print(f"{a} and {b}: {link['inliers']:.0f} landmarks agree, p = {link['probability']:.3f}")
 
 first, *_, last = office.nodes.ids
 route = office.route(first, last)

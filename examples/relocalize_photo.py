@@ -20,7 +20,7 @@ else:
         seen, robot = simulation.observe("visitor"), simulation.describe("visitor")
     assert seen.image is not None
     answer = mapweave.open(drive("r0")).relocalize(seen.image, robot.camera)
-    print(f"it was really taken at {beside.x:+.3f} {beside.y:+.3f} m, {math.degrees(beside.heading):+.1f} deg")
+    print(f"really at {beside.x:+.3f} {beside.y:+.3f} m, {math.degrees(beside.heading):+.1f} deg")
 
 print(f"{answer.certainty}: {answer.reason}")
 for place in answer.candidates:

@@ -18,19 +18,19 @@ picture = Path("out/examples/fleet.png")
 
 with mapweave.connect(endpoint) as fleet:
     for robot in fleet.status().robots:
-        print(f"{robot.robot} is {'there' if robot.alive else 'gone'}, at {robot.merged_from_robot}", flush=True)
+        print(f"{robot.robot} is {'there' if robot.alive else 'gone'}, at {robot.merged_from_robot}")
     for event in fleet.events(seconds):
         match event:
             case mapweave.AgentStatus():
-                print(f"{event.robot}: {event.status.doing} {event.status.detail}", flush=True)
+                print(f"{event.robot}: {event.status.doing} {event.status.detail}")
             case mapweave.MapEvent():
-                print(f"{event.kind}: {event.words}", flush=True)
+                print(f"{event.kind}: {event.words}")
             case mapweave.MapChanged():
-                print(f"map: {event.summary}", flush=True)
+                print(f"map: {event.summary}")
                 fleet.refresh()
                 if len(fleet.nodes):
                     picture.parent.mkdir(parents=True, exist_ok=True)
                     axes = fleet.plot()
                     axes.figure.savefig(picture)
                     axes.figure.clear()
-                    print(f"{picture}: {len(fleet.nodes)} nodes", flush=True)
+                    print(f"{picture}: {len(fleet.nodes)} nodes")
