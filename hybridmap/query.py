@@ -11,6 +11,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import (
     MAX_NUMBER,
@@ -21,7 +22,6 @@ from mapweave.hybridmap.limits import (
     Probability,
     Words,
 )
-from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 

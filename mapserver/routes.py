@@ -103,7 +103,7 @@ class Router:
         """Why no route can exist, in words; empty if there may be one."""
         for name, node in (("start", start), ("goal", goal)):
             if node not in self.merged.poses:
-                retired = self.merged.constraints.retired.get(node.map)
+                retired = self.merged.constraints.retires(node)
                 apart = self.merged.set_apart.get(node.map)
                 why = f": {reason_of(retired)}" if retired is not None else ""
                 why = why or (f": map {node.map} is set apart, {apart}" if apart is not None else "")

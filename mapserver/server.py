@@ -16,6 +16,7 @@ from types import TracebackType
 
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
@@ -124,7 +125,7 @@ class MapServer:
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,
-            worker.constrain, lambda: worker.settled, self._settings.merge.consistency,
+            worker.constrain, lambda: worker.settled, self._settings.merge,
             lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
         )  # fmt: skip
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
@@ -203,6 +204,18 @@ class MapServer:
     def history(self) -> tuple[MapEvent, ...]:
         """The history of the maps and the manual constraints, in order."""
         return self._explainer.history()
+
+    def constraints(self) -> ConstraintList:
+        """The record of manual constraints, in order."""
+        return self._explainer.constraints()
+
+    def constrain(self, request: ConstraintRequest) -> str:
+        """Keep a manual constraint, or only check it, from any thread; says what it does in words.
+
+        Raises:
+            InvalidValue: it has no effect, or contradicts the map.
+        """
+        return self._explainer.constrain(request)
 
     def command(self, request: MissionRequest) -> MissionReport:
         """Hand a mission on to its robot, from any thread; waits for the robot's answer.

@@ -10,24 +10,18 @@ with mapweave.connect("tcp/127.0.0.1:7447") as fleet:
 from __future__ import annotations
 
 import getpass
-import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-from mapweave.fleet_events import FleetEvent, FleetEvents
+from mapweave.fleet_constraints import FleetConstraints
+from mapweave.fleet_map import FleetMap
+from mapweave.fleet_questions import SOON
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
-from mapweave.hybridmap.explanation import (
-    Explanation,
-    FleetExplanation,
-    PairExplanation,
-    RouteExplanation,
-)
-from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import (
     MissionKind,
     MissionOrder,
@@ -38,25 +32,14 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.identities.key_file import read_key_file
-from mapweave.map import Map
-from mapweave.map_reading import MapReading
-from mapweave.storage.map_file import unpack_map_file
-from mapweave.wire.bus import Bus, Reply, Sample
+from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
-from mapweave.wire.messages import decode, encode, encode_view
-from mapweave.wire.patience import ask_patiently
+from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-SOON = 2.0
-"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
-PACKING = 120.0
-"""How long a server may take to pack a large map, s."""
-THINKING = 20.0
-"""How long a server may take to find out where a view was taken, or to explain, s."""
 TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
 
@@ -96,7 +79,7 @@ def login() -> str:
         return "a person"
 
 
-class Fleet(Map):
+class Fleet(FleetMap, FleetConstraints):
     """A connection to a fleet, and its merged map. A context manager; it may be used from any thread.
 
     The merged map is fetched when it is first looked at, and again by `refresh`. Whereabouts, routes and
@@ -123,7 +106,7 @@ class Fleet(Map):
         Raises:
             NotConnected: there is no router.
         """
-        self._keys = Keys(check_name(fleet))
+        checked = Keys(check_name(fleet))
         self._by = (by or login())[:64]
         self._own: ZenohBus | None = None
         self._role: Role | None = None
@@ -137,14 +120,7 @@ class Fleet(Map):
                 raise NotConnected(
                     f"no router at {', '.join(endpoints)}: start `mapweave server`, or give --connect"
                 )
-        self._bus = bus
-        self._lock = threading.Lock()
-        self._fetched: MapReading | None = None
-        self._closed = False
-
-    def __repr__(self) -> str:
-        """For example `<Fleet demo>`; asks nothing."""
-        return f"<Fleet {self._keys.fleet}>"
+        super().__init__(bus, checked)
 
     def __enter__(self) -> Fleet:
         """Nothing more to do."""
@@ -261,73 +237,6 @@ class Fleet(Map):
             listening.close()
         return last[0]
 
-    def map_bytes(self) -> bytes:
-        """The merged map as the bytes of a map file.
-
-        Raises:
-            NotConnected: no map server answers.
-        """
-        packed = self._packed()
-        unpack_map_file(packed)  # what is damaged is not handed on
-        return packed
-
-    def refresh(self) -> None:
-        """Fetch the merged map again: from now on it is what `nodes`, `graph`, `plot` and `export` show.
-
-        Raises:
-            NotConnected: no map server answers.
-        """
-        fetched = MapReading(unpack_map_file(self._packed()))
-        with self._lock:
-            self._fetched = fetched
-
-    def history(self) -> tuple[MapEvent, ...]:
-        """What has become of the maps, oldest first: joined, parted, kept apart and why, with dates.
-
-        Raises:
-            NotConnected: no map server answers.
-        """
-        return decode(self._question(self._keys.any_history(), b"", SOON), History).history
-
-    def events(self, seconds: float = math.inf) -> Iterator[FleetEvent]:
-        """What happens from now on: robots' statuses, events of the maps, and another merged map.
-
-        Of a robot whose statuses come quicker than they are read, the newest is given.
-
-        Args:
-            seconds: how long; without end if not given.
-        """
-        # From here on, not from when the first is read.
-        return self._events(FleetEvents(self._bus, self._keys, self.history), time.monotonic() + seconds)
-
-    def _events(self, events: FleetEvents, end: float) -> Iterator[FleetEvent]:
-        try:
-            yield from events.until(end, lambda: self._closed)
-        finally:
-            events.close()
-
-    @property
-    def _reading(self) -> MapReading:
-        if self._fetched is None:
-            self.refresh()
-        assert self._fetched is not None, "it was fetched"
-        return self._fetched
-
-    def _packed(self) -> bytes:
-        return self._question(self._keys.any_server_map(), b"", PACKING)
-
-    def _answer(self, view: View) -> RelocalizeAnswer:
-        payload = self._question(self._keys.any_relocalize(), encode_view(view), THINKING)
-        return decode(payload, RelocalizeAnswer)
-
-    def _explained(self, request: ExplainRequest) -> Explanation:
-        payload = self._question(self._keys.any_explain(), encode(request), THINKING)
-        if request.route:
-            return decode(payload, RouteExplanation)
-        if request.ends is not None and isinstance(request.ends[0], NodeId):
-            return decode(payload, PairExplanation)
-        return decode(payload, FleetExplanation)
-
     def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
         """By way of the map server; without one directly."""
         check_name(robot)
@@ -371,25 +280,6 @@ class Fleet(Map):
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0
-
-    def _question(self, key: str, payload: bytes, timeout: float) -> bytes:
-        """The answer of a map server; one that is busy is asked again at its time.
-
-        Raises:
-            NotConnected: no map server answers, or all stay busy.
-            InvalidValue: it refuses the question.
-        """
-        replies = ask_patiently(self._bus, key, payload, timeout)
-        for reply in replies:
-            if not reply.error:
-                return reply.payload
-        if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
-        reason = f"the map server refused: {replies[0].error}"
-        raise NotConnected(reason) if replies[0].retry_after else InvalidValue(reason)
-
-    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
-        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
 
 
 def _node(goal: str) -> NodeId | None:

@@ -82,6 +82,9 @@ class Database:
                 raise self._damaged(str(error)) from None
             advice = self._advice if code == sqlite3.SQLITE_NOTADB else ""
             raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error}){advice}") from None
+        except UnicodeDecodeError:
+            # SQLite quotes a damaged schema in its error, which then is no text.
+            raise self._damaged("its schema is no text") from None
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:

@@ -9,8 +9,8 @@
     mapweave/1/<fleet>/agent/<agent>/drive            question: a person's velocity command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
-    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain and
-                                                      history
+    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain,
+                                                      constraints and history
     mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
@@ -208,6 +208,14 @@ class Keys:
     def any_constrain(self) -> str:
         """Pattern: every server of the fleet."""
         return f"{self.root}/server/*/constrain"
+
+    def constraints(self, server: str) -> str:
+        """The record of manual constraints of a server."""
+        return self._of_server("constraints", server)
+
+    def any_constraints(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/constraints"
 
     def history(self, server: str) -> str:
         """The history of the maps, from a server."""

@@ -9,8 +9,10 @@
     GET /robots       what every robot is doing, JSON
     GET /missions     the missions that are known, JSON
     GET /map          the merged map, a map file
+    GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
+    POST /constraints links, unmerges, retires, or takes back, JSON in and out; see constraint_request.py
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
 An error comes back as one JSON object with `error`. A busy server answers 503 with
@@ -23,11 +25,12 @@ import asyncio
 import ipaddress
 import logging
 import math
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import Future
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -38,18 +41,18 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.constraint_subject import EXAMPLE, read_ends
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
-from mapweave.hybridmap.explanation import Explanation
-from mapweave.hybridmap.manual_constraint import EXAMPLE, read_ends
-from mapweave.hybridmap.map_event import History, MapEvent
-from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.map_event import History
+from mapweave.hybridmap.mission_order import MissionKind, Missions
+from mapweave.hybridmap.query import ExplainRequest
+from mapweave.mapserver.http.answering import Answering
+from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
-from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
-from mapweave.wire.log_messages import Scalar
 
 log = logging.getLogger(__name__)
 
@@ -64,42 +67,18 @@ MOST_AT_ONCE = 32
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
-METHODS = dict.fromkeys(
-    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
-) | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+METHODS = (
+    dict.fromkeys(
+        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+    )
+    | {"/constraints": "GET or POST"}
+    | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+)
 BY = "http"
 """Gives a mission, if the request does not say."""
 
 
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
-
-
-class Answering(Protocol):
-    """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
-
-    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
-        """Where a view was taken."""
-
-    def explain(self, request: ExplainRequest) -> Future[Explanation]:
-        """Explain a merge or a route."""
-
-    def status(self) -> dict[str, Scalar]:
-        """What the server holds and does."""
-
-    def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps."""
-
-    def robots(self) -> FleetStatus:
-        """The robots, and where they are."""
-
-    def missions(self) -> Missions:
-        """The missions that are known."""
-
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
-        """Give a robot a mission; waits for its answer."""
-
-    def map_file(self) -> Future[bytes]:
-        """The merged map as a map file."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -133,7 +112,7 @@ class Web(HttpThread):
             server: answers.
             patience: time limit for a body, and for an answer, s.
             limits: of connections.
-            commands: whether other machines may move robots, too.
+            commands: whether other machines may move robots and correct the map, too.
 
         Raises:
             NotConnected: the port cannot be used, for example since it is taken.
@@ -211,6 +190,7 @@ class Questions:
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
+            Route("/constraints", self._answering(self._constraints), methods=["GET", "POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such})
@@ -289,13 +269,28 @@ class Questions:
 
         return await run_in_threadpool(stop)
 
+    async def _constraints(self, request: Request) -> Mapping[str, Any]:
+        if request.method != "POST":
+            return await run_in_threadpool(
+                lambda: constraint_values(ManualConstraints(self._server.constraints().made))
+            )
+        self._check_commands(request)
+        body = await self._body(request, "JSON")
+
+        def constrain() -> Mapping[str, Any]:
+            record = self._server.constraints().made
+            return {"said": self._server.constrain(read_request(body, BY, time.time_ns(), record))}
+
+        return await run_in_threadpool(constrain)
+
     def _check_commands(self, request: Request) -> None:
-        """There is no password: unless it is set otherwise, robots are moved from this machine alone."""
+        """There is no password: robots are moved and maps corrected from this machine, unless it is set."""
         host = "" if request.client is None else request.client.host
         if not self._commands and not is_loopback(host):
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
-                "robots take missions from this machine alone: start the server with --http-commands",
+                "missions and corrections are taken from this machine alone: start the server with "
+                "--http-commands",
             )
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
@@ -322,9 +317,9 @@ class Questions:
         async with asyncio.timeout(self._patience):
             return await asyncio.wrap_future(await run_in_threadpool(ask))
 
-    async def _body(self, request: Request) -> bytes:
+    async def _body(self, request: Request, what: str = "a JPEG or PNG image") -> bytes:
         """All of it, in the time that a body may take; refused before it is sent if it is too long."""
-        length = _length(request)
+        length = _length(request, what)
         body = bytearray()
         async with asyncio.timeout(self._patience):
             async for piece in request.stream():
@@ -335,14 +330,14 @@ class Questions:
         return bytes(body)
 
 
-def _length(request: Request) -> int:
+def _length(request: Request, what: str) -> int:
     text = request.headers.get("Content-Length", "")
     if "Transfer-Encoding" in request.headers or not (text.isascii() and text.isdigit()):
-        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the image with Content-Length")
+        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the body with Content-Length")
     if len(text) > 12 or int(text) > MOST_BYTES:
         raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES >> 20} MiB are taken")
     if int(text) == 0:
-        raise InvalidValue("send a JPEG or PNG image as the body")
+        raise InvalidValue(f"send {what} as the body")
     return int(text)
 
 

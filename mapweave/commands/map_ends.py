@@ -7,8 +7,8 @@ import sys
 from collections.abc import Callable
 
 from mapweave.commands.network import connect, network_of, settings_of
+from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
-from mapweave.hybridmap.manual_constraint import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.wire.bus import Reply
 from mapweave.wire.keys import Keys

@@ -39,8 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.commands.map_ends import ends_of
     from mapweave.explanation_text import maps_words, pair_words
     from mapweave.extras import need
+    from mapweave.hybridmap.constraint_subject import EXAMPLE
     from mapweave.hybridmap.errors import InvalidValue
-    from mapweave.hybridmap.manual_constraint import EXAMPLE
     from mapweave.hybridmap.node import MapId, NodeId
     from mapweave.mapserver.http.json_values import json_values
 
