@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mapweave.extras import need
 from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.constraint_subject import read_ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import (
     Explanation,
@@ -28,7 +29,6 @@ from mapweave.hybridmap.explanation import (
     PairExplanation,
     RouteExplanation,
 )
-from mapweave.hybridmap.manual_constraint import read_ends
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View

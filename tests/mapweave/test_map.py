@@ -19,7 +19,6 @@ from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.explanation import PairExplanation
-from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.server import MapServer
@@ -27,7 +26,6 @@ from mapweave.storage.map_file import unpack_map_file
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import encode
 from synthetic.world import room, take_map, take_view
 from tests.waiting import eventually
 
@@ -142,9 +140,7 @@ def test_a_fleet_tells_what_happens_and_its_map_is_fetched_again_on_request(runn
     status = next(event for event in events if isinstance(event, mapweave.AgentStatus))
     assert status.robot == "r0" and status.status.doing == "standing"
     # A person parts the two maps.
-    bus.ask(
-        KEYS.any_constrain(), encode(ManualConstraint((MAPS[0], MAPS[1]), True, "anna", 1, "twins")), 10.0
-    )
+    assert "twins" in fleet.unlink("r0.1", "r1.1", "twins")
     happened = []
     for event in events:
         happened.append(event)
