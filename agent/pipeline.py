@@ -444,6 +444,7 @@ class Pipeline:
         if not nodes and isinstance(self._mission, Explore | Carried):
             detail = f"no nodes yet: {detail or self._mapper.track_report}"
         fix = self._navigator.fix if self._navigator is not None else None
+        c = (self._mapper.map_from_robot if fix is None else fix.node_from_robot).covariance
         return Status(
             doing=doing,
             detail=detail,
@@ -461,4 +462,5 @@ class Pipeline:
             progress=progress,
             located=mapping and self._located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
+            covariance=(float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), float(c[2, 2])),
         )

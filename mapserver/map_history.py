@@ -13,7 +13,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -21,8 +21,6 @@ from mapweave.wire.messages import KeptHistory, decode, encode
 
 log = logging.getLogger(__name__)
 
-NAME = "history"
-"""In the store."""
 MOST = 500
 """Events that are kept: the newest."""
 MOST_APART = 2000
@@ -55,7 +53,7 @@ class MapHistory:
         self._lock = threading.Lock()
         self._kept = KeptHistory()
         self._links: Collection[Link] | None = None
-        record = None if store is None else store.result(NAME)
+        record = None if store is None else store.result(HISTORY)
         if record is not None:
             try:
                 self._kept = decode(record, KeptHistory)
@@ -139,7 +137,7 @@ class MapHistory:
         if self._store is None:
             return
         try:
-            self._store.put_result(NAME, encode(kept))
+            self._store.put_result(HISTORY, encode(kept))
         except (InvalidFile, InvalidValue) as error:
             log.warning("what has happened to the maps is not kept: %s", error)
 

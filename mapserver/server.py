@@ -35,6 +35,7 @@ from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -156,22 +157,22 @@ class MapServer:
         """Wait until everything that came before this call is merged; False if the time is over first."""
         return self._worker.settle(timeout)
 
+    @property
+    def read_only(self) -> bool:
+        """Whether nothing can be changed, as with a map file."""
+        return False
+
+    def merged(self) -> MergedMap:
+        """The newest merged map."""
+        return self._worker.current().merged
+
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
         merged = self._worker.answers.merged
-        loops = sum(link.within for link in merged.links)
         traffic = self._store.traffic()
         return {
-            "nodes": len(merged.poses),
-            "superseded": len(merged.superseded),
-            "maps": len(merged.maps),
-            "components": len(merged.components),
-            "links": len(merged.links) - loops,
-            "loops": loops,
-            "refused": sum(refusal.link is not None for refusal in merged.refused),
+            **merged.counts(),
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
-            "constraints": len(merged.constraints.in_force),
-            "set_apart": len(merged.set_apart),
             "event": self._ingest.failure or self._worker.event,
             "settled": self._worker.settled,
             "bytes": traffic.payload_bytes,

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from mapweave.map import FileMap as FileMap
     from mapweave.map import Map as Map
     from mapweave.map import open as open
-    from mapweave.mapserver.map_files import maps_of as maps_of
+    from mapweave.mapserver.own_maps import maps_of as maps_of
     from mapweave.mapserver.relocalization.relocalizer import Relocalizer as Relocalizer
     from mapweave.node_table import NodeTable as NodeTable
     from mapweave.offline_merge import merge_map_files as merge_map_files
@@ -81,7 +81,7 @@ else:
         "mapweave.hybridmap.pose": ("Pose2", "PoseGaussian"),
         "mapweave.hybridmap.query": ("Certainty", "RelocalizeAnswer", "View"),
         "mapweave.map": ("FileMap", "Map", "open"),
-        "mapweave.mapserver.map_files": ("maps_of",),
+        "mapweave.mapserver.own_maps": ("maps_of",),
         "mapweave.mapserver.relocalization.relocalizer": ("Relocalizer",),
         "mapweave.node_table": ("NodeTable",),
         "mapweave.offline_merge": ("merge_map_files",),

@@ -20,6 +20,7 @@ from mapweave.commands import (
     keys,
     map_file,
     missions,
+    open_map,
     record,
     relocalize,
     replay,
@@ -69,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
         demo, server, router, sim, agent, drive, status, missions, keys, robots, doctor, find_port,
-        find_cameras, calibrate, map_file, record, replay, info, relocalize, evaluate, settings,
+        find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)
     return top

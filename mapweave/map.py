@@ -10,6 +10,7 @@ office.plot()
 from __future__ import annotations
 
 import os
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
@@ -35,6 +36,7 @@ from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.map_reading import MapReading
 from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
+from mapweave.opened_map import MapSource, open_map
 from mapweave.storage.map_file import MapFile, write_map_file
 
 if TYPE_CHECKING:
@@ -74,7 +76,7 @@ class Map(ABC):
 
     @property
     def hash(self) -> str:
-        """SHA-256 of the content, in hexadecimal digits: two maps with the same are the same."""
+        """Content hash in hexadecimal digits, as `mapweave map show` prints it: the same map has the same."""
         return self._reading.hash
 
     @property
@@ -108,7 +110,7 @@ class Map(ABC):
         between maps, `probability`.
         """
         from mapweave.formats.graph import graph_of
-        from mapweave.mapserver.map_files import PROBABILITY
+        from mapweave.mapserver.own_maps import PROBABILITY
 
         reading = self._reading
         placed = {node: (component, pose.mean) for node, (component, pose) in reading.placed.items()}
@@ -291,14 +293,22 @@ class FileMap(Map):
 
 
 def open(path: str | os.PathLike[str]) -> FileMap:
-    """Open a map file. It is never changed.
+    """Open a map file, a server's store or an agent's journal. It is never changed.
+
+    Several maps of a store or journal are merged first. Of a damaged one what can be read is opened, with a
+    warning that says what is lost.
 
     Raises:
-        InvalidFile: it cannot be read, is damaged or no map file.
+        InvalidFile: it cannot be read, is damaged, in use, or none of these.
+        MissingExtra: several maps are merged with the extra "server".
     """
-    from mapweave.storage.map_file import read_map_file
-
-    return FileMap(read_map_file(Path(path)))
+    opened = open_map(Path(path))
+    for complaint in opened.complaints.values():
+        warnings.warn(complaint, stacklevel=2)
+    if opened.source is MapSource.FILE or len(opened.maps) < 2:
+        return FileMap(opened.content)
+    need("server")
+    return FileMap(opened.file(opened.merged()))
 
 
 def _node_id(node: NodeName) -> NodeId:

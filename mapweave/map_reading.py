@@ -11,9 +11,10 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.mapserver.content_hash import content_hash
 from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
-from mapweave.storage.map_file import MapFile, pack_map_file
+from mapweave.storage.map_file import MapFile
 
 if TYPE_CHECKING:
     from mapweave.mapserver.relocalization.relocalizer import Relocalizer
@@ -86,8 +87,8 @@ class MapReading:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 of the content, as a map file holds it, in hexadecimal digits."""
-        return pack_map_file(self.content)[-32:].hex()
+        """See mapweave.mapserver.content_hash."""
+        return content_hash(self.content)
 
     def node(self, node: NodeId) -> Node:
         """A node.

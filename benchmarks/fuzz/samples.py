@@ -17,6 +17,7 @@ from mapweave.agent.recordings.mcap_writer import McapWriter
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.ros_messages import making
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionRequest
@@ -85,7 +86,7 @@ class Samples:
             encode(RouteAnswer(legs, "the way")),
             encode(KnownRequest(self.map_id, 1.5, -2.5, 9.0)),
             encode(ExplainRequest((a.id, b.id))),
-            encode(ManualConstraint((a.id, b.id), True, "anna", 5, "two kitchens")),
+            encode(ManualConstraint(Apart((a.id, b.id)), True, "anna", 5, "two kitchens")),
             encode(MissionRequest("m1", "r0", MissionKind.GO, 10**18, "anna", "r0.1.3")),
             encode(MissionOrder.new("r0", MissionKind.GO, "anna", a.id, 0)),
             Mark(7, 2**63).encode(),

@@ -32,8 +32,8 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import camera_of, pose_of
 from mapweave.formats.g2o import read_g2o
+from mapweave.hybridmap.constraint_subject import read_end
 from mapweave.hybridmap.errors import InvalidMessage, MapweaveError
-from mapweave.hybridmap.manual_constraint import read_end
 from mapweave.identities.key_file import read_key_file
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.log.store import Store

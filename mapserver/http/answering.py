@@ -6,32 +6,21 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Protocol
 
-from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
-from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
-from mapweave.wire.log_messages import Scalar
+from mapweave.mapserver.http.live import Shown
 
 
-class Answering(Protocol):
-    """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
+class Answering(Shown, Protocol):
+    """The questions, as of a MapServer or a map file: from any thread; a MapweaveError refuses one."""
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         """Where a view was taken."""
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
         """Explain a merge or a route."""
-
-    def status(self) -> dict[str, Scalar]:
-        """What the server holds and does."""
-
-    def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps."""
-
-    def robots(self) -> FleetStatus:
-        """The robots, and where they are."""
 
     def missions(self) -> Missions:
         """The missions that are known."""

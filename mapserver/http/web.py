@@ -1,7 +1,9 @@
 """The map server for people: a photograph in, JSON out, explanations of merges and routes, and pages.
 
-    GET /             the page for photographs
-    GET /why          the page that explains why maps are one, or are not
+    GET /             the page: the merged map live, robots, and where a photograph was taken
+    GET /why          the same page, with an explanation: ?a=r0.1.17&b=r1.1.5
+    WebSocket /live   what the page draws, see live.py
+    GET /nodes/NODE   one node, JSON
     GET /status       what the server holds, JSON
     GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
@@ -37,7 +39,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
-from starlette.routing import Mount, Route
+from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -46,18 +48,21 @@ from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConn
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
 from mapweave.hybridmap.mission_order import MissionKind, Missions
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
+from mapweave.mapserver.http.live import Live
+from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
 
 log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).with_name("static")
-PAGES = {"/": "index.html", "/why": "why.html"}
+PAGES = ("/", "/why")
 MOST_BYTES = 16 * 2**20
 """Longest body, 16 MiB."""
 PATIENCE = 10.0
@@ -69,7 +74,8 @@ WHOLE = "mapweave.whole"
 MISSION = "/robots/ROBOT/go?goal=GOAL"
 METHODS = (
     dict.fromkeys(
-        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/nodes/NODE"),
+        "GET",
     )
     | {"/constraints": "GET or POST"}
     | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
@@ -183,9 +189,11 @@ class Questions:
         answering: dict[str, Answer] = {
             "/status": self._status, "/history": self._history, "/explain": self._explain,
             "/route": self._explain, "/robots": self._robots, "/missions": self._missions, "/map": self._map,
+            "/nodes/{node}": self._node,
         }  # fmt: skip
         routes = [
-            *(Route(path, _page(name)) for path, name in PAGES.items()),
+            *(Route(path, _page("index.html")) for path in PAGES),
+            WebSocketRoute("/live", Live(server, self._may_command).serve),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
@@ -240,6 +248,10 @@ class Questions:
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
 
+    async def _node(self, request: Request) -> Mapping[str, Any]:
+        node = NodeId.parse(request.path_params["node"])
+        return await run_in_threadpool(lambda: json_values(node_details(self._server.merged(), node)))
+
     async def _map(self, _: Request) -> Response:
         data = await self._result(self._server.map_file)
         headers = {"Content-Disposition": 'attachment; filename="merged.mapweave"'}
@@ -283,10 +295,13 @@ class Questions:
 
         return await run_in_threadpool(constrain)
 
+    def _may_command(self, host: str) -> bool:
+        return self._commands or is_loopback(host)
+
     def _check_commands(self, request: Request) -> None:
         """There is no password: robots are moved and maps corrected from this machine, unless it is set."""
         host = "" if request.client is None else request.client.host
-        if not self._commands and not is_loopback(host):
+        if not self._may_command(host):
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
                 "missions and corrections are taken from this machine alone: start the server with "

@@ -106,16 +106,24 @@ def _settled(arguments: argparse.Namespace) -> None:
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.commands.map_merge import merged_with_progress
     from mapweave.commands.network import settings_of
+    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
     from mapweave.mapserver.map_files import map_file_of, merged_of
     from mapweave.mapserver.map_history import between
     from mapweave.merge.constraint_checks import check_manual_constraint
     from mapweave.offline_merge import parts_of
+    from mapweave.opened_map import MapSource, source_of
     from mapweave.storage.atomic_file import check_place
     from mapweave.storage.map_file import read_map_file, write_map_file
 
     check_place(arguments.out or arguments.map)
     settings = settings_of(arguments).merge
+    source = source_of(arguments.map)
+    if source is not MapSource.FILE:
+        raise InvalidFile(
+            f"{arguments.map}: is a {source} and is not changed; make a map file of it with "
+            f"`mapweave map merge {arguments.map} -o FILE`, or ask the running server without --map"
+        )
     content = read_map_file(arguments.map, "merged")
     before = merged_of(content, settings)
     earlier = ManualConstraints(content.constraints)

@@ -30,8 +30,9 @@ from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSett
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.map_files import map_file_of, maps_of, merged_of
+from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.own_maps import maps_of
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings

@@ -73,6 +73,7 @@ CASES: list[tuple[str, str, str]] = [
     ("eval relocalize", "{recording}", SERVER),
     ("eval replay", "{recording} --out {tmp}/replay", "frames"),
     ("eval merge", "{recording}", 'needs the extras "server" and "viz"'),
+    ("open", "{own}", SERVER),
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said
     ("map show", "{own} --out {tmp}/own.png", VIZ),

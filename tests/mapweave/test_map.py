@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -81,6 +82,8 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
     fleet = running.fleet
     fleet.save(tmp_path / "both.mapweave")
     file = mapweave.open(tmp_path / "both.mapweave")
+    shutil.copy(tmp_path / "s.sqlite", tmp_path / "copy.sqlite")
+    assert set(mapweave.open(tmp_path / "copy.sqlite").nodes.ids) == set(file.nodes.ids), "merged on opening"
     assert file.hash == fleet.hash and len(file.hash) == 64
     assert repr(file) == f"<FileMap: {file.content.title}>" and repr(fleet) == "<Fleet fleet>"
     for table in (file.nodes, fleet.nodes):

@@ -297,6 +297,9 @@ def test_a_whole_store_is_extracted_whole(
     for one, changes in maps.items():
         content = read_map_file(fleet.folder / "out" / f"{one}.mapweave")
         assert sorted(map(encode_body, content.changes)) == changes
-    for path, words in ((fleet.folder / "nothing", "no such file"), (Path(__file__), "cannot be read")):
+    for path, words in (
+        (fleet.folder / "nothing", "no such file"),
+        (Path(__file__), "is neither a map file"),
+    ):
         assert main(["map", "extract", str(path), "-o", str(fleet.folder / "out")]) == 1
         assert words in capfd.readouterr().err
