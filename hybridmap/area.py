@@ -1,4 +1,4 @@
-"""Areas: polygons in the frame of a node, so that they move with the map when it is merged anew."""
+"""Areas: polygons in the frame of a node, so that they move with the map when it is merged again."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def write_store(path: Path, maps: dict[MapId, list[ChangeBody]]) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A store, a journal and map files, with names that say nothing; nobody may write there."""
+    """A store, a journal and map files, with names that say nothing; no file can be written there."""
     made = tmp_path_factory.mktemp("maps")
     write_store(made / "store", LOGS)
     journal = Journal(made / "journal", "r0")
