@@ -22,7 +22,7 @@ IDLE = 0.5
 
 @dataclass(frozen=True)
 class MapChanged:
-    """The merged map is another than before, or the first that is told of; `Fleet.refresh` fetches it.
+    """The merged map has changed; also comes once at the beginning. `Fleet.refresh` fetches the map.
 
     Attributes:
         summary: of the map, in one line.
@@ -38,7 +38,7 @@ FleetEvent = AgentStatus | MapEvent | MapChanged
 
 
 class FleetEvents:
-    """Listens until it is closed; what nobody reads in time is replaced by what is newer."""
+    """Listens until it is closed; what is not read in time is replaced by what is newer."""
 
     def __init__(self, bus: Bus, keys: Keys, history: Callable[[], tuple[MapEvent, ...]]) -> None:
         """Begin to listen.

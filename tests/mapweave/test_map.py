@@ -42,7 +42,7 @@ class Running:
 
     Attributes:
         fleet: as a person sees it.
-        bus: of somebody else.
+        bus: of another participant.
         places: where each node really is, in the room.
         nodes: as the robots made them.
     """
@@ -122,8 +122,8 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
         assert isinstance(pair, PairExplanation) and pair.standing == "linked" and pair.evidence
         (maps,) = asked.explain_maps()
         assert maps.joined and asked.explain_maps("r0.1", "r1.1") == (maps,)
-        for wrong in (["r0.1.1", "r9.1.1"], ["r0.1.1", "nobody"]):
-            with pytest.raises(InvalidValue, match=r"r9\.1|nobody"):
+        for wrong in (["r0.1.1", "r9.1.1"], ["r0.1.1", "nothing"]):
+            with pytest.raises(InvalidValue, match=r"r9\.1|nothing"):
                 asked.explain(*wrong)
         with pytest.raises(InvalidValue, match="is a node"):
             asked.explain_maps("r0.1.1", "r1.1.1")
