@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -13,20 +14,28 @@ import pytest
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
+from mapweave.agent.localization.fix import Fix
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.camera_file import read_camera
+from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.processes.rerun_log import FREE, OCCUPIED, QUEUED, RerunLog, _ellipsoids, _floor
+from mapweave.processes.rerun_log import FREE, OCCUPIED, QUEUED, RerunLog, _ellipsoids, _floor, _tracked
+from mapweave.scenarios.fleet import Stage
+from mapweave.scenarios.scenario import load_scenario, scenario_path
 from mapweave.storage.map_file import read_map_file
-from tests.agent.conftest import PhotoWalls
+from mapweave.vision.lens import Lens
+from tests.agent.conftest import DESCRIPTION, PhotoWalls
+from tests.agent.localization.test_node_localizer import located
 from tests.mapweave.command_line import complaint
+from tests.simulator import needs_simulator
 from tests.waiting import free_port
 
 STEP = 0.02
@@ -176,3 +185,39 @@ def test_what_is_no_place_for_a_log_is_refused(
     for address in (f"rerun+http://127.0.0.1:{free_port()}/proxy", "rerun+http://127.0.0.1:99999999/proxy"):
         with pytest.raises(NotConnected, match=r"no Rerun viewer at .*: start it with `rerun`"):
             RerunLog(address, "r0")
+
+
+def test_while_navigating_it_shows_the_landmarks_of_the_node_where_the_image_has_them() -> None:
+    walls, start = PhotoWalls(), Pose2(0.25, -0.1, 0.08)
+    node = walls.mapped(Mapper(MapId("r0", 1), DESCRIPTION))
+    localizer = located(walls, DESCRIPTION, node, start)
+    camera = DESCRIPTION.camera
+    pipeline: Any = SimpleNamespace(lens=Lens(camera, DESCRIPTION.distortion), fix=Fix.of(localizer))
+    tracks, bearings, points, covariances = _tracked(pipeline)
+    assert len(tracks) == len(points) > 10 and bearings == pytest.approx(camera.bearings(localizer.pixels))
+    order = [np.argsort(ids) for ids in (localizer.visible, localizer.landmarks.ids)]
+    off = camera.project(points[order[1]]) - localizer.pixels[order[0]]
+    assert np.median(np.linalg.norm(off, axis=1)) < 2.0
+    # The same ellipsoids, turned with the robot: their longest axes point away from its camera.
+    _, axes = np.linalg.eigh(covariances)
+    rays = points - [camera.mount_forward, 0.0, camera.mount_height]
+    along = np.abs(np.einsum("ni,ni->n", axes[:, :, 2], rays)) / np.linalg.norm(rays, axis=1)
+    assert np.median(along) > 0.95
+
+
+@needs_simulator
+def test_each_robot_of_a_trial_has_a_log_and_one_that_is_started_again_another(tmp_path: Path) -> None:
+    from mapweave.scenarios.local_fleet import LocalFleet
+
+    scenario = load_scenario(scenario_path("office"), ["robots=2", "world.rooms=3"])
+    fleet = LocalFleet(Stage(scenario, 1, tmp_path, AgentSettings(), rerun=True))
+    fleet.start()
+    fleet.advance(6)
+    fleet.kill_agent("r0")
+    fleet.start_agent("r0")
+    fleet.advance(10)
+    fleet.end()
+    names = ("r0.1", "r0.2", "r1.1")
+    assert sorted(path.stem for path in (tmp_path / "rerun").iterdir()) == sorted(names)
+    counts = [len(rows_of(tmp_path / "rerun" / f"{name}.rrd")[f"/{name[:2]}/now:text"]) for name in names]
+    assert counts[0] + counts[1] == counts[2] == 10
