@@ -193,12 +193,12 @@ class Pipeline:
         match mission:
             case Explore() if self._explorer is None and self._explores:
                 self._explorer = self._new_explorer()
-            case GoTo(goal):
+            case GoTo(goal, via):
                 self._mapper.lose()
                 self._restart()
                 self._navigator = Navigator(
                     self._description, self._lens, self._sift, self.map, goal, self._settings,
-                    self._settings.seed,
+                    self._settings.seed, via,
                 )  # fmt: skip
 
     def step(

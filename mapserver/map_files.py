@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraints
@@ -23,12 +24,15 @@ from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, RefusedPair
 
 
-def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
+def map_file_of(
+    merged: MergedMap, history: Iterable[MapEvent] = (), annotations: Annotations | None = None
+) -> MapFile:
     """A whole merged map: nodes, edges, links with their probabilities, refusals, manual constraints, poses.
 
     Args:
         merged: the map.
         history: events of its maps.
+        annotations: what people say about it.
     """
     whole = merged.union()
     probabilities = link_probabilities(merged)
@@ -46,6 +50,7 @@ def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
         merged.superseded,
         merged.faded,
         tuple(history),
+        (annotations or Annotations()).made,
     )
 
 

@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
+from mapweave.fleet_annotations import FleetAnnotations
 from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
 from mapweave.fleet_questions import SOON
@@ -79,7 +80,7 @@ def login() -> str:
         return "a person"
 
 
-class Fleet(FleetMap, FleetConstraints):
+class Fleet(FleetMap, FleetConstraints, FleetAnnotations):
     """A connection to a fleet, and its merged map. A context manager; it may be used from any thread.
 
     The merged map is fetched when it is first looked at, and again by `refresh`. Whereabouts, routes and
@@ -160,18 +161,19 @@ class Fleet(FleetMap, FleetConstraints):
         reports = decode(self._question(self._keys.any_missions(), b"", SOON), Missions).reports
         return tuple(report for report in reports if robot in ("", report.order.robot))
 
-    def go(self, robot: str, goal: str, wait: float = 0.0) -> MissionReport:
-        """Send a robot to a node (`r0.1.17`), a position in the merged map (`3.1,-2.0`) or `home`.
+    def go(self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = ()) -> MissionReport:
+        """Send a robot to a node (`r0.1.17`), a place, a position in the merged map (`3.1,-2.0`) or `home`.
 
         Args:
             robot: which.
             goal: where to.
             wait: until it is there or has given up, s at most.
+            via: what to pass before, in order, in the same words.
 
         Raises:
             MapweaveError: the robot or the goal does not exist, or the robot does not answer.
         """
-        return self._give(robot, MissionKind.GO, goal, wait)
+        return self._give(robot, MissionKind.GO, goal, wait, tuple(via))
 
     def explore(self, robot: str, wait: float = 0.0) -> MissionReport:
         """Let a robot map all floor that it can reach; see `go`."""
@@ -237,20 +239,23 @@ class Fleet(FleetMap, FleetConstraints):
             listening.close()
         return last[0]
 
-    def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
+    def _give(
+        self, robot: str, kind: MissionKind, goal: str, wait: float, via: tuple[str, ...] = ()
+    ) -> MissionReport:
         """By way of the map server; without one directly."""
         check_name(robot)
         self._check_role()
         report, after_ns = None, 0
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
-            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal)
+            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via)
             replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * SOON)
             taken = [reply for reply in replies if not reply.error]
             if not taken and replies:
                 raise InvalidValue(replies[0].error.removeprefix("refused: "))
             if not taken:
-                report = self._direct(robot, kind, _node(goal), goal)
+                nodes = tuple(node for word in via if (node := _node(word)) is not None)
+                report = self._direct(robot, kind, _node(goal), goal, nodes)
                 break
             report = decode(taken[0].payload, MissionReport)
             if report.state is not MissionState.REPLACED:
@@ -264,10 +269,12 @@ class Fleet(FleetMap, FleetConstraints):
         if self._role in (Role.VIEWER, Role.ROBOT):
             raise InvalidValue(f"this is the key of a {self._role}: missions need an operator's")
 
-    def _direct(self, robot: str, kind: MissionKind, node: NodeId | None, goal: str) -> MissionReport:
+    def _direct(
+        self, robot: str, kind: MissionKind, node: NodeId | None, goal: str, via: tuple[NodeId, ...] = ()
+    ) -> MissionReport:
         after_ns = 0
         for _ in range(TRIES):
-            order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal)
+            order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal, via=via)
             report = send_order(self._bus, self._keys, order, SOON)
             if report.state is not MissionState.REPLACED:
                 break

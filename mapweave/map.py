@@ -10,6 +10,7 @@ office.plot()
 from __future__ import annotations
 
 import os
+import time
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.extras import need
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.constraint_subject import read_ends
 from mapweave.hybridmap.errors import InvalidValue
@@ -32,7 +34,7 @@ from mapweave.hybridmap.explanation import (
 )
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.map_reading import MapReading
 from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
@@ -43,8 +45,10 @@ if TYPE_CHECKING:
     import networkx as nx
     from matplotlib.axes import Axes
 
+    from mapweave.mapserver.routes import Router
+
 NodeName = NodeId | str
-"""A node, also as people write it: `r0.1.17`."""
+"""A node, also as people write it: `r0.1.17`, the name of a place, a position `3.1,-2.0` in component 0."""
 MapName = MapId | str
 """A robot's own map, also as people write it: `r0.1`."""
 
@@ -64,6 +68,18 @@ class Map(ABC):
     @abstractmethod
     def _explained(self, request: ExplainRequest) -> Explanation:
         """An explanation of the kind that the request asks for."""
+
+    @abstractmethod
+    def annotations(self) -> Annotations:
+        """What people say about the map: named places, closures, preferences."""
+
+    @abstractmethod
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words: names of places, and positions in the merged map.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+        """
 
     def __repr__(self) -> str:
         """For example `<FileMap: 17 nodes, 3 maps, ...>`."""
@@ -90,7 +106,7 @@ class Map(ABC):
         Raises:
             InvalidValue: it is not there.
         """
-        return self._reading.node(_node_id(node))
+        return self._reading.node(self._named(node)[0])
 
     def pose(self, node: NodeName) -> PoseGaussian:
         """Pose of a node in the frame of its component.
@@ -98,7 +114,7 @@ class Map(ABC):
         Raises:
             InvalidValue: it is not there.
         """
-        found = self._reading.placed.get(_node_id(node))
+        found = self._reading.placed.get(self._named(node)[0])
         if found is None:
             raise InvalidValue(f"the map has no pose of node {node}")
         return found[1]
@@ -202,9 +218,9 @@ class Map(ABC):
         Raises:
             InvalidValue: a node is not there.
         """
-        ends = _node_id(start), _node_id(goal)
-        closed = tuple((_node_id(a), _node_id(b)) for a, b in blocked)
-        explanation = self._explained(ExplainRequest(ends, True, closed))
+        a, b, *closed = self._named(start, goal, *(end for pair in blocked for end in pair))
+        pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
+        explanation = self._explained(ExplainRequest((a, b), True, pairs))
         assert isinstance(explanation, RouteExplanation), "a route was asked for"
         return explanation
 
@@ -214,7 +230,8 @@ class Map(ABC):
         Raises:
             InvalidValue: a node is not there.
         """
-        explanation = self._explained(ExplainRequest((_node_id(a), _node_id(b))))
+        first, second = self._named(a, b)
+        explanation = self._explained(ExplainRequest((first, second)))
         assert isinstance(explanation, PairExplanation), "two nodes were asked for"
         return explanation
 
@@ -232,6 +249,19 @@ class Map(ABC):
         explanation = self._explained(ExplainRequest(pair))
         assert isinstance(explanation, FleetExplanation), "maps were asked for"
         return explanation.maps
+
+    def _named(self, *names: NodeName) -> list[NodeId]:
+        """The nodes for names.
+
+        Raises:
+            InvalidValue: one is none.
+        """
+        nodes = {name: _node_id(name) for name in names}
+        words = [str(name) for name, node in nodes.items() if node is None]
+        if words:
+            found = self.resolve(ResolveRequest(tuple(words))).found
+            nodes |= {word: one.node for word, one in zip(words, found, strict=True)}
+        return [node for name in names if (node := nodes[name]) is not None]
 
     def export(self, path: str | os.PathLike[str], to: str = "", component: int = 0) -> list[Path]:
         """Write a component for others' tools, as `mapweave map export` does.
@@ -286,10 +316,25 @@ class FileMap(Map):
         return self._read.relocalizer.answer(view)
 
     def _explained(self, request: ExplainRequest) -> Explanation:
-        router = self._read.router
+        router = self._router()
         from mapweave.mapserver.explanations import explained
 
         return explained(request, router, self._read.settings.consistency)
+
+    def annotations(self) -> Annotations:
+        """What people say about the map, as the file has it."""
+        return Annotations(self.content.annotations)
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words; see Map."""
+        router = self._router()
+        from mapweave.mapserver.places import Places
+
+        return Places(router, router.annotations).answer(request)
+
+    def _router(self) -> Router:
+        """Of the ways that are open now."""
+        return self._read.router.at(self.annotations(), time.time_ns())
 
 
 def open(path: str | os.PathLike[str]) -> FileMap:
@@ -311,5 +356,11 @@ def open(path: str | os.PathLike[str]) -> FileMap:
     return FileMap(opened.file(opened.merged()))
 
 
-def _node_id(node: NodeName) -> NodeId:
-    return node if isinstance(node, NodeId) else NodeId.parse(node)
+def _node_id(name: NodeName) -> NodeId | None:
+    """The node that is written; None if it may be the name of a place, or a position."""
+    if isinstance(name, NodeId):
+        return name
+    try:
+        return NodeId.parse(name)
+    except InvalidValue:
+        return None

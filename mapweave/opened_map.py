@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from mapweave.agent.replication import journal
 from mapweave.agent.replication.retained_map import RetainedMap
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId
@@ -50,7 +51,8 @@ class OpenedMap:
     Attributes:
         path: of the file.
         source: what it is.
-        content: of a file as it is; of a store or journal all maps, constraints and history, not merged yet.
+        content: of a file as it is; of a store or journal all maps, constraints, annotations and history, not
+            merged yet.
         maps: the robots' maps in it, also those of a journal that are empty.
         complaints: what of each map could not be read, in one line each; key None: what belongs to no map.
     """
@@ -96,7 +98,7 @@ class OpenedMap:
             return self.content
         from mapweave.mapserver.map_files import map_file_of
 
-        return map_file_of(merged, self.content.history)
+        return map_file_of(merged, self.content.history, Annotations(self.content.annotations))
 
 
 def open_map(path: Path) -> OpenedMap:
@@ -166,14 +168,16 @@ def _of_store(path: Path) -> OpenedMap:
     history, worse = _read(
         [salvaged.results[store.HISTORY]] if store.HISTORY in salvaged.results else [], KeptHistory
     )
+    annotations, worst = _read(salvaged.annotations, Annotation)
     content = MapFile(
         "agent",
         _title(salvaged.maps),
         tuple(body for _, hybrid in sorted(salvaged.maps.items()) for body in hybrid.contents()),
         constraints=tuple(constraints),
         history=tuple(event for record in history for event in record.events),
+        annotations=tuple(annotations),
     )
-    complaint = _lost(path, salvaged, bad + worse)
+    complaint = _lost(path, salvaged, bad + worse + worst)
     maps = tuple(sorted(salvaged.maps))
     return OpenedMap(path, MapSource.STORE, content, maps, {None: complaint} if complaint else {})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
@@ -10,15 +11,17 @@ from types import TracebackType
 from typing import NoReturn
 
 from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.mapserver.explanations import explained
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
@@ -45,6 +48,7 @@ class ReadOnlyServer:
         self._admission = AdmissionControl()
         self._background = ThreadPoolExecutor(1, thread_name_prefix="opened map")
         self._relocalizer = self._background.submit(relocalizer_in, merged)
+        self._annotations = Annotations(opened.content.annotations)
         self._router = self._background.submit(Router, merged)
 
     def __enter__(self) -> ReadOnlyServer:
@@ -64,7 +68,9 @@ class ReadOnlyServer:
         Raises:
             Busy: too many ask.
         """
-        return self._admission.submit(lambda: self._relocalizer.result().answer(look()), ticket)
+        return self._admission.submit(
+            lambda: self._places().named(self._relocalizer.result().answer(look())), ticket
+        )
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
         """Explain a merge or a route.
@@ -73,7 +79,7 @@ class ReadOnlyServer:
             Busy: too many ask.
         """
         return self._admission.submit(
-            lambda: explained(request, self._router.result(), self._consistency), usual=False
+            lambda: explained(request, self._places().router, self._consistency), usual=False
         )
 
     def status(self) -> dict[str, Scalar]:
@@ -101,7 +107,27 @@ class ReadOnlyServer:
     def history(self) -> tuple[MapEvent, ...]:
         """What became of the maps until the file was written, and what people decided."""
         content = self._opened.content
-        return with_constraints(content.history, ManualConstraints(content.constraints))
+        return with_constraints(content.history, ManualConstraints(content.constraints), self._annotations)
+
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+        return self._annotations
+
+    def annotate(self, annotation: Annotation) -> str:
+        """Refuse an annotation.
+
+        Raises:
+            InvalidValue: always.
+        """
+        self._refuse("`mapweave place add --map FILE -o OUT` and the like write an annotated copy")
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+        """
+        return self._places().answer(request)
 
     def robots(self) -> FleetStatus:
         """There are none."""
@@ -111,7 +137,9 @@ class ReadOnlyServer:
         """There are none."""
         return Missions()
 
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+    def give(
+        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str, via: tuple[str, ...]
+    ) -> MissionReport:
         """Refuse a mission.
 
         Raises:
@@ -134,6 +162,10 @@ class ReadOnlyServer:
     def map_file(self) -> Future[bytes]:
         """The map as a map file."""
         return self._background.submit(lambda: self._packed)
+
+    def _places(self) -> Places:
+        router = self._router.result().at(self._annotations, time.time_ns())
+        return Places(router, self._annotations)
 
     @cached_property
     def _packed(self) -> bytes:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
@@ -27,6 +28,8 @@ from mapweave.hybridmap.query import (
     RelocalizeAnswer,
     ReserveAnswer,
     ReserveRequest,
+    ResolveAnswer,
+    ResolveRequest,
     RouteAnswer,
     RouteRequest,
     View,
@@ -77,6 +80,10 @@ LIMITS: dict[type, Limit] = {
     ManualConstraint: Limit("manual constraint", 2**16, 8192),
     ConstraintRequest: Limit("manual constraint", 2**16, 8192),
     ConstraintList: Limit("manual constraints", 2**26, 2_000_000),
+    Annotation: Limit("annotation", 2**16),
+    Annotations: Limit("annotations", 2**26, 4_000_000),
+    ResolveRequest: Limit("resolve request", 2**14),
+    ResolveAnswer: Limit("resolved places", 2**16),
     History: Limit("history", 2**26, 1_000_000),
     AgentStatus: Limit("agent status", 2**15),
     DriveRequest: Limit("drive request", 256),

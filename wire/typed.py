@@ -24,6 +24,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.annotation import BODIES, MAX_ANNOTATIONS, Annotation
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Ends
@@ -79,6 +80,18 @@ def _events(events: list[dict[str, Any]]) -> tuple[MapEvent, ...]:
     return tuple(_convert(event, _schema(MapEvent)) for event in read)
 
 
+def _annotations(entries: list[dict[str, Any]]) -> tuple[Annotation, ...]:
+    """Skips annotations of unknown kinds: a newer program may have written them."""
+    bodies = [entry.get("body") for entry in entries]
+    newer = [
+        isinstance(body, dict) and isinstance(body.get("kind"), str) and body["kind"] not in BODIES
+        for body in bodies
+    ]
+    return tuple(
+        _convert(entry, _schema(Annotation)) for entry, skip in zip(entries, newer, strict=True) if not skip
+    )
+
+
 def _distortion(plain: list[float] | dict[str, Any]) -> Distortion:
     return _convert(plain, _schema(Equidistant if isinstance(plain, dict) else RadialTangential))  # type: ignore[no-any-return]
 
@@ -93,6 +106,9 @@ FORMS: dict[Any, Form] = {
     Ends: Form(tuple[list[Any], list[Any]], _ends),
     Distortion: Form(list[float] | dict[str, Any], _distortion),
     tuple[MapEvent, ...]: Form(list[dict[str, Any]], _events),
+    tuple[Annotation, ...]: Form(
+        Annotated[list[dict[str, Any]], Meta(max_length=MAX_ANNOTATIONS)], _annotations
+    ),
 }
 PACKERS: Packers = {
     PoseGaussian: pack_pose,
@@ -163,6 +179,20 @@ def decode(data: bytes, kind: type[Value], limit: Limit) -> Value:
     """
     schema: Any = kind
     value: Value = unpack(data, _schema(schema), limit, _read)
+    return value
+
+
+def value_of(plain: Any, kind: type[Value]) -> Value:
+    """A value of plain data, as `packed` returns it.
+
+    Raises:
+        InvalidValue: something is missing, of another type or out of range.
+    """
+    schema: Any = kind
+    try:
+        value: Value = _convert(plain, _schema(schema))
+    except msgspec.ValidationError as error:
+        raise InvalidValue(str(error).splitlines()[0]) from None
     return value
 
 

@@ -10,10 +10,11 @@ from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.mapserver.http.annotations import Annotating
 from mapweave.mapserver.http.live import Shown
 
 
-class Answering(Shown, Protocol):
+class Answering(Annotating, Shown, Protocol):
     """The questions, as of a MapServer or a map file: from any thread; a MapweaveError refuses one."""
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
@@ -25,7 +26,9 @@ class Answering(Shown, Protocol):
     def missions(self) -> Missions:
         """The missions that are known."""
 
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+    def give(
+        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str, via: tuple[str, ...]
+    ) -> MissionReport:
         """Give a robot a mission; waits for its answer."""
 
     def map_file(self) -> Future[bytes]:

@@ -11,6 +11,8 @@
     GET /robots       what every robot is doing, JSON
     GET /missions     the missions that are known, JSON
     GET /map          the merged map, a map file
+    GET /annotations  what people say about the map: named places and so on, JSON
+    POST /annotations JSON: adds an annotation, or withdraws one
     GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
@@ -43,13 +45,14 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from mapweave.hybridmap.constraint_subject import EXAMPLE, read_ends
+from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
 from mapweave.hybridmap.mission_order import MissionKind, Missions
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ExplainRequest
+from mapweave.mapserver.http.annotations import annotate, annotations_json, ends_of_words
 from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
@@ -77,7 +80,7 @@ METHODS = (
         (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/nodes/NODE"),
         "GET",
     )
-    | {"/constraints": "GET or POST"}
+    | dict.fromkeys(("/constraints", "/annotations"), "GET or POST")
     | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
 )
 BY = "http"
@@ -195,6 +198,7 @@ class Questions:
             *(Route(path, _page("index.html")) for path in PAGES),
             WebSocketRoute("/live", Live(server, self._may_command).serve),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
+            Route("/annotations", self._answering(self._annotations), methods=["GET", "POST"]),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
@@ -248,6 +252,13 @@ class Questions:
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
 
+    async def _annotations(self, request: Request) -> Mapping[str, Any]:
+        if request.method != "POST":
+            return await run_in_threadpool(annotations_json, self._server)
+        self._check_commands(request)
+        body = await self._body(request, "JSON")
+        return await run_in_threadpool(annotate, self._server, body, request.query_params.get("by", BY))
+
     async def _node(self, request: Request) -> Mapping[str, Any]:
         node = NodeId.parse(request.path_params["node"])
         return await run_in_threadpool(lambda: json_values(node_details(self._server.merged(), node)))
@@ -265,8 +276,9 @@ class Questions:
         query = request.query_params
         goal, by, mission_id = query.get("goal", ""), query.get("by", BY), query.get("id", "")
         report = await run_in_threadpool(
-            self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id
-        )
+            self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id,
+            tuple(query.getlist("via")),
+        )  # fmt: skip
         return json_values(report)
 
     async def _stop(self, request: Request) -> Mapping[str, Any]:
@@ -276,7 +288,7 @@ class Questions:
         def stop() -> Mapping[str, Any]:
             names = [entry.robot for entry in self._server.robots().robots if entry.alive]
             return json_values(
-                Missions(tuple(self._server.give(name, MissionKind.STOP, "", by) for name in names))
+                Missions(tuple(self._server.give(name, MissionKind.STOP, "", by, "", ()) for name in names))
             )
 
         return await run_in_threadpool(stop)
@@ -309,12 +321,14 @@ class Questions:
             )
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
-        ends, path, query = None, request.url.path, dict(request.query_params)
+        ends: Ends | None = None
+        path, query = request.url.path, dict(request.query_params)
         route = path == "/route"
         if query or route:
             if query.keys() != {"a", "b"}:
                 raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
-            ends = read_ends(query["a"].strip(), query["b"].strip())
+            words = query["a"].strip(), query["b"].strip()
+            ends = await run_in_threadpool(ends_of_words, self._server, words)
         asked = ExplainRequest(ends, route)
         explanation = await self._result(lambda: self._server.explain(asked))
         return await run_in_threadpool(json_values, explanation)

@@ -26,6 +26,7 @@ class Salvage:
         damaged: rows with wrong checksums.
         whole: whether all pages could be read.
         constraints: the manual constraints that are good, encoded, in order.
+        annotations: the annotations that are good, likewise.
         results: the server's own results that are good, by name.
     """
 
@@ -34,6 +35,7 @@ class Salvage:
     damaged: int
     whole: bool
     constraints: tuple[bytes, ...]
+    annotations: tuple[bytes, ...]
     results: dict[str, bytes]
 
 
@@ -69,17 +71,21 @@ def _read(connection: sqlite3.Connection, path: Path) -> Salvage:
     for (map_id, _), body in sorted(good.items(), key=lambda item: item[0]):
         maps.setdefault(map_id, HybridMap()).apply(body)
     constraints, constraints_whole = _good(connection, "manual_constraint")
+    annotations, annotations_whole = _good(connection, "annotation")
     results, results_whole = _good(connection, "result")
     return Salvage(
-        maps, len(good), damaged, not error and constraints_whole and results_whole,
-        tuple(bytes(body) for _, body in constraints), {str(name): bytes(value) for name, value in results},
+        maps, len(good), damaged, not error and constraints_whole and annotations_whole and results_whole,
+        tuple(bytes(body) for _, body in constraints), tuple(bytes(body) for _, body in annotations),
+        {str(name): bytes(value) for name, value in results},
     )  # fmt: skip
 
 
 def _good(connection: sqlite3.Connection, table: str) -> tuple[list[list[Any]], bool]:
-    """Undamaged rows of a table, and whether all could be read."""
+    """Undamaged rows of a table, and whether all could be read; none of one that an older program lacked."""
     rows: list[list[Any]] = []
     try:
+        if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = ?", (table,)).fetchone():
+            return rows, True
         for *values, crc in connection.execute(f"SELECT * FROM {table} ORDER BY 1"):
             if checksum(values) == crc:
                 rows.append(values)

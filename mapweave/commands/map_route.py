@@ -5,15 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, router_of
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import RouteExplanation
     from mapweave.hybridmap.node import NodeId
+    from mapweave.mapserver.routes import Router
     from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
@@ -22,17 +24,20 @@ def add_to(actions: Any) -> None:
     parser: argparse.ArgumentParser = actions.add_parser(
         "route",
         help="the way from node to node, and why it leads so, or why there is none",
-        description="Explain the route from one node to another (r0.1.17 r1.1.5), step by step; "
-        "why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
+        description="Explain the route from one node or named place to another (r0.1.17 kitchen), step by "
+        "step; why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
         "blocked, or which maps would have to be one. A running server is asked, or a map file. "
         "Exit status 0: there is a way; 2: there is none; 1: could not ask.",
     )
-    parser.add_argument("start", metavar="START", help="a node")
+    parser.add_argument("start", metavar="START", help="a node, a named place, or a position")
     parser.add_argument("goal", metavar="GOAL", help="another one")
     parser.add_argument(
         "--blocked", nargs=2, action="append", default=[], metavar="NODE",
         help="as if a robot could not get through between these two; may be given again",
     )  # fmt: skip
+    parser.add_argument(
+        "--via", action="append", default=[], metavar="PLACE", help="pass this first; may be given again"
+    )
     parser.add_argument("--map", type=Path, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -43,30 +48,53 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapweave.commands.map_ends import node_of
+    from mapweave.commands.map_ends import node_of, resolved
     from mapweave.explanation_text import route_words
     from mapweave.extras import need
     from mapweave.mapserver.http.json_values import json_values
 
     if arguments.draw is not None:
         need("viz")
-    start, goal = node_of(arguments.start), node_of(arguments.goal)
-    blocked = tuple((node_of(a), node_of(b)) for a, b in arguments.blocked)
-    merged = None
-    if arguments.map is not None:
-        from mapweave.commands.network import settings_of
-
-        merged = merged_with_progress(opened(arguments.map), settings_of(arguments).merge)
-    explanation = explained_route(arguments, merged, start, goal, blocked)
+    stops = [arguments.start, *arguments.via, arguments.goal]
+    words = [*stops, *(word for pair in arguments.blocked for word in pair)]
+    router = None if arguments.map is None else router_of(arguments)
+    nodes = list(map(node_of, resolved(arguments, words, router)))
+    start, goal, rest = nodes[0], nodes[len(stops) - 1], nodes[len(stops) :]
+    blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
+    if arguments.via:
+        return _run_via(arguments, router, nodes[: len(stops)], blocked)
+    explanation = explained_route(arguments, router, start, goal, blocked)
     values, lines = json_values(explanation), route_words(explanation)
     if arguments.draw is not None and explanation.found:
-        draw_route(arguments, merged, explanation)
+        draw_route(arguments, None if router is None else router.merged, explanation)
         values["picture"] = str(arguments.draw)
         lines.append(f"  picture   {arguments.draw}")
     print(json.dumps(values) if arguments.json else "\n".join(lines))
     if arguments.draw is not None and not explanation.found:
         print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
     return 0 if explanation.found else 2
+
+
+def _run_via(
+    arguments: argparse.Namespace,
+    router: Router | None,
+    stops: list[NodeId],
+    blocked: tuple[tuple[NodeId, NodeId], ...],
+) -> int:
+    """Explain the way from stop to stop."""
+    from mapweave.explanation_text import route_words
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.http.json_values import json_values
+
+    if arguments.draw is not None:
+        raise InvalidValue("--draw and --via do not go together: draw the way from one place to the next")
+    legs = [explained_route(arguments, router, a, b, blocked) for a, b in pairwise(stops)]
+    found = all(leg.found for leg in legs)
+    if arguments.json:
+        print(json.dumps({"found": found, "legs": [json_values(leg) for leg in legs]}))
+    else:
+        print("\n".join(line for leg in legs for line in route_words(leg)))
+    return 0 if found else 2
 
 
 def draw_route(
@@ -98,7 +126,7 @@ def draw_route(
 
 def explained_route(
     arguments: argparse.Namespace,
-    merged: MergedMap | None,
+    router: Router | None,
     start: NodeId,
     goal: NodeId,
     blocked: tuple[tuple[NodeId, NodeId], ...],
@@ -110,11 +138,10 @@ def explained_route(
     from mapweave.wire.keys import Keys
     from mapweave.wire.messages import decode, encode
 
-    if merged is None:
+    if router is None:
         request = ExplainRequest((start, goal), True, blocked)
         replies = ask(arguments, Keys.any_explain, encode(request))
         return decode(replies[0].payload, RouteExplanation)
     from mapweave.mapserver.route_explaining import explain_route
-    from mapweave.mapserver.routes import Router
 
-    return explain_route(Router(merged), start, goal, blocked)
+    return explain_route(router, start, goal, blocked)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.explanation import Explanation, FleetExplanation
@@ -64,6 +65,9 @@ class StubServices:
 
     def history(self) -> tuple[MapEvent, ...]:
         return self.events
+
+    def annotations(self) -> Annotations:
+        return Annotations()
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         done: Future[RelocalizeAnswer] = Future()

@@ -80,6 +80,7 @@ def running(tmp_path: Path) -> Iterator[Running]:
 
 def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> None:
     fleet = running.fleet
+    fleet.annotate("place", "kitchen", node="r1.1.3")
     fleet.save(tmp_path / "both.mapweave")
     file = mapweave.open(tmp_path / "both.mapweave")
     shutil.copy(tmp_path / "s.sqlite", tmp_path / "copy.sqlite")
@@ -116,6 +117,10 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
     way, same = fleet.route("r0.1.1", "r1.1.5"), file.route("r0.1.1", "r1.1.5")
     assert way.found and str(way.hops[0].a) == "r0.1.1" and str(way.hops[-1].b) == "r1.1.5"
     assert [(hop.a, hop.b, hop.kind) for hop in way.hops] == [(hop.a, hop.b, hop.kind) for hop in same.hops]
+    for asked in (fleet, file):
+        assert str(asked.node("kitchen").id) == "r1.1.3"
+        assert asked.route("r0.1.1", "kitchen").hops == asked.route("r0.1.1", "r1.1.3").hops != ()
+        assert asked.annotations().last("place", "kitchen") is not None
     assert not file.route("r0.1.1", "r0.1.3", blocked=[(a, b) for a in graph for b in graph if a < b]).found
     for asked in (fleet, file):
         pair = asked.explain("r0.1.1", mapweave.NodeId("r1", 1, 1))
