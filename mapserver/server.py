@@ -117,7 +117,7 @@ class MapServer:
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
         self._constraints = ConstraintRecord(self._store, self._base)
         self._worker.constrain(self._constraints.constraints)
-        self._annotations = AnnotationRecord(self._store)
+        self._annotations = AnnotationRecord(self._store, self._base.annotations)
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )

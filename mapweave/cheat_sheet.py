@@ -20,7 +20,7 @@ GROUPS = {
         "place add", "place list", "place remove", "close", "reopen", "prefer", "avoid", "closures",
     ),
     "Maps": (
-        "map show", "open", "map explain", "map route", "map history", "map link", "map unmerge",
+        "map show", "open", "map explain", "map route", "map history", "map diff", "map link", "map unmerge",
         "map retire", "map undo", "map merge",
         "map fetch", "map export", "map extract", "map import", "map from-photos", "relocalize",
     ),

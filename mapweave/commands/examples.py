@@ -50,6 +50,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "map explain": ("mapweave map explain r0.1 r1.1", "mapweave map explain r0.1.5 r1.1.9"),
     "map route": ("mapweave map route r0.1.1 r1.1.17",),
+    "map diff": ("mapweave map diff monday.mapweave tuesday.mapweave",),
     "map history": ("mapweave map history --most 10",),
     "map unmerge": ("mapweave map unmerge r0.1.5 r1.1.9 --because 'two like doors'",),
     "map link": ("mapweave map link r0.1.17 r1.1.5 --check",),

@@ -214,6 +214,35 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     )
 
 
+def test_linking_in_a_file_and_taking_it_back(
+    files: list[Path], said: Said, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "m.mapweave"
+    path.write_bytes(files[3].read_bytes())
+    wrong = ["map", "link", "r0.1.1", "r2.1.3", "--map", str(path)]
+    assert main(wrong) == 1
+    assert "do not show one place: " in capfd.readouterr().err
+    by_hand = [*wrong, "--pose=-1,0.5,90", "--because", "the same door", "--by", "anna"]
+    only_checked = "only checked, nothing is changed: r0.1.1 and r2.1.3: linked by hand by anna"
+    assert said(*by_hand, "--check").startswith(only_checked)
+    assert path.read_bytes() == files[3].read_bytes(), "only checked"
+    assert "1 component" in said(*by_hand)
+    out = said("map", "explain", "r0.1.1", "r2.1.3", "--map", path)
+    assert "are linked: linked by hand by anna" in out and "they see one place (r0.1.1 and r2.1.3)" in out
+    out = said("map", "retire", "r0.1.3", "--map", path)
+    assert "node r0.1.3 is retired by " in out and "1 retired node" in out
+    out = said("map", "explain", "r0.1.3", "r1.1.1", "--map", path)
+    assert "are not linked: node r0.1.3 is retired" in out
+    assert [line.split()[0] for line in said("map", "undo", "--map", path).splitlines()] == ["1", "2"]
+    said("map", "undo", "2", "--map", path)
+    said("map", "undo", "1", "--map", path)
+    assert said("map", "undo", "--map", path) == "no manual constraint holds\n"
+    assert len(json.loads(said("map", "undo", "--json", "--map", path))["constraints"]) == 4
+    content, before = read_map_file(path), read_map_file(files[3])
+    assert content.changes == before.changes or links(path) == links(files[3])
+    assert [str(node) for node in content.poses] == [str(node) for node in before.poses]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
