@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import MAX_WORDS
@@ -16,6 +18,7 @@ from mapweave.mapserver.log.store import Store
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.pinned_frames import FrameChange, frame_changes
 from mapweave.wire.messages import KeptHistory, decode, encode
 
 log = logging.getLogger(__name__)
@@ -101,9 +104,22 @@ class MapHistory:
             log.info("%s", words)
         for words in (*parted, *held, *left_out):
             log.warning("%s", words)
+        frames = {
+            (change.pinned, change.holding or change.pinned): change for change in frame_changes(merged)
+        }
+        before_frames = self._kept.frames
+        moved = [_frame_words(change) for key, change in frames.items() if key not in before_frames]
+        not_holding, pinned = {node for node, _ in frames}, {pin.node for pin in merged.pins}
+        moved += [
+            f"the pin of {node} holds its component's frame again"
+            for node in sorted({node for node, _ in before_frames} & pinned - not_holding)
+        ]
+        for words in moved:
+            log.warning("%s", words)
         # Of what happens at once, that something came apart is what people must see last.
         fresh = [
             *_briefly(MapEventKind.JOINED, joined),
+            *_briefly(MapEventKind.FRAME, moved),
             *_briefly(MapEventKind.KEPT_APART, held),
             *_briefly(MapEventKind.PARTED, parted),
             *_briefly(MapEventKind.SET_APART, taken_in),
@@ -111,27 +127,24 @@ class MapHistory:
         ]
         apart_pairs = frozenset(still | set(new))
         self._links = merged.links
-        if fresh or now != before or apart_pairs != self._kept.apart:
-            self._keep(fresh, now, apart_pairs, frozenset(bad))
+        if fresh or now != before or apart_pairs != self._kept.apart or frames.keys() != before_frames:
+            self._keep(fresh, KeptHistory((), now, apart_pairs, frozenset(bad), frozenset(frames)))
 
     def failed(self, words: str) -> None:
         """Record that something could not be done; the same twice is reported once."""
         if not self._kept.events or self._kept.events[-1].words != words:
-            self._keep(
-                [(MapEventKind.FAILED, words)], self._kept.parts, self._kept.apart, self._kept.set_apart
-            )
+            self._keep([(MapEventKind.FAILED, words)], self._kept)
 
-    def _keep(
-        self,
-        fresh: list[tuple[MapEventKind, str]],
-        parts: tuple[frozenset[MapId], ...],
-        apart: frozenset[Pair],
-        set_apart: frozenset[MapId],
-    ) -> None:
-        """Add to the record; it is on the disk when this returns, unless the disk does not take it."""
+    def _keep(self, fresh: list[tuple[MapEventKind, str]], state: KeptHistory) -> None:
+        """Add to the record; it is on the disk when this returns, unless the disk does not take it.
+
+        Args:
+            fresh: new events.
+            state: what is remembered besides events.
+        """
         now = self._clock()
         more = [MapEvent(now, kind, _one_line(words)) for kind, words in fresh]
-        kept = KeptHistory((*self._kept.events, *more)[-self._most :], parts, apart, set_apart)
+        kept = replace(state, events=(*self._kept.events, *more)[-self._most :])
         with self._lock:
             self._kept = kept
         if self._store is None:
@@ -179,6 +192,17 @@ def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pa
             f"{first} and {second} are kept apart: {links} refused ({counts.most_common(1)[0][0]})"
         )
     return out
+
+
+def _frame_words(change: FrameChange) -> str:
+    if change.holding is None:
+        return f"the pin of {change.pinned} holds no frame: the node is not in the merged map"
+    x, y, heading = change.now_from_pinned.vector
+    return (
+        f"the frame that {change.pinned} pins has moved: it has joined that of the older pin of "
+        f"{change.holding}; its coordinates are turned by {math.degrees(heading):.2f} deg about the origin, "
+        f"then shifted by {x:.3f}, {y:.3f} m"
+    )
 
 
 def _briefly(kind: MapEventKind, events: Sequence[str]) -> list[tuple[MapEventKind, str]]:

@@ -212,12 +212,12 @@ def check_pairs(a: Array, b: Array, covariance: Array, scale: float | None = Non
         spread = math.sqrt(float(((a - a.mean(axis=0)) ** 2).sum(axis=1).mean()))
         raise InvalidValue(
             f"the pairs are too near to each other: they lie within {spread:.2f} m, which leaves the plan's "
-            f"rotation uncertain by {math.degrees(proper.sigmas[2]):.1f} deg; click some that are further apart"
+            f"rotation uncertain by {math.degrees(proper.sigmas[2]):.1f} deg; click some further apart"
         )
     if lead < CLEARLY and proper.chi2 > CLEARLY * max(proper.freedom, 1):
         raise InvalidValue(
-            f"the pairs contradict each other: residuals of {proper.rms:.2f} m; one is wrong, click more pairs "
-            "to learn which"
+            f"the pairs contradict each other: residuals of {proper.rms:.2f} m; one is wrong, click more "
+            "pairs to learn which"
         )
     if lead < CLEARLY:
         raise InvalidValue(

@@ -17,7 +17,7 @@ from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, Ro
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import (
     MAX_CANDIDATES,
     MAX_KNOWN,
@@ -49,12 +49,15 @@ class KeptHistory:
         parts: maps that were one when it was written, each in one set.
         apart: pairs of maps that are reported as kept apart.
         set_apart: maps that are reported as set apart.
+        frames: pins that are reported as not holding their component's frame, with the node of the older pin
+            that does; a pin whose node is not in the merged map with its own.
     """
 
     events: tuple[MapEvent, ...] = ()
     parts: tuple[frozenset[MapId], ...] = ()
     apart: frozenset[tuple[MapId, MapId]] = frozenset()
     set_apart: frozenset[MapId] = frozenset()
+    frames: frozenset[tuple[NodeId, NodeId]] = frozenset()
 
 
 VIEW = Limit("view", MAX_LANDMARKS_BYTES + 256)

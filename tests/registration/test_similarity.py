@@ -102,7 +102,7 @@ def test_the_covariance_is_that_of_many_trials(known: float | None) -> None:
     assert predicted is not None
     used = 3 if known else 4
     sample, expected = np.cov(np.array(found).T)[:used, :used], predicted[:used, :used]
-    # Wishart: each entry of a whitened sample covariance has a standard deviation of sqrt(2 / trials) at most.
+    # Wishart: an entry of a whitened sample covariance has a standard deviation of sqrt(2 / trials) at most.
     root = np.linalg.inv(np.linalg.cholesky(expected))
     assert np.abs(root @ sample @ root.T - np.eye(used)).max() < 5.0 * math.sqrt(2.0 / trials)
     assert known is None or not predicted[3].any()
@@ -191,5 +191,5 @@ def test_pairs_that_determine_nothing_are_refused() -> None:
     with pytest.raises(InvalidValue, match="mirror image of the plan fits better"):
         check_pairs(TRUTH.apply(plane * (1.0, -1.0)), plane, loose)
     exchanged = plane[[1, 0, 2]]
-    with pytest.raises(InvalidValue, match="two pairs are exchanged|contradict"):
+    with pytest.raises(InvalidValue, match=r"two pairs are exchanged|contradict"):
         check_pairs(TRUTH.apply(exchanged), plane[:3], loose[:6, :6])
