@@ -1,8 +1,8 @@
 """The similarity transform between pairs of points in the plane, by generalised least squares.
 
 The start is Umeyama's closed form (IEEE PAMI 13(4), 1991), which in the plane is one complex division. From
-there Gauss-Newton steps minimise r' C^-1 r with the joint covariance C of all points, so it does not matter
-which node of a map is held: what moves all points as one is in the span of the transform's own parameters.
+there Gauss-Newton steps minimise r' C^-1 r with the joint covariance C of all points. Errors that move all
+points as one do no harm: they are in the span of the transform's own parameters.
 """
 
 from __future__ import annotations
