@@ -39,7 +39,7 @@ def merged_map(building: Building) -> MergedMap:
 
 
 def plan_of(building: Building) -> tuple[NDArray[np.uint8], Pose2]:
-    """A drawing of the rooms, as an architect has it, and `plan_from_world`: y of the building points left."""
+    """A drawing of the rooms, as an architect has it, and `plan_from_world`: the building lies across."""
     cells = np.round((building.truth[:, :, :2] - (WIDTH / 2, DEPTH / 2)) / PITCH)
     corners = PITCH * np.unique(cells.reshape(-1, 2), axis=0)
     low, high = np.min(corners, axis=0) - MARGIN, np.max(corners, axis=0) + np.array([WIDTH, DEPTH]) + MARGIN

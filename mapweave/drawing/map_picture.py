@@ -211,7 +211,8 @@ def _draw_backdrop(axes: Any, backdrop: Backdrop) -> None:
         )  # fmt: skip
         axes.annotate(
             str(number), on_plan, (9, 9), textcoords="offset points", fontsize=10, fontweight="bold",
-            color="#c0392b", zorder=7, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1},
+            color="#c0392b", zorder=7,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1},
         )  # fmt: skip
 
 
