@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
@@ -27,9 +28,11 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
+from mapweave.identities.key_file import read_key_file
 from mapweave.storage.map_file import MapFile, unpack_map_file
 from mapweave.wire.bus import Bus, Reply, Sample
 from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -71,6 +74,7 @@ class Fleet:
         connect: str | Sequence[str] = "tcp/127.0.0.1:7447",
         fleet: str = "demo",
         by: str = "",
+        keys: str | Path = "",
         bus: Bus | None = None,
     ) -> None:
         """Connect.
@@ -79,6 +83,7 @@ class Fleet:
             connect: Zenoh endpoint of the router, or several, of which the first in reach is taken.
             fleet: its name.
             by: gives the missions; the login name by default.
+            keys: key file of an operator or viewer, where the router asks for one.
             bus: a connection to use instead; it stays the caller's.
 
         Raises:
@@ -87,9 +92,12 @@ class Fleet:
         self._keys = Keys(check_name(fleet))
         self._by = (by or login())[:64]
         self._own: ZenohBus | None = None
+        self._role: Role | None = None
         if bus is None:
+            credentials = read_key_file(Path(keys)).credentials if keys else None
+            self._role = None if credentials is None else credentials.role
             endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-            bus = self._own = ZenohBus(BusSettings(mode="client", endpoints=endpoints))
+            bus = self._own = ZenohBus(BusSettings(endpoints=endpoints, credentials=credentials))
             if not self._own.wait_connected(SOON):
                 self._own.close()
                 raise NotConnected(
@@ -164,6 +172,7 @@ class Fleet:
         Raises:
             NotConnected: one does not answer; the others are stopped.
         """
+        self._check_role()
         names = [robot] if robot else [entry.robot for entry in self.status().robots if entry.alive]
         reports, silent = [], []
         for name in names:
@@ -232,6 +241,7 @@ class Fleet:
     def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
         """By way of the map server; without one directly."""
         check_name(robot)
+        self._check_role()
         report, after_ns = None, 0
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
@@ -249,6 +259,11 @@ class Fleet:
             after_ns = self._newest(robot)
         assert report is not None, "it was tried"
         return self.wait(report, wait) if wait > 0.0 else report
+
+    def _check_role(self) -> None:
+        """The router drops what a role may not send; without a word, so that is said here."""
+        if self._role in (Role.VIEWER, Role.ROBOT):
+            raise InvalidValue(f"this is the key of a {self._role}: missions need an operator's")
 
     def _direct(self, robot: str, kind: MissionKind, node: NodeId | None, goal: str) -> MissionReport:
         after_ns = 0

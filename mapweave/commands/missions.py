@@ -76,7 +76,7 @@ def fleet_of(arguments: argparse.Namespace) -> Fleet:
     from mapweave.fleet import Fleet
 
     network = network_of(arguments, settings_of(arguments))
-    return Fleet(network.endpoints, network.fleet, getattr(arguments, "by", ""))
+    return Fleet(network.endpoints, network.fleet, getattr(arguments, "by", ""), network.keys)
 
 
 def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -> int:

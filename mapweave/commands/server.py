@@ -8,7 +8,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
+from mapweave.commands.network import (
+    add_network,
+    network_of,
+    renew_access,
+    router_settings,
+    settings_of,
+    stop_on_signals,
+)
 
 LARGE = 20_000_000
 """Bytes of a store whose reading is announced, since it takes long."""
@@ -48,23 +55,25 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
-    from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
     logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
-    logging.getLogger("mapweave.mapserver").setLevel(logging.INFO)
+    for part in ("mapweave.mapserver", "mapweave.wire"):
+        logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
-    name, keys = check_name(arguments.name or network.server), Keys(network.fleet)
+    name = check_name(arguments.name or network.server)
+    router, folder = router_settings(network, name)
+    keys = Keys(router.fleet)
     address = None
     if arguments.http is not None:
         from mapweave.mapserver.http.web import Web, parse_address
 
         address = parse_address(arguments.http)
     stop = stop_on_signals()
-    bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
+    bus = ZenohBus(router)
     try:
         how = ServerSettings(settings.admission_control, settings.merge)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
@@ -74,8 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
                 print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
             server = MapServer(bus, keys, path, name, how, schedule)
             stack.enter_context(server)
-            where = ", ".join(network.endpoints)
-            print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
+            where = ", ".join(router.listen)
+            print(f"map server {name} of fleet {keys.fleet} listens at {where}", flush=True)
             if address is not None:
                 stack.enter_context(Web(address, server, commands=arguments.http_commands))
                 print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
@@ -83,6 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
             manager.ready()
             while not stop.wait(1.0):
                 manager.alive()
+                if folder is not None:
+                    router = renew_access(bus, folder, router, name)
                 now = server.summary()
                 if now != last_line:
                     print(now, flush=True)
