@@ -109,7 +109,7 @@ def _pixels(data: bytes) -> NDArray[np.uint8]:
     if image is None:
         raise InvalidValue("the image is damaged")
     if image.dtype != np.uint8:
-        image = (image >> 8).astype(np.uint8)
+        image = np.right_shift(image.astype(np.uint16), 8).astype(np.uint8)
     if png_with_alpha and image.ndim == 3 and image.shape[2] in (2, 4):
         alpha = image[:, :, -1:].astype(np.float32) / 255.0
         image = np.rint(image[:, :, :-1] * alpha + 255.0 * (1.0 - alpha)).astype(np.uint8)
