@@ -8,8 +8,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.floor_plan import FittedPair, FloorPlan, PlacedPlan, PlanPair, PlanPart
+from mapweave.hybridmap.floor_plan import FittedPair, FloorPlan, PlacedPlan, PlacedPlans, PlanPair, PlanPart
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.similarity import (
@@ -52,6 +53,13 @@ def placed_plan(name: str, plan: FloorPlan, merged: MergedMap) -> PlacedPlan:
     if missing:
         reasons.append(f"{_pairs(len(missing))} of nodes that are not in the merged map: {', '.join(nodes)}")
     return PlacedPlan(name, plan, tuple(parts), "; ".join(reasons))
+
+
+def placed_plans(annotations: Annotations, merged: MergedMap) -> PlacedPlans:
+    """All plans that are in force, by name."""
+    return PlacedPlans(
+        tuple(placed_plan(entry.name, plan, merged) for entry, plan in annotations.in_force(FloorPlan))
+    )
 
 
 def check_plan(plan: FloorPlan, merged: MergedMap) -> PlacedPlan:

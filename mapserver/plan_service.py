@@ -1,0 +1,94 @@
+"""Floor plans of a running server: their images, and where each lies under the newest merged map."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
+from mapweave.mapserver.floor_plans import placed_plans
+from mapweave.mapserver.plan_images import PlanImages
+from mapweave.mapserver.services import guarded
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.bus import Bus, Closing
+from mapweave.wire.keys import Keys
+from mapweave.wire.messages import encode
+
+
+class PlanService:
+    """Declared on a bus until closed. Thread-safe."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        name: str,
+        merged: Callable[[], MergedMap],
+        annotations: Callable[[], Annotations],
+        store: Path,
+    ) -> None:
+        """Begin to answer.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            name: of the server in the fleet.
+            merged: the newest merged map. May wait for it.
+            annotations: the record, in which the plans are.
+            store: path of the server's store, beside which the images are.
+        """
+        self._merged, self._annotations = merged, annotations
+        used = {entry.body.image.sha256 for entry in annotations().made if isinstance(entry.body, FloorPlan)}
+        self.images = PlanImages(store, used)
+        self._lock = threading.Lock()
+        self._placed: tuple[MergedMap, Annotations, PlacedPlans] | None = None
+        self._closing: list[Closing] = [
+            bus.serve(keys.plans(name), guarded(lambda _: encode(self.plans()))),
+            bus.serve(keys.plan_image(name), guarded(lambda payload: self.images.get(_sha256(payload)))),
+            bus.serve(keys.put_plan_image(name), guarded(lambda payload: encode(self.images.put(payload)))),
+        ]
+
+    def close(self) -> None:
+        """Stop answering."""
+        for closing in self._closing:
+            closing.close()
+
+    def plans(self) -> PlacedPlans:
+        """All plans, under the newest merged map; worked out once for each."""
+        merged, annotations = self._merged(), self._annotations()
+        with self._lock:
+            if self._placed is None or self._placed[0] is not merged or self._placed[1] != annotations:
+                self._placed = merged, annotations, placed_plans(annotations, merged)
+            return self._placed[2]
+
+    def image(self, name: str) -> bytes:
+        """The PNG file of a plan.
+
+        Raises:
+            InvalidValue: there is none of this name.
+            InvalidFile: its image is lost.
+        """
+        return self.images.get(self.plans().plan(name).plan.image.sha256)
+
+    def check(self, plan: FloorPlan) -> None:
+        """Refuse a plan without its image (InvalidValue)."""
+        if plan.image.sha256 not in self.images:
+            raise InvalidValue("the image of this plan is not on the server: send it first")
+
+    def files(self) -> dict[str, bytes]:
+        """The images of the plans in force, for a map file; those that are lost are left out."""
+        used = [plan.image for _, plan in self._annotations().in_force(FloorPlan)]
+        return {image.sha256: self.images.get(image.sha256) for image in used if self._there(image)}
+
+    def _there(self, image: PlanImage) -> bool:
+        return image.sha256 in self.images
+
+
+def _sha256(payload: bytes) -> str:
+    try:
+        return payload.decode("ascii")
+    except UnicodeDecodeError:
+        raise InvalidMessage("no name of an image") from None
