@@ -124,6 +124,7 @@ class RobotEntry:
         status: the last one; None if none has come.
         merged_from_robot: where it is in the merged map, if that is known.
         component: number of that map's component; -1 if it is not known.
+        place: the name of the place where it is; empty if it has none.
     """
 
     robot: Name
@@ -132,6 +133,7 @@ class RobotEntry:
     status: AgentStatus | None = None
     merged_from_robot: Pose2 | None = None
     component: Annotated[int, Meta(ge=-1)] = NO_COMPONENT
+    place: Annotated[str, Meta(max_length=64)] = ""
 
 
 @dataclass(frozen=True)

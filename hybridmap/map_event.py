@@ -20,6 +20,8 @@ class MapEventKind(StrEnum):
     """The merge fails with a map, and is made without it; or it is taken in again."""
     CONSTRAINED = "constrained"
     """A person has decided."""
+    ANNOTATED = "annotated"
+    """A person has said something about the map."""
     FRAME = "frame"
     """A pinned frame has moved, or holds again."""
     FAILED = "failed"

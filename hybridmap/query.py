@@ -29,6 +29,9 @@ MAX_CANDIDATES = 64
 MAX_BLOCKED = 256
 MAX_LEGS = 512
 """A route through a building has tens of legs."""
+MAX_WORDS_ASKED = 64
+REACH = 2.0
+"""A position is the nearest node if that is no farther away, m; robots park at nodes alone."""
 MAX_KNOWN = 512
 """Views in one answer: 8 kB, as much as two or three nodes."""
 
@@ -78,6 +81,7 @@ class Whereabouts:
         inliers: landmarks that agree.
         probability: that this place is the right one, 0 to 1.
         distance_known: if not, the node's scale was not measured, and the covariance includes that.
+        place: the name of the place where this is; empty if it has none.
     """
 
     node: NodeId
@@ -87,6 +91,7 @@ class Whereabouts:
     inliers: LandmarkCount
     probability: Probability
     distance_known: bool = True
+    place: Annotated[str, Meta(max_length=64)] = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +228,47 @@ class KnownRequest:
     x: Coordinate
     y: Coordinate
     reach: Annotated[float, Meta(ge=0.0, le=MAX_POSITION)]
+
+
+@dataclass(frozen=True, slots=True)
+class ResolveRequest:
+    """Which nodes are these words?
+
+    Attributes:
+        words: nodes (r0.1.17), names of places, or positions in the merged map (3.1,-2.0).
+        near: a node, or a place: positions are in the frame of its component; empty: of the largest one.
+        reach: a position is refused if no node is nearer than this, m.
+    """
+
+    words: Annotated[tuple[Annotated[str, Meta(max_length=64)], ...], Meta(max_length=MAX_WORDS_ASKED)]
+    near: Annotated[str, Meta(max_length=64)] = ""
+    reach: Annotated[float, Meta(ge=0.0, le=MAX_POSITION)] = REACH
+
+
+@dataclass(frozen=True, slots=True)
+class Resolved:
+    """A node for a word.
+
+    Attributes:
+        node: an active one, unless the word is a node itself.
+        merged_from_node: its pose in the frame of its component.
+        component: number of the component.
+        place: the name of the place, if the word is one; else empty.
+        note: what is to be said about it, such as that another node was taken; may be empty.
+    """
+
+    node: NodeId
+    merged_from_node: Pose2
+    component: Annotated[int, Meta(ge=0, le=MAX_NUMBER)]
+    place: Annotated[str, Meta(max_length=64)] = ""
+    note: Words = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ResolveAnswer:
+    """One for each word."""
+
+    found: Annotated[tuple[Resolved, ...], Meta(max_length=MAX_WORDS_ASKED)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
     MAX_MAPS_LISTED,
@@ -91,6 +92,7 @@ class Explainer:
         consistency: ConsistencySettings,
         wary: Callable[[], Collection[tuple[NodeId, NodeId]]],
         events: Callable[[], Iterable[MapEvent]],
+        annotations: Callable[[], Annotations] = Annotations,
     ) -> None:
         """Begin to answer.
 
@@ -106,6 +108,7 @@ class Explainer:
             consistency: as in the merge.
             wary: pairs of nodes between which robots of late did not get through.
             events: what has become of the maps.
+            annotations: the record.
         """
         self._answers = answers
         self._admission = admission
@@ -115,6 +118,7 @@ class Explainer:
         self._consistency = consistency
         self._wary = wary
         self._events = events
+        self._annotations = annotations
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
@@ -157,8 +161,8 @@ class Explainer:
         return FleetExplanation((_still(two, settled),))
 
     def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps and the manual constraints, in order."""
-        return with_constraints(self._events(), self._record.constraints)
+        """The history of the maps, the manual constraints and the annotations, in order."""
+        return with_constraints(self._events(), self._record.constraints, self._annotations())
 
     def _apply_constraint(self, payload: bytes) -> bytes:
         constraint = decode(payload, ManualConstraint)

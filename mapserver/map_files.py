@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -27,12 +28,15 @@ PROBABILITY = "probability"
 """Name among the evidence of a link in a file: see mapweave.merge.outlier_rejection.link_probability."""
 
 
-def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
+def map_file_of(
+    merged: MergedMap, history: Iterable[MapEvent] = (), annotations: Annotations | None = None
+) -> MapFile:
     """A whole merged map: nodes, edges, links with their probabilities, refusals, manual constraints, poses.
 
     Args:
         merged: the map.
         history: events of its maps.
+        annotations: what people say about it.
     """
     whole = merged.union()
     probabilities = link_probabilities(merged)
@@ -50,6 +54,7 @@ def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
         merged.superseded,
         merged.faded,
         tuple(history),
+        (annotations or Annotations()).made,
     )
 
 

@@ -27,8 +27,8 @@ from mapweave.hybridmap.mission_order import (
 from mapweave.hybridmap.node import MapId, check_name
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.roster import Roster
-from mapweave.mapserver.routes import Router
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
@@ -53,7 +53,7 @@ class MissionRelay:
         bus: Bus,
         keys: Keys,
         store: Store,
-        router: Callable[[], Router],
+        places: Callable[[], Places],
         time_ns: Callable[[], int],
     ) -> None:
         """Go on with the record of the store.
@@ -62,10 +62,10 @@ class MissionRelay:
             bus: the connection; stays the caller's.
             keys: of the fleet.
             store: keeps the record.
-            router: of the newest merged map.
+            places: of the newest merged map.
             time_ns: the present time.
         """
-        self._bus, self._keys, self._store, self._router, self._time_ns = bus, keys, store, router, time_ns
+        self._bus, self._keys, self._store, self._places, self._time_ns = bus, keys, store, places, time_ns
         self.roster: Roster | None = None
         self._turn = threading.RLock()
         self._reports: dict[str, MissionReport] = {}
@@ -138,7 +138,7 @@ class MissionRelay:
             raise InvalidValue(f"no robot {robot} has been heard of")
         if request.goal:
             map_id = MapId(robot, 0 if status is None else status.epoch)
-            node = node_of_goal(request.goal, map_id, self._router())
+            node = node_of_goal(request.goal, map_id, self._places())
         order = MissionOrder(
             request.id, robot, request.kind, request.stamp_ns, request.by, node, request.goal
         )

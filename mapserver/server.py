@@ -15,11 +15,13 @@ from pathlib import Path
 from types import TracebackType
 
 from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
+from mapweave.mapserver.annotator import AnnotationRecord, Annotator
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
@@ -29,6 +31,7 @@ from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
 from mapweave.mapserver.mission_relay import MissionRelay
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.roster import Roster
@@ -102,6 +105,7 @@ class MapServer:
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
         self._constraints = ConstraintRecord(self._store)
         self._worker.constrain(self._constraints.constraints)
+        self._annotations = AnnotationRecord(self._store)
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
@@ -112,21 +116,21 @@ class MapServer:
         worker, clock = self._worker, self._schedule
         worker.start()
         self._ingest = Ingest(self._bus, self._keys, self._store, self._name, worker.take, replay=worker.read)
-        self._missions = MissionRelay(
-            self._bus, self._keys, self._store, lambda: worker.current().router, clock.time_ns
-        )
+        self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
         self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
             lambda: self._history.events, self._missions, self._roster,
-            clock.executor(RELAYS), clock.monotonic, clock.executor(1),
+            clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places,
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,
             worker.constrain, lambda: worker.settled, self._settings.merge.consistency,
             lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
+            lambda: self._annotations.annotations,
         )  # fmt: skip
+        self._annotator = Annotator(self._bus, self._keys, self._name, self._named_places, self._annotations)
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
@@ -140,6 +144,7 @@ class MapServer:
         self._services.close()
         self._roster.close()
         self._explainer.close()
+        self._annotator.close()
         self._admission.close()
         self._ingest.close()
         self._broadcast.close()
@@ -190,7 +195,7 @@ class MapServer:
         Raises:
             Busy: too many ask.
         """
-        return self._admission.submit(lambda: self._worker.current().relocalizer.answer(look()), ticket)
+        return self._admission.submit(lambda: self._services.locate(look()), ticket)
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
         """Ask why nodes or maps are linked or are not, or why a route leads so, from any thread.
@@ -201,8 +206,28 @@ class MapServer:
         return self._admission.submit(lambda: self._explainer.explain(request), usual=False)
 
     def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps and the manual constraints, in order."""
+        """The history of the maps, the manual constraints and the annotations, in order."""
         return self._explainer.history()
+
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+        return self._annotations.annotations
+
+    def annotate(self, annotation: Annotation) -> str:
+        """Add an annotation to the record, from any thread; returns what it says, in words.
+
+        Raises:
+            InvalidValue: it says nothing new, or is about something that is not there.
+        """
+        return self._annotator.annotate(annotation)
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words, from any thread.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+        """
+        return self._annotator.resolve(request)
 
     def command(self, request: MissionRequest) -> MissionReport:
         """Hand a mission on to its robot, from any thread; waits for the robot's answer.
@@ -222,11 +247,14 @@ class MapServer:
 
     def robots(self) -> FleetStatus:
         """The robots, and where they are."""
-        return self._roster.robots(self._worker.current().merged)
+        return self._roster.robots(self._named_places())
 
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file."""
         return self._services.map_file()
+
+    def _named_places(self) -> Places:
+        return Places(self._worker.current().router, self._annotations.annotations)
 
     def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))

@@ -9,12 +9,20 @@ from concurrent.futures import Executor, Future
 from mapweave.hybridmap.errors import Busy, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
-from mapweave.hybridmap.query import KnownRequest, ReserveRequest, RouteAnswer, RouteRequest
+from mapweave.hybridmap.query import (
+    KnownRequest,
+    RelocalizeAnswer,
+    ReserveRequest,
+    RouteAnswer,
+    RouteRequest,
+    View,
+)
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.packed_map import PackedMap
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
@@ -46,6 +54,7 @@ class Services:
         relays: Executor,
         clock: Callable[[], float],
         executor: Executor,
+        places: Callable[[], Places],
     ) -> None:
         """Begin to answer.
 
@@ -63,7 +72,9 @@ class Services:
             relays: waits for robots' answers; it is shut down with this.
             clock: only grows, s.
             executor: packs the whole map; it is shut down with this.
+            places: named places of the newest merged map. May wait for it.
         """
+        self._places = places
         self._clock = clock
         self._answers = answers
         self._admission = admission
@@ -74,8 +85,9 @@ class Services:
         self._relays = relays
         self._reservations = Reservations()
         self._map = PackedMap(
-            answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor
-        )
+            answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
+            lambda: places().annotations,
+        )  # fmt: skip
         self._closing: list[Closing] = [
             bus.serve(keys.relocalize(name), self._relocalize_later),
             bus.serve(keys.route(name), guarded(self._route)),
@@ -84,7 +96,7 @@ class Services:
             bus.serve(keys.reserve(name), guarded(self._reserve)),
             bus.serve(keys.server_mission(name), self._command_later),
             bus.serve(keys.missions(name), guarded(lambda _: encode(missions.missions()))),
-            bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(answers().merged)))),
+            bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(places())))),
             bus.serve(keys.server_status(name), guarded(self._tell_status)),
             bus.announce(keys.server_alive(name)),
         ]
@@ -111,7 +123,11 @@ class Services:
 
     def _relocalize(self, payload: bytes) -> bytes:
         view = decode_view(payload)
-        return encode(within_range(self._answers().relocalizer.answer(view)))
+        return encode(within_range(self.locate(view)))
+
+    def locate(self, view: View) -> RelocalizeAnswer:
+        """Where a view was taken, with the names of the places."""
+        return self._places().named(self._answers().relocalizer.answer(view))
 
     def _route(self, payload: bytes) -> bytes:
         request = decode(payload, RouteRequest)

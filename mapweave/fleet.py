@@ -11,12 +11,14 @@ from __future__ import annotations
 import getpass
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import (
     MissionKind,
@@ -28,17 +30,22 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.identities.key_file import read_key_file
+from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.storage.map_file import MapFile, unpack_map_file
 from mapweave.wire.bus import Bus, Reply, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
 SOON = 2.0
 """s; a router that is there is found sooner, and a robot that is there answers sooner."""
+ANSWER = 10.0
+"""A server that merges answers questions about its map late, s."""
 PACKING = 120.0
 """How long a server may take to pack a large map, s."""
 TRIES = 3
@@ -146,7 +153,7 @@ class Fleet:
         return tuple(report for report in reports if robot in ("", report.order.robot))
 
     def go(self, robot: str, goal: str, wait: float = 0.0) -> MissionReport:
-        """Send a robot to a node (`r0.1.17`), a position in the merged map (`3.1,-2.0`) or `home`.
+        """Send a robot to a node (`r0.1.17`), a place, a position in the merged map (`3.1,-2.0`) or `home`.
 
         Args:
             robot: which.
@@ -237,6 +244,68 @@ class Fleet:
     def map(self) -> MapFile:
         """The merged map; see `map_bytes`."""
         return unpack_map_file(self.map_bytes())
+
+    def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
+        """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
+
+        Args:
+            kind: of the annotation: place, closure, preference.
+            name: for the same kind and name the last one holds.
+            because: why.
+            fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a
+                place, a position `3.1,-2.0` in the merged map. An area is `corners`, positions in the merged
+                map (in the component of the place or node `near`), or `radius`, m, around `node`.
+
+        Returns:
+            What it says, in words.
+
+        Raises:
+            MapweaveError: it says nothing new, is about something that is not there, or no server answers.
+        """
+        return self._annotate(name, {"kind": kind, **fields}, False, because)
+
+    def withdraw(self, kind: str, name: str, because: str = "") -> str:
+        """Withdraw what was said about the map; see `annotate`."""
+        return self._annotate(name, {"kind": kind}, True, because)
+
+    def annotations(self) -> Annotations:
+        """What people say about the map.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._of_server(self._keys.any_annotations(), b""), Annotations)
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words: names of places, and positions in the merged map.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+            NotConnected: no map server answers.
+        """
+        return decode(self._of_server(self._keys.any_resolve(), encode(request)), ResolveAnswer)
+
+    def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
+        annotation = annotation_of_words(
+            name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
+        )
+        said = decode_record(self._of_server(self._keys.any_annotate(), encode(annotation)))["said"]
+        return str(said)
+
+    def _of_server(self, key: str, payload: bytes) -> bytes:
+        """The answer of a map server.
+
+        Raises:
+            InvalidValue: it refuses.
+            NotConnected: none answers.
+        """
+        replies = self._bus.ask(key, payload, ANSWER)
+        for reply in replies:
+            if not reply.error:
+                return reply.payload
+        if replies:
+            raise InvalidValue(replies[0].error.removeprefix("refused: "))
+        raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
 
     def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
         """By way of the map server; without one directly."""

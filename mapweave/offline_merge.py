@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
@@ -31,12 +32,14 @@ class Parts:
         constraints: manual constraints in any of the files.
         notes: what was left out, one sentence each.
         history: history of the maps in any of the files, in order.
+        annotations: what people say about them in any of the files.
     """
 
     maps: dict[MapId, HybridMap]
     constraints: ManualConstraints
     notes: tuple[str, ...] = ()
     history: tuple[MapEvent, ...] = ()
+    annotations: Annotations = field(default_factory=Annotations)
 
 
 def parts_of(files: Mapping[Path, MapFile]) -> Parts:
@@ -68,7 +71,8 @@ def parts_of(files: Mapping[Path, MapFile]) -> Parts:
         constraints += ManualConstraints(content.constraints)
     events = {hybrid_map for content in files.values() for hybrid_map in content.history}
     history = sorted(events, key=lambda hybrid_map: (hybrid_map.stamp_ns, hybrid_map.kind, hybrid_map.words))
-    return Parts(maps, constraints, tuple(notes), tuple(history))
+    said = sum((Annotations(content.annotations) for content in files.values()), Annotations())
+    return Parts(maps, constraints, tuple(notes), tuple(history), said)
 
 
 def _length(hybrid_map: HybridMap) -> int:
@@ -132,4 +136,4 @@ def merge_map_files(paths: Iterable[Path]) -> MapFile:
         InvalidValue: a map cannot be merged.
     """
     parts = parts_of({path: read_map_file(path) for path in paths})
-    return map_file_of(merge_parts(parts.maps, parts.constraints), parts.history)
+    return map_file_of(merge_parts(parts.maps, parts.constraints), parts.history, parts.annotations)

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.manual_constraint import ManualConstraint
@@ -27,6 +28,8 @@ from mapweave.hybridmap.query import (
     RelocalizeAnswer,
     ReserveAnswer,
     ReserveRequest,
+    ResolveAnswer,
+    ResolveRequest,
     RouteAnswer,
     RouteRequest,
     View,
@@ -75,6 +78,10 @@ LIMITS: dict[type, Limit] = {
     FleetExplanation: Limit("explanation", 8_000_000, 500_000),
     RouteExplanation: Limit("explanation of a route", 16_000_000, 200_000),
     ManualConstraint: Limit("manual constraint", 4096),
+    Annotation: Limit("annotation", 2**16),
+    Annotations: Limit("annotations", 2**26, 4_000_000),
+    ResolveRequest: Limit("resolve request", 2**14),
+    ResolveAnswer: Limit("resolved places", 2**16),
     History: Limit("history", 2**26, 1_000_000),
     AgentStatus: Limit("agent status", 2**15),
     DriveRequest: Limit("drive request", 256),

@@ -23,6 +23,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.annotation import BODIES, KINDS, MAX_ANNOTATIONS, Annotation, Body
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
@@ -78,6 +79,26 @@ def _events(events: list[dict[str, Any]]) -> tuple[MapEvent, ...]:
     return tuple(_convert(event, _schema(MapEvent)) for event in read)
 
 
+def _body(plain: dict[str, Any]) -> Any:
+    kind = plain.get("kind")
+    if not isinstance(kind, str) or kind not in BODIES:
+        raise InvalidMessage(f"annotation of unknown kind {kind!r:.40}; known are {', '.join(BODIES)}")
+    body: Any = BODIES[kind]
+    return _convert(plain, _schema(body))
+
+
+def _annotations(entries: list[dict[str, Any]]) -> tuple[Annotation, ...]:
+    """Skips annotations of unknown kinds: a newer program may have written them."""
+    bodies = [entry.get("body") for entry in entries]
+    newer = [
+        isinstance(body, dict) and isinstance(body.get("kind"), str) and body["kind"] not in BODIES
+        for body in bodies
+    ]
+    return tuple(
+        _convert(entry, _schema(Annotation)) for entry, skip in zip(entries, newer, strict=True) if not skip
+    )
+
+
 def _distortion(plain: list[float] | dict[str, Any]) -> Distortion:
     return _convert(plain, _schema(Equidistant if isinstance(plain, dict) else RadialTangential))  # type: ignore[no-any-return]
 
@@ -92,6 +113,10 @@ FORMS: dict[Any, Form] = {
     Ends: Form(tuple[list[Any], list[Any]], _ends),
     Distortion: Form(list[float] | dict[str, Any], _distortion),
     tuple[MapEvent, ...]: Form(list[dict[str, Any]], _events),
+    Body: Form(dict[str, Any], _body),
+    tuple[Annotation, ...]: Form(
+        Annotated[list[dict[str, Any]], Meta(max_length=MAX_ANNOTATIONS)], _annotations
+    ),
 }
 PACKERS: Packers = {
     PoseGaussian: pack_pose,
@@ -117,7 +142,9 @@ def packed(value: Any, packers: Packers = PACKERS) -> Any:
     if (pack_value := packers.get(type(value))) is not None:
         return pack_value(value)
     if is_dataclass(value):
-        return {field.name: packed(getattr(value, field.name), packers) for field in fields(value)}
+        values = {field.name: packed(getattr(value, field.name), packers) for field in fields(value)}
+        kind = KINDS.get(type(value))
+        return values if kind is None else {"kind": kind, **values}
     match value:
         case msgspec.Struct():
             return msgspec.to_builtins(value, builtin_types=(bytes,))
@@ -161,6 +188,20 @@ def decode(data: bytes, kind: type[Value], limit: Limit) -> Value:
     """
     schema: Any = kind
     value: Value = unpack(data, _schema(schema), limit, _read)
+    return value
+
+
+def value_of(plain: Any, kind: type[Value]) -> Value:
+    """A value of plain data, as `packed` returns it.
+
+    Raises:
+        InvalidValue: something is missing, of another type or out of range.
+    """
+    schema: Any = kind
+    try:
+        value: Value = _convert(plain, _schema(schema))
+    except msgspec.ValidationError as error:
+        raise InvalidValue(str(error).splitlines()[0]) from None
     return value
 
 

@@ -9,6 +9,8 @@
     GET /robots       what every robot is doing, JSON
     GET /missions     the missions that are known, JSON
     GET /map          the merged map, a map file
+    GET /annotations  what people say about the map: named places and so on, JSON
+    POST /annotations JSON: adds an annotation, or withdraws one
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
@@ -41,10 +43,11 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
 from mapweave.hybridmap.explanation import Explanation
-from mapweave.hybridmap.manual_constraint import EXAMPLE, read_ends
+from mapweave.hybridmap.manual_constraint import EXAMPLE, Ends, read_ends
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveRequest, View
+from mapweave.mapserver.http.annotations import Annotating, annotate, annotations_json
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.same_site import SameSite
@@ -65,7 +68,8 @@ WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
 METHODS = dict.fromkeys(
-    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/annotations"),
+    "GET",
 ) | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
 BY = "http"
 """Gives a mission, if the request does not say."""
@@ -74,7 +78,7 @@ BY = "http"
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
 
 
-class Answering(Protocol):
+class Answering(Annotating, Protocol):
     """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
@@ -204,10 +208,12 @@ class Questions:
         answering: dict[str, Answer] = {
             "/status": self._status, "/history": self._history, "/explain": self._explain,
             "/route": self._explain, "/robots": self._robots, "/missions": self._missions, "/map": self._map,
+            "/annotations": self._annotations,
         }  # fmt: skip
         routes = [
             *(Route(path, _page(name)) for path, name in PAGES.items()),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
+            Route("/annotations", self._answering(self._annotate), methods=["POST"]),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
@@ -260,6 +266,14 @@ class Questions:
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
 
+    async def _annotations(self, _: Request) -> Mapping[str, Any]:
+        return await run_in_threadpool(annotations_json, self._server)
+
+    async def _annotate(self, request: Request) -> Mapping[str, Any]:
+        self._check_commands(request)
+        body = await self._body(request, "JSON")
+        return await run_in_threadpool(annotate, self._server, body, request.query_params.get("by", BY))
+
     async def _map(self, _: Request) -> Response:
         data = await self._result(self._server.map_file)
         headers = {"Content-Disposition": 'attachment; filename="merged.mapweave"'}
@@ -290,21 +304,24 @@ class Questions:
         return await run_in_threadpool(stop)
 
     def _check_commands(self, request: Request) -> None:
-        """There is no password: unless it is set otherwise, robots are moved from this machine alone."""
+        """There is no password: unless it is set otherwise, only this machine moves robots and annotates."""
         host = "" if request.client is None else request.client.host
         if not self._commands and not is_loopback(host):
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
-                "robots take missions from this machine alone: start the server with --http-commands",
+                "missions and annotations come from this machine alone: start the server with "
+                "--http-commands",
             )
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
-        ends, path, query = None, request.url.path, dict(request.query_params)
+        ends: Ends | None = None
+        path, query = request.url.path, dict(request.query_params)
         route = path == "/route"
         if query or route:
             if query.keys() != {"a", "b"}:
                 raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
-            ends = read_ends(query["a"].strip(), query["b"].strip())
+            words = query["a"].strip(), query["b"].strip()
+            ends = await run_in_threadpool(_ends, words, self._server)
         asked = ExplainRequest(ends, route)
         explanation = await self._result(lambda: self._server.explain(asked))
         return await run_in_threadpool(json_values, explanation)
@@ -322,9 +339,9 @@ class Questions:
         async with asyncio.timeout(self._patience):
             return await asyncio.wrap_future(await run_in_threadpool(ask))
 
-    async def _body(self, request: Request) -> bytes:
+    async def _body(self, request: Request, what: str = "a JPEG or PNG image") -> bytes:
         """All of it, in the time that a body may take; refused before it is sent if it is too long."""
-        length = _length(request)
+        length = _length(request, what)
         body = bytearray()
         async with asyncio.timeout(self._patience):
             async for piece in request.stream():
@@ -335,15 +352,24 @@ class Questions:
         return bytes(body)
 
 
-def _length(request: Request) -> int:
+def _length(request: Request, what: str) -> int:
     text = request.headers.get("Content-Length", "")
     if "Transfer-Encoding" in request.headers or not (text.isascii() and text.isdigit()):
-        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the image with Content-Length")
+        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the body with Content-Length")
     if len(text) > 12 or int(text) > MOST_BYTES:
         raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES >> 20} MiB are taken")
     if int(text) == 0:
-        raise InvalidValue("send a JPEG or PNG image as the body")
+        raise InvalidValue(f"send {what} as the body")
     return int(text)
+
+
+def _ends(words: tuple[str, str], server: Answering) -> Ends:
+    """Two nodes or maps; a word that is none may be the name of a place, or a position."""
+    known = server.annotations()
+    if any(known.last("place", word) or "," in word for word in words):
+        first, second = server.resolve(ResolveRequest(words)).found
+        return first.node, second.node
+    return read_ends(*words)
 
 
 def is_loopback(host: str) -> bool:

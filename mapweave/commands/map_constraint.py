@@ -100,5 +100,5 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     merged = merged_with_progress(parts.maps, parts.constraints + ManualConstraints([constraint]), settings)
     out = arguments.out or arguments.map
     history = (*parts.history, *between(before, merged, constraint.stamp_ns))
-    write_map_file(out, map_file_of(merged, history))
+    write_map_file(out, map_file_of(merged, history, parts.annotations))
     print(f"{out}: {merged.summary()}")

@@ -11,8 +11,10 @@ from mapweave.commands.network import connect, network_of, settings_of
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.manual_constraint import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode, encode
 
 
 def ends_of(words: list[str]) -> Ends:
@@ -35,6 +37,50 @@ def _patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Reply
         if pause <= 0.0 or time.monotonic() + pause > end:
             return replies
         time.sleep(pause)
+
+
+def resolved(arguments: argparse.Namespace, words: list[str]) -> list[str]:
+    """Words with nodes in the place of named places and positions; nodes and maps as they are.
+
+    Args:
+        arguments: of the command line; with `map`, of this map file, else of a running server.
+        words: as people write them.
+
+    Raises:
+        MapweaveError: a word is none of these, or no server answers.
+    """
+    asked = [word for word in words if not _is_end(word)]
+    if not asked:
+        return words
+    found = resolve(arguments, ResolveRequest(tuple(asked))).found
+    for word, one in zip(asked, found, strict=True):
+        if one.note:
+            print(f"mapweave: {word}: {one.note}", file=sys.stderr)
+    nodes = {word: str(one.node) for word, one in zip(asked, found, strict=True)}
+    return [nodes.get(word, word) for word in words]
+
+
+def resolve(arguments: argparse.Namespace, request: ResolveRequest) -> ResolveAnswer:
+    """Nodes for words, by a map file or a running server; see `resolved`."""
+    if arguments.map is None:
+        return decode(ask(arguments, Keys.any_resolve, encode(request))[0].payload, ResolveAnswer)
+    from mapweave.hybridmap.annotation import Annotations
+    from mapweave.mapserver.map_files import merged_of
+    from mapweave.mapserver.places import Places
+    from mapweave.mapserver.routes import Router
+    from mapweave.storage.map_file import read_map_file
+
+    content = read_map_file(arguments.map)
+    merged = merged_of(content, settings_of(arguments).merge)
+    return Places(Router(merged), Annotations(content.annotations)).answer(request)
+
+
+def _is_end(word: str) -> bool:
+    try:
+        read_end(word)
+    except InvalidValue:
+        return False
+    return True
 
 
 def map_of(word: str) -> MapId:

@@ -23,7 +23,7 @@ def add_to(actions: Any) -> None:
         help="why two nodes or two maps are linked, or are not",
         description="Explain why two nodes (r0.1.17 r1.1.5) are linked or not, or why two maps (r0.1 r1.1) "
         "are one or are not, with every number behind it; without ends, of each two maps. A running server "
-        "is asked, or a map file.",
+        "is asked, or a map file. A named place stands for its node.",
     )
     parser.add_argument("ends", nargs="*", metavar="NODE|MAP", help="two nodes or two maps")
     parser.add_argument("--map", type=Path, metavar="FILE", help="explain this map file; no server is asked")
@@ -36,7 +36,7 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print, draw."""
-    from mapweave.commands.map_ends import ends_of
+    from mapweave.commands.map_ends import ends_of, resolved
     from mapweave.explanation_text import maps_words, pair_words
     from mapweave.extras import need
     from mapweave.hybridmap.errors import InvalidValue
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.draw is not None:
         need("viz")
-    ends = ends_of(arguments.ends) if arguments.ends else None
+    ends = ends_of(resolved(arguments, arguments.ends)) if arguments.ends else None
     first, second = ends or (None, None)
     if isinstance(first, NodeId) and isinstance(second, NodeId):
         pair = explained_nodes(arguments, first, second)

@@ -46,12 +46,13 @@ def run(arguments: argparse.Namespace) -> int:
     left_out = len(listed) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
     lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in listed[-arguments.most :]]
-    print("\n".join(lines) if lines else "no joins, splits or manual constraints yet")
+    print("\n".join(lines) if lines else "no joins, splits, manual constraints or annotations yet")
     return 0
 
 
 def _history(arguments: argparse.Namespace) -> History:
     from mapweave.commands.map_ends import ask
+    from mapweave.hybridmap.annotation import Annotations
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.map_event import History
     from mapweave.mapserver.constraint_history import with_constraints
@@ -62,4 +63,8 @@ def _history(arguments: argparse.Namespace) -> History:
     if arguments.map is None:
         return decode(ask(arguments, Keys.any_history, b"")[0].payload, History)
     content = read_map_file(arguments.map)
-    return History(with_constraints(content.history, ManualConstraints(content.constraints)))
+    return History(
+        with_constraints(
+            content.history, ManualConstraints(content.constraints), Annotations(content.annotations)
+        )
+    )

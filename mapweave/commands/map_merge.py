@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = settings_of(arguments).merge
     parts = parts_of({path: read_map_file(path) for path in arguments.files})
     merged = merged_with_progress(parts.maps, parts.constraints, settings)
-    write_map_file(arguments.out, map_file_of(merged, parts.history))
+    write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
     if arguments.json:

@@ -20,12 +20,12 @@ def add_to(actions: Any) -> None:
     parser: argparse.ArgumentParser = actions.add_parser(
         "route",
         help="the way from node to node, and why it leads so, or why there is none",
-        description="Explain the route from one node to another (r0.1.17 r1.1.5), step by step; "
-        "why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
+        description="Explain the route from one node or named place to another (r0.1.17 kitchen), step by "
+        "step; why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
         "blocked, or which maps would have to be one. A running server is asked, or a map file. "
         "Exit status 0: there is a way; 2: there is none; 1: could not ask.",
     )
-    parser.add_argument("start", metavar="START", help="a node")
+    parser.add_argument("start", metavar="START", help="a node, a named place, or a position")
     parser.add_argument("goal", metavar="GOAL", help="another one")
     parser.add_argument(
         "--blocked", nargs=2, action="append", default=[], metavar="NODE",
@@ -41,15 +41,16 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapweave.commands.map_ends import node_of
+    from mapweave.commands.map_ends import node_of, resolved
     from mapweave.explanation_text import route_words
     from mapweave.extras import need
     from mapweave.mapserver.http.json_values import json_values
 
     if arguments.draw is not None:
         need("viz")
-    start, goal = node_of(arguments.start), node_of(arguments.goal)
-    blocked = tuple((node_of(a), node_of(b)) for a, b in arguments.blocked)
+    words = [arguments.start, arguments.goal, *(word for pair in arguments.blocked for word in pair)]
+    start, goal, *rest = map(node_of, resolved(arguments, words))
+    blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
     explanation = explained_route(arguments, start, goal, blocked)
     values, lines = json_values(explanation), route_words(explanation)
     if arguments.draw is not None and explanation.found:

@@ -133,15 +133,16 @@ def _print(answer: RelocalizeAnswer) -> None:
     for place in answer.candidates:
         x, y, heading = place.node_from_robot.mean.vector
         sx, sy, sh = np.sqrt(np.diag(place.node_from_robot.covariance))
+        named = f", {place.place}" if place.place else ""
         if not place.distance_known:
             print(
-                f"  node {place.node}: somewhere near it, {math.degrees(heading):+.1f} deg "
+                f"  node {place.node}{named}: somewhere near it, {math.degrees(heading):+.1f} deg "
                 f"(sigma {math.degrees(sh):.1f} deg), {place.inliers} landmarks agree, "
                 f"probability {place.probability:.3f}"
             )
             continue
         print(
-            f"  node {place.node}: {x:+.3f} m ahead, {y:+.3f} m left, {math.degrees(heading):+.1f} deg "
-            f"(sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
+            f"  node {place.node}{named}: {x:+.3f} m ahead, {y:+.3f} m left, "
+            f"{math.degrees(heading):+.1f} deg (sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
             f"{place.inliers} landmarks agree, probability {place.probability:.3f}"
         )

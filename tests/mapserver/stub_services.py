@@ -9,6 +9,7 @@ from functools import cache
 import cv2
 import numpy as np
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.explanation import Explanation, FleetExplanation
@@ -54,6 +55,9 @@ class StubServices:
 
     def history(self) -> tuple[MapEvent, ...]:
         return self.events
+
+    def annotations(self) -> Annotations:
+        return Annotations()
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         done: Future[RelocalizeAnswer] = Future()
