@@ -16,9 +16,11 @@ from msgspec import Meta
 
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import MOST_WORDS
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pin import Pin
 
 MAX_NAME = 64
 MAX_ANNOTATIONS = 10_000
@@ -129,8 +131,14 @@ class Preference:
         return f"{_edge_or_area(self.edge, self.area)}, {verb}: cost times {self.factor:g}"
 
 
-Body = Place | Closure | Preference
-BODIES: dict[str, type[Body]] = {"place": Place, "closure": Closure, "preference": Preference}
+Body = Place | Closure | Preference | FloorPlan | Pin
+BODIES: dict[str, type[Body]] = {
+    "place": Place,
+    "closure": Closure,
+    "preference": Preference,
+    "plan": FloorPlan,
+    "pin": Pin,
+}
 """Kinds of annotations, by the word that names them in messages."""
 KINDS: dict[type, str] = {body: kind for kind, body in BODIES.items()}
 AnyBody = TypeVar("AnyBody", bound=Body)
@@ -212,6 +220,12 @@ class Annotations:
             for _, entry in sorted(self._last.items())
             if isinstance(entry.body, body) and not entry.removed
         )
+
+    @property
+    def pins(self) -> tuple[Pin, ...]:
+        """Pins that hold, oldest first."""
+        made = sorted(self.in_force(Pin), key=lambda item: item[0].stamp_ns)
+        return tuple(pin for _, pin in made)
 
     @cached_property
     def _last(self) -> dict[tuple[str, str], Annotation]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, RefusedPair
 from mapweave.wire.codec import element_of
@@ -29,7 +30,10 @@ PROBABILITY = "probability"
 
 
 def map_file_of(
-    merged: MergedMap, history: Iterable[MapEvent] = (), annotations: Annotations | None = None
+    merged: MergedMap,
+    history: Iterable[MapEvent] = (),
+    annotations: Annotations | None = None,
+    images: Mapping[str, bytes] | None = None,
 ) -> MapFile:
     """A whole merged map: nodes, edges, links with their probabilities, refusals, manual constraints, poses.
 
@@ -37,6 +41,7 @@ def map_file_of(
         merged: the map.
         history: events of its maps.
         annotations: what people say about it.
+        images: PNG files of floor plans, by their names.
     """
     whole = merged.union()
     probabilities = link_probabilities(merged)
@@ -55,6 +60,7 @@ def map_file_of(
         merged.faded,
         tuple(history),
         (annotations or Annotations()).made,
+        dict(images or {}),
     )
 
 
@@ -100,7 +106,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     components = tuple(frozenset(graph.nodes) for graph in solved)
     superseded = {node: fate for node, fate in content.superseded.items() if node in poses}
     faded = {node: mask for node, mask in content.faded.items() if node in poses}
-    return MergedMap(
+    merged = MergedMap(
         dict(sorted(maps.items())),
         links,
         refused,
@@ -111,6 +117,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         superseded,
         faded,
     )
+    return PinnedFrames().moved(merged, Annotations(content.annotations).pins)
 
 
 def _is_link(edge: Edge) -> bool:

@@ -6,13 +6,14 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
 from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.plan_images import PlanImages
 from mapweave.mapserver.services import guarded
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.storage.plan_image import plan_file
 from mapweave.wire.bus import Bus, Closing
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import encode
@@ -73,18 +74,20 @@ class PlanService:
         """
         return self.images.get(self.plans().plan(name).plan.image.sha256)
 
-    def check(self, plan: FloorPlan) -> None:
+    def put(self, data: bytes) -> PlanImage:
+        """Keep an image of any kind as a PNG file; raises InvalidValue if it is none."""
+        return self.images.put(plan_file(data).png)
+
+    def check(self, annotation: Annotation) -> None:
         """Refuse a plan without its image (InvalidValue)."""
-        if plan.image.sha256 not in self.images:
+        plan = annotation.body
+        if isinstance(plan, FloorPlan) and not annotation.removed and plan.image.sha256 not in self.images:
             raise InvalidValue("the image of this plan is not on the server: send it first")
 
     def files(self) -> dict[str, bytes]:
         """The images of the plans in force, for a map file; those that are lost are left out."""
         used = [plan.image for _, plan in self._annotations().in_force(FloorPlan)]
-        return {image.sha256: self.images.get(image.sha256) for image in used if self._there(image)}
-
-    def _there(self, image: PlanImage) -> bool:
-        return image.sha256 in self.images
+        return {image.sha256: self.images.get(image.sha256) for image in used if image.sha256 in self.images}
 
 
 def _sha256(payload: bytes) -> str:

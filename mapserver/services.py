@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
 
 from mapweave.hybridmap.errors import Busy, MapweaveError
@@ -55,6 +55,7 @@ class Services:
         clock: Callable[[], float],
         executor: Executor,
         places: Callable[[], Places],
+        images: Callable[[], Mapping[str, bytes]],
     ) -> None:
         """Begin to answer.
 
@@ -73,6 +74,7 @@ class Services:
             clock: only grows, s.
             executor: packs the whole map; it is shut down with this.
             places: named places of the newest merged map. May wait for it.
+            images: of the plans, for the map's file.
         """
         self._places = places
         self._clock = clock
@@ -86,7 +88,7 @@ class Services:
         self._reservations = Reservations()
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
-            lambda: places().annotations,
+            lambda: places().annotations, images,
         )  # fmt: skip
         self._closing: list[Closing] = [
             bus.serve(keys.relocalize(name), self._relocalize_later),

@@ -20,6 +20,7 @@ from typing import Any
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.mission_order import (
     MissionKind,
     MissionOrder,
@@ -249,7 +250,7 @@ class Fleet:
         """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
 
         Args:
-            kind: of the annotation: place, closure, preference.
+            kind: of the annotation: place, closure, preference, plan, pin.
             name: for the same kind and name the last one holds.
             because: why.
             fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a
@@ -284,6 +285,32 @@ class Fleet:
             NotConnected: no map server answers.
         """
         return decode(self._of_server(self._keys.any_resolve(), encode(request)), ResolveAnswer)
+
+    def plans(self) -> PlacedPlans:
+        """Floor plans, and where they lie under the merged map.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._of_server(self._keys.any_plans(), b""), PlacedPlans)
+
+    def plan_image(self, sha256: str) -> bytes:
+        """The PNG file of a plan, by the name of its image.
+
+        Raises:
+            InvalidValue: the server does not have it.
+            NotConnected: no map server answers.
+        """
+        return self._of_server(self._keys.any_plan_image(), sha256.encode())
+
+    def put_plan_image(self, png: bytes) -> PlanImage:
+        """Send the image of a plan, a PNG file, before the annotation that names it.
+
+        Raises:
+            InvalidValue: it is no PNG file, or too large.
+            NotConnected: no map server answers.
+        """
+        return decode(self._of_server(self._keys.any_put_plan_image(), png), PlanImage)
 
     def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
         annotation = annotation_of_words(

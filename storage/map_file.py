@@ -81,6 +81,7 @@ class MapFile:
         faded: of a merged map: (N,) which of a node's N landmarks are faded.
         history: of a merged map: what has become of its maps by itself, in order.
         annotations: what people say about the map, in order.
+        images: PNG files of floor plans, by their SHA-256.
     """
 
     kind: Kind
@@ -93,6 +94,7 @@ class MapFile:
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     history: tuple[MapEvent, ...] = ()
     annotations: tuple[Annotation, ...] = ()
+    images: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse faded landmarks that the nodes do not have (InvalidValue)."""

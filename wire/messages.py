@@ -15,6 +15,7 @@ from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
+from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
@@ -91,6 +92,8 @@ LIMITS: dict[type, Limit] = {
     MissionReport: Limit("mission report", 2**15),
     MissionRequest: Limit("mission request", 2048),
     Missions: Limit("missions", 2**22, 50_000),
+    PlacedPlans: Limit("plans", 2**24, 1_000_000),
+    PlanImage: Limit("plan image", 2048),
     KeptHistory: Limit("history", 2**26, 2_000_000),
 }
 """Kinds of messages."""

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.node import MapId
+    from mapweave.hybridmap.pin import Pin
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.merge.settings import MergeSettings
 
@@ -46,8 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
     check_place(arguments.out)
     settings = settings_of(arguments).merge
     parts = parts_of({path: read_map_file(path) for path in arguments.files})
-    merged = merged_with_progress(parts.maps, parts.constraints, settings)
-    write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations))
+    merged = merged_with_progress(parts.maps, parts.constraints, settings, parts.annotations.pins)
+    write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations, parts.images))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
     if arguments.json:
@@ -72,7 +73,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def merged_with_progress(
-    maps: dict[MapId, HybridMap], constraints: ManualConstraints, settings: MergeSettings | None = None
+    maps: dict[MapId, HybridMap],
+    constraints: ManualConstraints,
+    settings: MergeSettings | None = None,
+    pins: Sequence[Pin] = (),
 ) -> MergedMap:
     """Merge, with a bar on stderr for people."""
     from rich.console import Console
@@ -88,4 +92,4 @@ def merged_with_progress(
             words = "reading nodes" if done < of else "comparing and joining"
             bar.update(task, description=words, completed=done, total=of if done < of else None)
 
-        return merge_parts(maps, constraints, report, settings)
+        return merge_parts(maps, constraints, report, settings, pins)
