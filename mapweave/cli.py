@@ -21,6 +21,7 @@ from mapweave.commands import (
     map_file,
     missions,
     place,
+    plan,
     record,
     relocalize,
     replay,
@@ -69,8 +70,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, drive, status, missions, place, keys, robots, doctor, find_port,
-        find_cameras, calibrate, map_file, record, replay, info, relocalize, evaluate, settings,
+        demo, server, router, sim, agent, drive, status, missions, place, plan, keys, robots, doctor,
+        find_port, find_cameras, calibrate, map_file, record, replay, info, relocalize, evaluate, settings,
     ):  # fmt: skip
         command.add_to(commands)
     return top

@@ -23,7 +23,7 @@ def add_to(actions: Any) -> None:
         help="why two nodes or two maps are linked, or are not",
         description="Explain why two nodes (r0.1.17 r1.1.5) are linked or not, or why two maps (r0.1 r1.1) "
         "are one or are not, with every number behind it; without ends, of each two maps. A running server "
-        "is asked, or a map file. A named place stands for its node.",
+        "is asked, or a map file. A named place may be given instead of a node.",
     )
     parser.add_argument("ends", nargs="*", metavar="NODE|MAP", help="two nodes or two maps")
     parser.add_argument("--map", type=Path, metavar="FILE", help="explain this map file; no server is asked")

@@ -218,7 +218,7 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     [
         (["explain", "r0.1.1"], "give two nodes or two maps, not 1"),
         (["explain", "r0.1.1", "r1.1"], "are a node and a map"),
-        (["explain", "here", "there"], "'here' is neither a node nor a map"),
+        (["explain", "here", "there"], "'here' is no place of this map"),
         (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
         (
             ["explain", "r0.1.1", "r1.1.2"],

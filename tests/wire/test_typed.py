@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap import (
     agent_status,
+    annotation,
+    area,
     explanation,
     manual_constraint,
     map_event,
@@ -157,8 +159,9 @@ def test_the_page_on_the_wire_names_the_fields() -> None:
         for name, words in ROW.findall(page)
     }
     modules = (
-        query, explanation, manual_constraint, map_event, superseded, map_file, agent_status, mission_order,
+        annotation, area, query, explanation, manual_constraint, map_event, superseded, map_file,
+        agent_status, mission_order,
     )  # fmt: skip
     classes = {name: getattr(module, name) for module in modules for name in rows if hasattr(module, name)}
-    assert classes.keys() == rows.keys() and len(rows) == 32
+    assert classes.keys() == rows.keys() and len(rows) == 39
     assert {name: [one.name for one in fields(kind)] for name, kind in classes.items()} == rows
