@@ -192,6 +192,13 @@ class PlacedPlan:
         where = ", ".join(str(part.component) for part in self.parts)
         raise InvalidValue(f"plan {self.name} does not lie under component {component}, but under {where}")
 
+    def pose(self, component: int, merged_from_robot: Pose2) -> Pose2 | None:
+        """A pose of the merged map in the coordinates of the plan; None where the plan does not lie."""
+        for part in self.parts:
+            if part.component == component:
+                return part.plan_from_merged @ merged_from_robot
+        return None
+
 
 @dataclass(frozen=True, slots=True)
 class PlacedPlans:

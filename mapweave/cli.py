@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -36,6 +37,7 @@ from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help."
+NEGATIVE = re.compile(r"-[0-9.][0-9.,=e+-]*$")
 MISSING_EXTRA = 3
 """Exit status of a command whose libraries are not installed."""
 
@@ -47,6 +49,8 @@ class CommandParser(argparse.ArgumentParser):
         """Make a parser; those of its commands are of this class, too."""
         super().__init__(*args, **kwargs)
         self.set_defaults(command=self.prog)
+        # Positions begin with a minus as well, and are no options: -3.1,2 and -3.1,2=40,50.
+        self._negative_number_matcher = NEGATIVE
 
 
 class PrintVersion(argparse.Action):

@@ -11,6 +11,8 @@
     GET /map          the merged map, a map file
     GET /annotations  what people say about the map: named places and so on, JSON
     POST /annotations JSON: adds an annotation, or withdraws one
+    GET /plans        floor plans, and where they lie under the merged map, JSON; /plans/NAME.png is the image
+    POST /plans       an image: keeps it for a plan that an annotation adds; JSON: its name and size
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
@@ -50,6 +52,7 @@ from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveRe
 from mapweave.mapserver.http.annotations import Annotating, annotate, annotations_json
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.http.plans import Planning, plan_routes
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
 from mapweave.wire.log_messages import Scalar
@@ -68,7 +71,19 @@ WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
 METHODS = dict.fromkeys(
-    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/annotations"),
+    (
+        *PAGES,
+        "/status",
+        "/history",
+        "/explain",
+        "/route",
+        "/robots",
+        "/missions",
+        "/map",
+        "/annotations",
+        "/plans",
+        "/plans/NAME.png",
+    ),
     "GET",
 ) | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
 BY = "http"
@@ -78,7 +93,7 @@ BY = "http"
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
 
 
-class Answering(Annotating, Protocol):
+class Answering(Annotating, Planning, Protocol):
     """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
@@ -214,6 +229,7 @@ class Questions:
             *(Route(path, _page(name)) for path, name in PAGES.items()),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
             Route("/annotations", self._answering(self._annotate), methods=["POST"]),
+            *plan_routes(server, self._answering, self._command_body),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
@@ -270,8 +286,7 @@ class Questions:
         return await run_in_threadpool(annotations_json, self._server)
 
     async def _annotate(self, request: Request) -> Mapping[str, Any]:
-        self._check_commands(request)
-        body = await self._body(request, "JSON")
+        body = await self._command_body(request, "JSON")
         return await run_in_threadpool(annotate, self._server, body, request.query_params.get("by", BY))
 
     async def _map(self, _: Request) -> Response:
@@ -302,6 +317,10 @@ class Questions:
             )
 
         return await run_in_threadpool(stop)
+
+    async def _command_body(self, request: Request, what: str = "a JPEG or PNG image") -> bytes:
+        self._check_commands(request)
+        return await self._body(request, what)
 
     def _check_commands(self, request: Request) -> None:
         """There is no password: unless it is set otherwise, only this machine moves robots and annotates."""

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.plan import add_plan_option
+
 FORMATS = ("g2o", "tum", "graphml", "geojson")
 
 
@@ -25,10 +27,10 @@ def add_to(actions: Any) -> None:
     parser.add_argument(
         "--component",
         type=int,
-        default=0,
         metavar="N",
-        help="which part that is one (default: 0, the largest)",
+        help="which part that is one (default: 0, the largest; with --plan that with most pairs)",
     )
+    add_plan_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -36,11 +38,18 @@ def run(arguments: argparse.Namespace) -> int:
     """Write, and print what was written and what was left out."""
     from mapweave.formats.export import FORMATS as WRITERS
     from mapweave.formats.map_part import MapPart
+    from mapweave.hybridmap.annotation import Annotations
+    from mapweave.mapserver.floor_plans import placed_plans
     from mapweave.mapserver.map_files import merged_of
     from mapweave.storage.map_file import read_map_file
 
-    merged = merged_of(read_map_file(arguments.file))
-    part = MapPart(merged, arguments.component)
+    content = read_map_file(arguments.file)
+    merged = merged_of(content)
+    part = MapPart(merged, arguments.component or 0)
+    if arguments.plan is not None:
+        plans = placed_plans(Annotations(content.annotations), merged)
+        placed = plans.plan(arguments.plan).part(arguments.component)
+        part = MapPart(merged, placed.component, placed.plan_from_merged)
     for path in WRITERS[arguments.to](part, arguments.out):
         print(path)
     left = len(merged.poses) - len(part.nodes)

@@ -13,7 +13,8 @@ from mapweave.commands.annotating import add_record_options, record_of
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
-    from mapweave.hybridmap.floor_plan import PlacedPlan, PlanPart
+    from mapweave.hybridmap.floor_plan import PlacedPlan
+    from mapweave.hybridmap.pose import Pose2
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.offline_annotations import OfflineAnnotations
 
@@ -177,9 +178,11 @@ def add_plan_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plan", metavar="NAME", help="in the coordinates of this floor plan")
 
 
-def part_of(placed: PlacedPlan, component: int) -> PlanPart | None:
-    """The plan under a component; None if it does not lie there."""
-    return next((part for part in placed.parts if part.component == component), None)
+def plan_place(placed: PlacedPlan, pose: Pose2 | None) -> str:
+    """A pose on a plan, in words."""
+    if pose is None:
+        return f"not on plan {placed.name}"
+    return f"on plan {placed.name}: {pose.x:.2f},{pose.y:.2f} m, {math.degrees(pose.heading):.0f} deg"
 
 
 def _pair(word: str) -> dict[str, Any]:
