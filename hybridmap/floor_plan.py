@@ -99,7 +99,7 @@ class FloorPlan:
     def words(self) -> str:
         """For people."""
         scale = "" if self.metres_per_pixel is None else f", {self.metres_per_pixel:g} m/px"
-        return f"plan {self.image.file or 'image'}, {len(self.pairs)} pairs{scale}"
+        return f"{self.image.file or 'an image'}, {len(self.pairs)} pairs{scale}"
 
     @property
     def pixels(self) -> Array:

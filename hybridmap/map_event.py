@@ -23,7 +23,7 @@ class MapEventKind(StrEnum):
     ANNOTATED = "annotated"
     """A person has said something about the map."""
     FRAME = "frame"
-    """A pinned frame has moved, or holds again."""
+    """A pin yields to an older one, or holds its component's frame again."""
     FAILED = "failed"
 
 

@@ -41,4 +41,4 @@ class Pin:
     def words(self) -> str:
         """For people."""
         pose = self.merged_from_node
-        return f"node {self.node} at {pose.x:.3f},{pose.y:.3f} m, {math.degrees(pose.heading):.1f} deg"
+        return f"at {pose.x:.3f},{pose.y:.3f} m, {math.degrees(pose.heading):.1f} deg"

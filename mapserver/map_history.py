@@ -199,9 +199,9 @@ def _frame_words(change: FrameChange) -> str:
         return f"the pin of {change.pinned} holds no frame: the node is not in the merged map"
     x, y, heading = change.now_from_pinned.vector
     return (
-        f"the frame that {change.pinned} pins has moved: it has joined that of the older pin of "
-        f"{change.holding}; its coordinates are turned by {math.degrees(heading):.2f} deg about the origin, "
-        f"then shifted by {x:.3f}, {y:.3f} m"
+        f"the pin of {change.pinned} yields to the older one of {change.holding} in its component: "
+        f"coordinates are turned by {math.degrees(heading):.2f} deg about the origin, then shifted by "
+        f"{x:.3f}, {y:.3f} m"
     )
 
 

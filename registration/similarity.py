@@ -157,8 +157,8 @@ def leave_one_out(a: Array, b: Array, covariance: Array, scale: float | None = N
     the tail for two degrees of freedom is a power).
 
     Returns:
-        One for each pair. Where the others leave no degree of freedom, each has a chance of 1: it cannot be
-        told which is wrong.
+        One for each pair. Where the others leave no degree of freedom, each has a chance of 1:
+        which is wrong cannot be known.
     """
     whole = fit_similarity(a, b, covariance, scale)
     out = []

@@ -62,7 +62,7 @@ def _list(arguments: argparse.Namespace) -> int:
         return 0
     for entry, pin in pins:
         said = f" ({entry.because})" if entry.because else ""
-        print(f"{pin.words}{said}, by {entry.who or 'a person'}")
+        print(f"{pin.node} {pin.words}{said}, by {entry.who or 'a person'}")
     if not pins:
         print("nothing is pinned: mapweave map pin NODE")
     return 0
@@ -75,11 +75,13 @@ def _pose(word: str) -> list[float]:
         InvalidValue: it is no pose.
     """
     from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.pin import FARTHEST
 
     try:
         x, y, degrees = map(float, word.split(","))
     except ValueError:
-        raise InvalidValue(
-            f"pose {word!r}: give x,y,heading, m and degrees, for example 12.5,-3,90"
-        ) from None
+        x = y = degrees = math.nan
+    # Written so that NaN fails.
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and abs(degrees) <= 360.0):
+        raise InvalidValue(f"pose {word!r}: give x,y,heading, m and degrees, for example 12.5,-3,90")
     return [x, y, math.radians(degrees)]

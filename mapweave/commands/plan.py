@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
 FORMATS = ("rmf", "nav2", "tf", "json")
 PAIR = "r0.1.17=412,230, kitchen=412,230 or 3.1,-2.0=412,230"
-EXAMPLE = (
-    "`mapweave plan add office map.yaml --pair r0.1.1=102,340 --pair r0.1.17=412,230 --pair kitchen=77,52`"
-)
+EXAMPLE = "`mapweave plan add office.yaml --pair r0.1.1=102,340 --pair r0.1.17=412,230 --pair kitchen=77,52`"
 
 
 def add_to(commands: Any) -> None:
@@ -42,12 +40,12 @@ def add_to(commands: Any) -> None:
         "left corner, right and down). The scale of an image is that of the pairs unless it is given. "
         f"Example: {EXAMPLE}.",
     )
-    add.add_argument("name", metavar="NAME", help="of the plan")
     add.add_argument("file", type=Path, metavar="MAP.yaml|IMAGE", help="a map.yaml, or png, jpg, pgm, bmp")
     add.add_argument(
         "--pair", action="append", required=True, metavar="NODE|PLACE|X,Y=U,V", dest="pairs",
         help=f"a place and its pixel: {PAIR}",
     )  # fmt: skip
+    add.add_argument("--name", metavar="NAME", help="of the plan (default: the file's, without its ending)")
     add.add_argument("--metres-per-pixel", type=float, metavar="M", help="scale of the image, m")
     add.add_argument(
         "--near", metavar="NODE|PLACE",
@@ -111,7 +109,8 @@ def run_add(arguments: argparse.Namespace) -> int:
     scale = arguments.metres_per_pixel
     if scale is not None and not 0.0 < scale < math.inf:
         raise InvalidValue(f"--metres-per-pixel {scale:g}: give metres, for example 0.05")
-    path, fields = arguments.file, {"pairs": pairs}
+    path = arguments.file
+    fields: dict[str, Any] = {"pairs": pairs}
     if path.suffix.lower() in SUFFIXES:
         if scale is not None:
             raise InvalidValue("--metres-per-pixel goes with an image: a map.yaml has its resolution")
@@ -125,10 +124,11 @@ def run_add(arguments: argparse.Namespace) -> int:
     fields["image"] = packed(kept.image)
     if arguments.near:
         fields["near"] = arguments.near
+    name = arguments.name or path.stem
     with record_of(arguments) as record:
         record.put_plan_image(kept.png)
-        print(record.annotate("plan", arguments.name, arguments.because, **fields))
-        print("\n".join(plan_words(record.plans().plan(arguments.name))))
+        print(record.annotate("plan", name, arguments.because, **fields))
+        print("\n".join(plan_words(record.plans().plan(name))))
     return 0
 
 

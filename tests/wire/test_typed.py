@@ -22,9 +22,11 @@ from mapweave.hybridmap import (
     annotation,
     area,
     explanation,
+    floor_plan,
     manual_constraint,
     map_event,
     mission_order,
+    pin,
     query,
     superseded,
 )  # fmt: skip
@@ -159,9 +161,9 @@ def test_the_page_on_the_wire_names_the_fields() -> None:
         for name, words in ROW.findall(page)
     }
     modules = (
-        annotation, area, query, explanation, manual_constraint, map_event, superseded, map_file,
-        agent_status, mission_order,
+        annotation, area, floor_plan, pin, query, explanation, manual_constraint, map_event, superseded,
+        map_file, agent_status, mission_order,
     )  # fmt: skip
     classes = {name: getattr(module, name) for module in modules for name in rows if hasattr(module, name)}
-    assert classes.keys() == rows.keys() and len(rows) == 39
+    assert classes.keys() == rows.keys() and len(rows) == 47
     assert {name: [one.name for one in fields(kind)] for name, kind in classes.items()} == rows
