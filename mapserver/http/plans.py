@@ -56,5 +56,5 @@ def plan_routes(
     return [
         Route("/plans", answering(plans)),
         Route("/plans", answering(put), methods=["POST"]),
-        Route("/plans/{name}.png", answering(image)),
+        Route("/plans/{name:path}.png", answering(image)),
     ]

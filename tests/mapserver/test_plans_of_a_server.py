@@ -111,16 +111,16 @@ def test_plans_over_http(house: House) -> None:
         status, _, body = ask(served, "POST", "/plans", jpeg)
         image = json.loads(body)
         assert status == 200 and (image["width"], image["height"]) == (400, 500)
-        posted = {"name": "flat 1", "body": {"kind": "plan", **fields(), "image": image}}
+        posted = {"name": "flat/1", "body": {"kind": "plan", **fields(), "image": image}}
         assert ask(served, "POST", "/annotations", json.dumps(posted).encode())[0] == 200
         status, _, body = ask(served, "GET", "/plans")
         (plan,) = json.loads(body)["plans"]
         (part,) = plan["parts"]
-        assert status == 200 and plan["name"] == "flat 1"
+        assert status == 200 and plan["name"] == "flat/1"
         a, b, c, d, e, f = part["merged_from_image"]
         u, v = pixel(3.0, 2.5)
         assert (a * u + c * v + e, b * u + d * v + f) == pytest.approx((3.0, 2.5), abs=1e-6)
-        status, headers, png = ask(served, "GET", "/plans/flat%201.png")
+        status, headers, png = ask(served, "GET", "/plans/flat%2F1.png")
         assert (status, headers["Content-Type"]) == (200, "image/png")
         assert cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (500, 400)
         assert ask(served, "GET", "/plans/none.png")[0] == 400
