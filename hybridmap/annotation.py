@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 from msgspec import Meta
 
@@ -21,6 +21,7 @@ from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import MOST_WORDS
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pin import Pin
+from mapweave.hybridmap.wall_time import utc_words
 
 MAX_NAME = 64
 MAX_ANNOTATIONS = 10_000
@@ -42,6 +43,7 @@ class Place:
         area: its extent; None if it is a node.
     """
 
+    TAG: ClassVar[str] = "place"
     node: NodeId | None = None
     area: Area | None = None
 
@@ -71,6 +73,7 @@ class Closure:
         end_ns: until when; None: until it is withdrawn.
     """
 
+    TAG: ClassVar[str] = "closure"
     edge: Pair | None = None
     area: Area | None = None
     begin_ns: Stamp | None = None
@@ -94,8 +97,10 @@ class Closure:
 
     @property
     def words(self) -> str:
-        """What it is about, for people."""
-        return _edge_or_area(self.edge, self.area)
+        """For people."""
+        begin = "" if self.begin_ns is None else f" from {utc_words(self.begin_ns)}"
+        end = "" if self.end_ns is None else f" until {utc_words(self.end_ns)}"
+        return f"{_edge_or_area(self.edge, self.area)}, closed{begin}{end}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +113,7 @@ class Preference:
         area: None if it is an edge.
     """
 
+    TAG: ClassVar[str] = "preference"
     factor: Annotated[float, Meta(ge=0.1, le=100.0)]
     edge: Pair | None = None
     area: Area | None = None
@@ -132,15 +138,8 @@ class Preference:
 
 
 Body = Place | Closure | Preference | FloorPlan | Pin
-BODIES: dict[str, type[Body]] = {
-    "place": Place,
-    "closure": Closure,
-    "preference": Preference,
-    "plan": FloorPlan,
-    "pin": Pin,
-}
+BODIES: dict[str, type[Body]] = {body.TAG: body for body in (Place, Closure, Preference, FloorPlan, Pin)}
 """Kinds of annotations, by the word that names them in messages."""
-KINDS: dict[type, str] = {body: kind for kind, body in BODIES.items()}
 AnyBody = TypeVar("AnyBody", bound=Body)
 
 
@@ -181,7 +180,7 @@ class Annotation:
     @property
     def kind(self) -> str:
         """Of the body: place, closure and so on."""
-        return KINDS[type(self.body)]
+        return self.body.TAG
 
     @property
     def words(self) -> str:

@@ -1,24 +1,22 @@
-"""Areas of a map: polygons in the frame of a node, so that they move with the map."""
+"""Areas: polygons in the frame of a node, so that they move with the map when it is merged again."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.limits import MAX_POSITION, Coordinate
+from mapweave.hybridmap.limits import Coordinate
 from mapweave.hybridmap.node import NodeId
-from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.pose import Array, Pose2
 
-MAX_CORNERS = 64
-LEAST = 1e-4
-"""Smallest area, m²."""
+LEAST_CORNERS, MOST_CORNERS = 3, 64
+FARTHEST = 1e4
+"""Of a corner from its anchor, m."""
 ROUND = 16
 """Corners of the polygon around a circle; it reaches 2 % beyond the circle at its corners."""
 
@@ -36,17 +34,23 @@ class Area:
     """
 
     anchor: NodeId
-    corners: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Meta(min_length=3, max_length=MAX_CORNERS)]
+    corners: tuple[tuple[Coordinate, Coordinate], ...]
 
     def __post_init__(self) -> None:
-        """Refuse what encloses nothing (InvalidValue)."""
-        if not 3 <= len(self.corners) <= MAX_CORNERS:
-            raise InvalidValue(f"an area has 3 to {MAX_CORNERS} corners, not {len(self.corners)}")
-        points = np.array(self.corners, dtype=float)
-        if not (np.abs(points) <= MAX_POSITION).all():
-            raise InvalidValue("a corner of the area is out of range")
-        if self.size < LEAST:
-            raise InvalidValue("the corners of the area lie on a line")
+        """Refuse what encloses nothing.
+
+        Raises:
+            InvalidValue: too few or too many corners, one that is far away, or all on one line.
+        """
+        if not LEAST_CORNERS <= len(self.corners) <= MOST_CORNERS:
+            raise InvalidValue(
+                f"an area has {LEAST_CORNERS} to {MOST_CORNERS} corners, not {len(self.corners)}"
+            )
+        if not all(math.isfinite(v) and abs(v) <= FARTHEST for corner in self.corners for v in corner):
+            raise InvalidValue(f"corners are at most {FARTHEST:g} m from the anchor")
+        x, y = np.array(self.corners).T - np.array(self.corners[0])[:, None]
+        if np.linalg.matrix_rank(np.stack([x, y]), tol=1e-6) < 2:
+            raise InvalidValue("the corners of an area must not lie on one line")
 
     @staticmethod
     def around(node: NodeId, radius: float) -> Area:
@@ -59,7 +63,7 @@ class Area:
         Raises:
             InvalidValue: the radius is not positive.
         """
-        if not 0.0 < radius <= MAX_POSITION:
+        if not 0.0 < radius < FARTHEST:
             raise InvalidValue(f"radius {radius:g}: give metres, more than 0")
         reach = radius / math.cos(math.pi / ROUND)
         angles = [2.0 * math.pi * k / ROUND for k in range(ROUND)]
@@ -86,6 +90,14 @@ class Area:
         x, y = np.mean(self.corners, axis=0)
         return float(x), float(y)
 
+    def contains(self, points_in_anchor: Array) -> NDArray[np.bool_]:
+        """(N,) which points lie inside.
+
+        Args:
+            points_in_anchor: (N, 2) m, in the anchor's frame.
+        """
+        return inside(np.array(self.corners), points_in_anchor)
+
     def polygon(self, merged_from_anchor: Pose2) -> Floats:
         """(N, 2) the corners in the merged frame."""
         placed = (merged_from_anchor @ Pose2(x, y) for x, y in self.corners)
@@ -93,18 +105,19 @@ class Area:
 
 
 def inside(polygon: Floats, points: Floats) -> NDArray[np.bool_]:
-    """(N,) whether points are in a polygon, by the even-odd rule.
+    """(N,) whether points lie in a polygon: a ray to the right crosses an odd number of sides.
 
     Args:
         polygon: (C, 2) corners in order.
         points: (N, 2) in the same frame.
     """
-    (x, y), (next_x, next_y) = polygon.T[:, :, None], np.roll(polygon, -1, axis=0).T[:, :, None]
-    px, py = np.asarray(points, dtype=float).T
-    spans = (y > py) != (next_y > py)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = x + (py - y) * (next_x - x) / (next_y - y)
-    return np.asarray(np.count_nonzero(spans & (px < crossing), axis=0) % 2 == 1)
+    x, y = points[:, 0, None], points[:, 1, None]
+    (x1, y1), (x2, y2) = polygon.T, np.roll(polygon, -1, axis=0).T
+    spans = (y1 > y) != (y2 > y)
+    # Left of the side, seen upwards: multiplied out, since a side may be almost level.
+    left = (x - x1) * (y2 - y1) < (y - y1) * (x2 - x1)
+    odd: NDArray[np.bool_] = (spans & (left == (y2 > y1))).sum(axis=1) % 2 == 1
+    return odd
 
 
 def crosses(polygon: Floats, begin: Floats, end: Floats, closed: bool = True) -> NDArray[np.bool_]:
@@ -133,3 +146,16 @@ def _side(a: Floats, b: Floats, point: Floats) -> Floats:
     """Positive if a point lies to the left of the line from a to b."""
     along, to = b - a, point - a
     return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+
+
+def read_corner(word: str) -> tuple[float, float]:
+    """A corner as people write it: `1.5,-2`.
+
+    Raises:
+        InvalidValue: it is none.
+    """
+    try:
+        x, y = map(float, word.split(","))
+    except ValueError:
+        raise InvalidValue(f"{word!r} is no corner: write X,Y in m, for example 1.5,-2") from None
+    return x, y

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from msgspec import Meta
@@ -78,6 +78,7 @@ class FloorPlan:
         origin: pose of the lower left corner, in `plan`.
     """
 
+    TAG: ClassVar[str] = "plan"
     pairs: Annotated[tuple[PlanPair, ...], Meta(min_length=1, max_length=MAX_PAIRS)]
     image: PlanImage
     metres_per_pixel: PixelSize | None = None

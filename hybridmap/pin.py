@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import NodeId
@@ -22,6 +23,7 @@ class Pin:
         merged_from_node: its pose.
     """
 
+    TAG: ClassVar[str] = "pin"
     node: NodeId
     merged_from_node: Pose2
 

@@ -11,17 +11,19 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import (
     MAX_NUMBER,
     MAX_POSITION,
+    Angle,
     Coordinate,
     LandmarkCount,
     Name,
+    Number,
     Probability,
     Words,
 )
-from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
@@ -94,17 +96,46 @@ class Whereabouts:
     place: Annotated[str, Meta(max_length=64)] = ""
 
 
+@dataclass(frozen=True, slots=True)
+class SimilarPlace:
+    """A place that a view looks like, and what is missing to recognise it.
+
+    Attributes:
+        node: whose view it looks like.
+        matches: landmarks of the node that match.
+        inliers: of these, those that agree on one pose.
+        needed: as many would have to agree.
+        lacks: what is missing, in words.
+        turn: by which the camera would look where the node's did, rad, positive to the left; None if too
+            little agrees to tell.
+    """
+
+    node: NodeId
+    matches: Number
+    inliers: Number
+    needed: Number
+    lacks: Words
+    turn: Angle | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class RelocalizeAnswer:
     """Where a view was taken: candidates best first, and the reason of the outcome, in words.
 
     An unknown place may have one candidate: then too few landmarks agree for this view to be certain alone,
     and another view that gives the same place is enough.
+
+    Attributes:
+        certainty: of the outcome.
+        candidates: where the robot may be.
+        reason: of the outcome.
+        similar: if the place is unknown, what came nearest to being recognised, best first.
     """
 
     certainty: Certainty
     candidates: Annotated[tuple[Whereabouts, ...], Meta(max_length=MAX_CANDIDATES)]
     reason: Words
+    similar: Annotated[tuple[SimilarPlace, ...], Meta(max_length=MAX_CANDIDATES)] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,12 +236,14 @@ class ReserveAnswer:
         holder: the robot that holds what comes then; empty if none does.
         aside: both wait for each other: this robot steps aside, to this node; None if it only waits.
         reason: in words.
+        closed: whether a person has closed the way ahead; the robot asks for another one.
     """
 
     granted: Annotated[int, Meta(ge=0, le=MAX_LEGS)]
     holder: Annotated[str, Meta(max_length=32)]
     aside: NodeId | None
     reason: Words
+    closed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from datetime import UTC
 from typing import Any, TypeVar
 
 import numpy as np
 
-from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body
+from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ResolveAnswer, Resolved, ResolveRequest
+from mapweave.hybridmap.wall_time import read_time
 from mapweave.mapserver.places import position_of
 from mapweave.wire.typed import packed, value_of
 
@@ -20,22 +22,31 @@ NODES = ("node", "anchor", "a", "b", "merged_from_node")
 ANYWHERE = 1e6
 """An area may lie away from all nodes, m: they only give its frame."""
 
+TIMES = ("begin_ns", "end_ns")
+AROUND = 1.0
+"""Of a place that is a node, so much floor around it is meant, m."""
+
 Resolve = Callable[[ResolveRequest], ResolveAnswer]
 Value = TypeVar("Value")
 
 
-def body_of_words(kind: str, fields: Mapping[str, Any], resolve: Resolve) -> Body:
+def body_of_words(
+    kind: str, fields: Mapping[str, Any], resolve: Resolve, annotations: Annotations, now_ns: int
+) -> Body:
     """The body of an annotation.
 
     Args:
         kind: of the annotation: place, closure and so on.
-        fields: those of the body as plain data. In the place of a node there may be a word: a node
+        fields: those of the body as plain data. Times may be text, see mapweave.hybridmap.wall_time; without
+            a zone they are UTC. In the place of a node there may be a word: a node
             (`r0.1.17`), the name of a place, a position in the merged map (`3.1,-2.0`). An area is `area`,
             or `corners`, a list of positions in the merged map (in the frame of the component of `near`, a
-            node or place; of the largest component without), or `radius`, m, around `node`. A pair of a plan
-            has `at`, such a word, or `node` with `x` and `y`. A pin without `merged_from_node` holds its
-            node where it is.
+            node or place; of the largest component without), or `radius`, m, around `node`; or
+            `place`, a named place. A pair of a plan has `at`, such a word, or `node` with `x` and `y`. A pin
+            without `merged_from_node` holds its node where it is.
         resolve: returns nodes for words.
+        annotations: the record.
+        now_ns: the present time.
 
     Raises:
         InvalidValue: something is missing or wrong, with the reason.
@@ -44,6 +55,17 @@ def body_of_words(kind: str, fields: Mapping[str, Any], resolve: Resolve) -> Bod
         raise InvalidValue(f"there are no annotations of kind {kind!r}: {', '.join(BODIES)}")
     plain = dict(fields)
     corners, radius, near = (plain.pop(name, None) for name in ("corners", "radius", "near"))
+    for name in TIMES:
+        if isinstance(plain.get(name), str):
+            plain[name] = read_time(plain[name], now_ns, UTC)
+    if (place := plain.pop("place", None)) is not None:
+        entry = annotations.last("place", str(place))
+        if entry is None:
+            raise InvalidValue(f"there is no place {place}")
+        if isinstance(entry.body, Place) and entry.body.area is not None:
+            plain["area"], radius = packed(entry.body.area), None
+        else:
+            plain["node"], radius = str(place), AROUND if radius is None else radius
     if corners is not None:
         plain["area"] = packed(_area(corners, near or "", resolve))
     elif isinstance(area := plain.get("area"), Mapping):
@@ -134,5 +156,5 @@ def annotation_of_words(
             raise InvalidValue(f"there is no {kind} {name}")
         body = before.body
     else:
-        body = body_of_words(kind, fields, resolve)
+        body = body_of_words(kind, fields, resolve, annotations(), stamp_ns)
     return Annotation(name, body, removed, who, stamp_ns, because)

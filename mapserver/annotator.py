@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable
 
-from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
@@ -135,7 +135,10 @@ def check_annotation(merged: MergedMap, annotations: Annotations, annotation: An
         return
     if before is not None and before.body == annotation.body:
         raise InvalidValue(f"that is known already: {before.words}")
-    anchor = annotation.body.anchor
+    body = annotation.body
+    if isinstance(body, Closure) and body.end_ns is not None and body.end_ns <= annotation.stamp_ns:
+        raise InvalidValue(f"the closure is over already: {body.words}")
+    anchor = body.anchor
     merged.check(anchor)
     if merged.component_of(anchor) is None:
         raise InvalidValue(f"node {anchor} is not in the merged map")

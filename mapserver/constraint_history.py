@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from mapweave.hybridmap.annotation import Annotations
-from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of
+from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 
 
@@ -14,7 +14,7 @@ def with_constraints(
 ) -> tuple[MapEvent, ...]:
     """Events of the merge, manual constraints and annotations, in order."""
     constrained = [
-        MapEvent(constraint.stamp_ns, MapEventKind.CONSTRAINED, said_of(constraint))
+        MapEvent(constraint.stamp_ns, MapEventKind.CONSTRAINED, event_words(constraint))
         for constraint in constraints.made
     ]
     annotated = [
@@ -22,17 +22,3 @@ def with_constraints(
         for annotation in (annotations or Annotations()).made
     ]
     return tuple(sorted([*constrained, *annotated, *events], key=lambda one: one.stamp_ns))
-
-
-def said_of(constraint: ManualConstraint) -> str:
-    """A manual constraint as an event, in one sentence."""
-    first, second = constraint.ends
-    who = constraint.who or "a person"
-    if constraint.retires is not None:
-        return (
-            reason_of(constraint)
-            if constraint.apart
-            else f"map {constraint.retires} is in use again, by {who}"
-        )
-    words = reason_of(constraint) if constraint.apart else f"may be linked again, by {who}"
-    return f"{first} and {second}: {words}"

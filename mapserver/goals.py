@@ -34,7 +34,7 @@ def node_of_goal(goal: str, map_id: MapId, places: Places) -> NodeId:
             node = NodeId.parse(goal)
         except InvalidValue:
             raise InvalidValue(f"goal {goal!r}{places.alike(goal)}: {FORMS}") from None
-        if node.map == map_id:
+        if node.map == map_id and not router.closed_goal(node):
             return node  # the robot knows best
     else:
         node = places.resolve(goal, (merged.component_of(own[0]) or 0) if own else 0).node

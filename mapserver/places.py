@@ -162,7 +162,7 @@ class Places:
         )
 
     def _why_not(self, node: NodeId) -> str:
-        retired = self.merged.constraints.retired.get(node.map)
+        retired = self.merged.constraints.retires(node)
         apart = self.merged.set_apart.get(node.map)
         if retired is not None:
             return f" ({reason_of(retired)})"

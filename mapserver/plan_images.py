@@ -7,14 +7,27 @@ import threading
 from collections.abc import Iterable
 from pathlib import Path
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.floor_plan import PlanImage
+from mapweave.hybridmap.floor_plan import FloorPlan, PlanImage
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.storage.plan_image import check_plan_png
 
 MOST_BYTES = 2**29
 """Of all images together: a plan takes about 2 MiB."""
 SUFFIX = ".png"
+
+
+def kept_images(store: Path, annotations: Annotations) -> dict[str, bytes]:
+    """The images of a store's plans that are in force, read only; those that are lost are left out."""
+    used = {plan.image.sha256 for _, plan in annotations.in_force(FloorPlan)}
+    folder = _folder_of(store)
+    files = {name: folder / f"{name}{SUFFIX}" for name in sorted(used)}
+    return {name: path.read_bytes() for name, path in files.items() if path.is_file()}
+
+
+def _folder_of(store: Path) -> Path:
+    return store.with_name(f"{store.name}.plans")
 
 
 class PlanImages:
@@ -27,7 +40,7 @@ class PlanImages:
             store: path of the store; the folder is made when the first image comes.
             used: names of images that plans use, or have used; others are removed.
         """
-        self._folder = store.with_name(f"{store.name}.plans")
+        self._folder = _folder_of(store)
         self._lock = threading.Lock()
         kept = {f"{name}{SUFFIX}" for name in used}
         for path in self._folder.glob(f"*{SUFFIX}"):

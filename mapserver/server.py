@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -18,11 +18,13 @@ from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.annotator import AnnotationRecord, Annotator
+from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
@@ -39,6 +41,7 @@ from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -129,13 +132,13 @@ class MapServer:
         self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
         self._missions.roster = self._roster
         self._services = Services(
-            self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
+            self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
             lambda: self._history.events, self._missions, self._roster,
             clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places, self._plans.files,
         )  # fmt: skip
         self._explainer = Explainer(
-            self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,
-            worker.constrain, lambda: worker.settled, self._settings.merge.consistency,
+            self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
+            worker.constrain, lambda: worker.settled, self._settings.merge,
             lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
             lambda: self._annotations.annotations,
         )  # fmt: skip
@@ -173,22 +176,22 @@ class MapServer:
         """Wait until everything that came before this call is merged; False if the time is over first."""
         return self._worker.settle(timeout)
 
+    @property
+    def read_only(self) -> bool:
+        """Whether nothing can be changed, as with a map file."""
+        return False
+
+    def merged(self) -> MergedMap:
+        """The newest merged map."""
+        return self._worker.current().merged
+
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
         merged = self._worker.answers.merged
-        loops = sum(link.within for link in merged.links)
         traffic = self._store.traffic()
         return {
-            "nodes": len(merged.poses),
-            "superseded": len(merged.superseded),
-            "maps": len(merged.maps),
-            "components": len(merged.components),
-            "links": len(merged.links) - loops,
-            "loops": loops,
-            "refused": sum(refusal.link is not None for refusal in merged.refused),
+            **merged.counts(),
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
-            "constraints": len(merged.constraints.in_force),
-            "set_apart": len(merged.set_apart),
             "event": self._ingest.failure or self._worker.event,
             "settled": self._worker.settled,
             "bytes": traffic.payload_bytes,
@@ -263,6 +266,18 @@ class MapServer:
         """
         return self._annotator.resolve(request)
 
+    def constraints(self) -> ConstraintList:
+        """The record of manual constraints, in order."""
+        return self._explainer.constraints()
+
+    def constrain(self, request: ConstraintRequest) -> str:
+        """Keep a manual constraint, or only check it, from any thread; says what it does in words.
+
+        Raises:
+            InvalidValue: it has no effect, or contradicts the map.
+        """
+        return self._explainer.constrain(request)
+
     def command(self, request: MissionRequest) -> MissionReport:
         """Hand a mission on to its robot, from any thread; waits for the robot's answer.
 
@@ -271,9 +286,17 @@ class MapServer:
         """
         return self._missions.command(request)
 
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+    def give(
+        self,
+        robot: str,
+        kind: MissionKind,
+        goal: str,
+        by: str,
+        mission_id: str = "",
+        via: tuple[str, ...] = (),
+    ) -> MissionReport:
         """Give a robot a mission that is newer than the one that holds it; see `command`."""
-        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id))
+        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id, via))
 
     def missions(self) -> Missions:
         """The missions that are known, oldest first."""
@@ -293,8 +316,14 @@ class MapServer:
             self._pins = annotations.pins
             self._worker.pin(self._pins)
 
+    def _answers(self) -> Answers:
+        """The newest ones, with routes by what is closed now."""
+        answers = self._worker.current()
+        router = answers.router.at(self._annotations.annotations, self._schedule.time_ns())
+        return replace(answers, router=router)
+
     def _named_places(self) -> Places:
-        return Places(self._worker.current().router, self._annotations.annotations)
+        return Places(self._answers().router, self._annotations.annotations)
 
     def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))

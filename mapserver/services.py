@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 
 from mapweave.hybridmap.errors import Busy, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
@@ -12,6 +13,7 @@ from mapweave.hybridmap.mission_order import MissionRequest
 from mapweave.hybridmap.query import (
     KnownRequest,
     RelocalizeAnswer,
+    ReserveAnswer,
     ReserveRequest,
     RouteAnswer,
     RouteRequest,
@@ -25,6 +27,7 @@ from mapweave.mapserver.packed_map import PackedMap
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
+from mapweave.mapserver.route_rules import rule_words
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
@@ -145,7 +148,15 @@ class Services:
 
     def _reserve(self, payload: bytes) -> bytes:
         request = decode(payload, ReserveRequest)
-        return encode(self._reservations.ask(request, self._answers().router, self._clock()))
+        router, closed = self._answers().router, None
+        if rules := router.rules:
+            within = rules.around(request.start, request.start_from_robot)
+            closed = rules.first_closed((request.start, *request.route), within)
+        if closed is None:
+            return encode(self._reservations.ask(request, router, self._clock()))
+        self._reservations.ask(replace(request, route=()), router, self._clock())
+        number, closure = closed
+        return encode(ReserveAnswer(number, "", None, f"the way ahead is {rule_words(closure)}", True))
 
     def _known(self, payload: bytes) -> bytes:
         request = decode(payload, KnownRequest)

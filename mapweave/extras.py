@@ -17,6 +17,7 @@ MODULES = {
         "scipy",
         "starlette",
         "uvicorn",
+        "wsproto",
     ),
     "sim": ("pybullet",),
     "eval": ("evo",),

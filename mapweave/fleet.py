@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from mapweave.fleet_constraints import SOON, FleetConstraints
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
@@ -35,7 +36,7 @@ from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.identities.key_file import read_key_file
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.storage.map_file import MapFile, unpack_map_file
-from mapweave.wire.bus import Bus, Reply, Sample
+from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
@@ -43,8 +44,6 @@ from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-SOON = 2.0
-"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
 ANSWER = 10.0
 """A server that merges answers questions about its map late, s."""
 PACKING = 120.0
@@ -74,7 +73,7 @@ def login() -> str:
         return "a person"
 
 
-class Fleet:
+class Fleet(FleetConstraints):
     """A connection to a fleet. A context manager; its methods may be called from any thread."""
 
     def __init__(
@@ -153,18 +152,19 @@ class Fleet:
         reports = decode(replies[0].payload, Missions).reports
         return tuple(report for report in reports if robot in ("", report.order.robot))
 
-    def go(self, robot: str, goal: str, wait: float = 0.0) -> MissionReport:
+    def go(self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = ()) -> MissionReport:
         """Send a robot to a node (`r0.1.17`), a place, a position in the merged map (`3.1,-2.0`) or `home`.
 
         Args:
             robot: which.
             goal: where to.
             wait: until it is there or has given up, s at most.
+            via: what to pass before, in order, in the same words.
 
         Raises:
             MapweaveError: the robot or the goal does not exist, or the robot does not answer.
         """
-        return self._give(robot, MissionKind.GO, goal, wait)
+        return self._give(robot, MissionKind.GO, goal, wait, tuple(via))
 
     def explore(self, robot: str, wait: float = 0.0) -> MissionReport:
         """Let a robot map all floor that it can reach; see `go`."""
@@ -334,20 +334,23 @@ class Fleet:
             raise InvalidValue(replies[0].error.removeprefix("refused: "))
         raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
 
-    def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
+    def _give(
+        self, robot: str, kind: MissionKind, goal: str, wait: float, via: tuple[str, ...] = ()
+    ) -> MissionReport:
         """By way of the map server; without one directly."""
         check_name(robot)
         self._check_role()
         report, after_ns = None, 0
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
-            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal)
+            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via)
             replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * SOON)
             taken = [reply for reply in replies if not reply.error]
             if not taken and replies:
                 raise InvalidValue(replies[0].error.removeprefix("refused: "))
             if not taken:
-                report = self._direct(robot, kind, _node(goal), goal)
+                nodes = tuple(node for word in via if (node := _node(word)) is not None)
+                report = self._direct(robot, kind, _node(goal), goal, nodes)
                 break
             report = decode(taken[0].payload, MissionReport)
             if report.state is not MissionState.REPLACED:
@@ -361,10 +364,12 @@ class Fleet:
         if self._role in (Role.VIEWER, Role.ROBOT):
             raise InvalidValue(f"this is the key of a {self._role}: missions need an operator's")
 
-    def _direct(self, robot: str, kind: MissionKind, node: NodeId | None, goal: str) -> MissionReport:
+    def _direct(
+        self, robot: str, kind: MissionKind, node: NodeId | None, goal: str, via: tuple[NodeId, ...] = ()
+    ) -> MissionReport:
         after_ns = 0
         for _ in range(TRIES):
-            order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal)
+            order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal, via=via)
             report = send_order(self._bus, self._keys, order, SOON)
             if report.state is not MissionState.REPLACED:
                 break
@@ -377,9 +382,6 @@ class Fleet:
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0
-
-    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
-        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
 
 
 def _node(goal: str) -> NodeId | None:

@@ -1,4 +1,4 @@
-"""Annotations of a map file, without a server; the same methods as of mapweave.fleet.Fleet."""
+"""Annotations of a map file or store, without a server; the same methods as of mapweave.fleet.Fleet."""
 
 from __future__ import annotations
 
@@ -10,43 +10,45 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.annotation import Annotations
-from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.annotator import check_annotation
 from mapweave.mapserver.floor_plans import placed_plans
-from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
+from mapweave.opened_map import MapSource, open_map
 from mapweave.storage.atomic_file import check_place
-from mapweave.storage.map_file import read_map_file, write_map_file
+from mapweave.storage.map_file import write_map_file
 from mapweave.storage.plan_image import check_plan_png
 
 
 class OfflineAnnotations:
-    """The annotations of one map file."""
+    """The annotations of one map. Map files are written; a store is only read, since it is its server's."""
 
     def __init__(
         self, path: Path, out: Path | None = None, by: str = "a person", settings: MergeSettings | None = None
     ) -> None:
-        """Read a map file.
+        """Read a map.
 
         Args:
-            path: of the file.
-            out: where the file with new annotations is written; over the old one by default.
+            path: of the file or store.
+            out: where the file with new annotations is written; over the old file by default.
             by: says so.
             settings: with which the file was merged.
 
         Raises:
             InvalidFile: it cannot be read.
         """
-        self._out, self._by, self._settings = out or path, by, settings
-        self._content = read_map_file(path)
-        self._images = dict(self._content.images)
+        self._by, self._settings = by, settings
+        self._opened = open_map(path)
+        self._out = path if out is None and self._opened.source is MapSource.FILE else out
+        self._made = Annotations(self._opened.content.annotations)
+        self._images = dict(self._opened.content.images)
 
     def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
         """See Fleet.annotate; the file is written.
@@ -62,7 +64,7 @@ class OfflineAnnotations:
 
     def annotations(self) -> Annotations:
         """What people say about the map."""
-        return Annotations(self._content.annotations)
+        return self._made
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words.
@@ -99,9 +101,13 @@ class OfflineAnnotations:
 
     @cached_property
     def _router(self) -> Router:
-        return Router(merged_of(self._content, self._settings))
+        return Router(self._opened.merged(self._settings))
 
     def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
+        if self._out is None:
+            raise InvalidValue(
+                f"{self._opened.path} is a {self._opened.source}, which is not written: give -o"
+            )
         check_place(self._out)
         annotation = annotation_of_words(
             name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
@@ -110,13 +116,15 @@ class OfflineAnnotations:
         body = annotation.body
         if isinstance(body, FloorPlan) and not annotation.removed:
             self.plan_image(body.image.sha256)
-        content = replace(self._content, annotations=(*self._content.annotations, annotation))
-        if isinstance(annotation.body, Pin):
-            content = replace(content, poses=dict(merged_of(content, self._settings).poses))
-            self.__dict__.pop("_router", None)
-        used = {plan.image.sha256 for _, plan in Annotations(content.annotations).in_force(FloorPlan)}
-        self._content = replace(
-            content, images={name: png for name, png in self._images.items() if name in used}
-        )
-        write_map_file(self._out, self._content)
+        self._made = Annotations((*self._made.made, annotation))
+        used = {plan.image.sha256 for _, plan in self._made.in_force(FloorPlan)}
+        images = {name: png for name, png in self._images.items() if name in used}
+        content = replace(self._opened.content, annotations=self._made.made, images=images)
+        self._opened = replace(self._opened, content=content)
+        if isinstance(body, Pin):
+            del self._router
+        content = self._opened.file(self.merged)
+        if isinstance(body, Pin) and content.poses:
+            content = replace(content, poses=dict(self.merged.poses))
+        write_map_file(self._out, content)
         return annotation.words

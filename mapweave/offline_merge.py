@@ -13,8 +13,10 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pin import Pin
-from mapweave.mapserver.map_files import map_file_of, maps_of
+from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
+from mapweave.mapserver.own_maps import maps_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, read_map_file
@@ -103,6 +105,7 @@ def merge_parts(
     constraints: ManualConstraints,
     progress: Progress = lambda done, of: None,
     settings: MergeSettings | None = None,
+    store: Path | None = None,
     pins: Sequence[Pin] = (),
 ) -> MergedMap:
     """Merge robots' maps as the map server does.
@@ -112,6 +115,7 @@ def merge_parts(
         constraints: manual constraints.
         progress: see `Progress`.
         settings: how they are merged.
+        store: the server's store from which they come: what that server has compared is not compared again.
         pins: that hold frames, oldest first.
 
     Raises:
@@ -123,6 +127,11 @@ def merge_parts(
     changes = [
         (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()
     ]
+    if store is not None:
+        VerificationCacheKeeper(store, fresh=True).restore(merger)
+        merger.read(changes)
+        progress(len(changes), len(changes))
+        changes = []
     for k, (map_id, change) in enumerate(changes):
         merger.apply(map_id, change)
         progress(k + 1, len(changes))

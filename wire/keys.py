@@ -10,8 +10,8 @@
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain,
-                                                      annotate, annotations, resolve, history, plans,
-                                                      plan_image and put_plan_image
+                                                      constraints, annotate, annotations, resolve, history,
+                                                      plans, plan_image and put_plan_image
     mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
@@ -257,6 +257,14 @@ class Keys:
     def any_put_plan_image(self) -> str:
         """Pattern: every server of the fleet."""
         return f"{self.root}/server/*/put_plan_image"
+
+    def constraints(self, server: str) -> str:
+        """The record of manual constraints of a server."""
+        return self._of_server("constraints", server)
+
+    def any_constraints(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/constraints"
 
     def history(self, server: str) -> str:
         """The history of the maps, from a server."""

@@ -16,7 +16,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
-from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.node import MapId, NodeId
@@ -53,6 +53,7 @@ class KeptHistory:
         parts: maps that were one when it was written, each in one set.
         apart: pairs of maps that are reported as kept apart.
         set_apart: maps that are reported as set apart.
+        contradicted: links by hand that are reported as contradicted.
         frames: pins that are reported as not holding their component's frame, with the node of the older pin
             that does; a pin whose node is not in the merged map with its own.
     """
@@ -61,6 +62,7 @@ class KeptHistory:
     parts: tuple[frozenset[MapId], ...] = ()
     apart: frozenset[tuple[MapId, MapId]] = frozenset()
     set_apart: frozenset[MapId] = frozenset()
+    contradicted: frozenset[tuple[NodeId, NodeId]] = frozenset()
     frames: frozenset[tuple[NodeId, NodeId]] = frozenset()
 
 
@@ -78,7 +80,10 @@ LIMITS: dict[type, Limit] = {
     PairExplanation: Limit("explanation", 2 * MAX_BODY_BYTES + 4_000_000, 200_000),
     FleetExplanation: Limit("explanation", 8_000_000, 500_000),
     RouteExplanation: Limit("explanation of a route", 16_000_000, 200_000),
-    ManualConstraint: Limit("manual constraint", 4096),
+    # A link has up to 150 pairs of landmarks, a retirement up to 1000 nodes.
+    ManualConstraint: Limit("manual constraint", 2**16, 8192),
+    ConstraintRequest: Limit("manual constraint", 2**16, 8192),
+    ConstraintList: Limit("manual constraints", 2**26, 2_000_000),
     Annotation: Limit("annotation", 2**16),
     Annotations: Limit("annotations", 2**26, 4_000_000),
     ResolveRequest: Limit("resolve request", 2**14),

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import msgspec
 
 from mapweave.hybridmap.annotation import MAX_NAME, Annotation, Annotations
+from mapweave.hybridmap.constraint_subject import Ends, read_ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
@@ -71,3 +72,16 @@ def annotate(server: Annotating, data: bytes, by: str) -> Mapping[str, Any]:
         posted.who or by, posted.because, time.time_ns(),
     )  # fmt: skip
     return {"said": server.annotate(annotation), "annotation": json_values(annotation)}
+
+
+def ends_of_words(server: Annotating, words: tuple[str, str]) -> Ends:
+    """Two nodes or maps; a word that is none may be the name of a place, or a position.
+
+    Raises:
+        InvalidValue: it is none of these.
+    """
+    known = server.annotations()
+    if any(known.last("place", word) or "," in word for word in words):
+        first, second = server.resolve(ResolveRequest(words)).found
+        return first.node, second.node
+    return read_ends(*words)

@@ -42,19 +42,17 @@ def plan_routes(
         body_of: reads the body of a request of one who may command.
     """
 
-    async def plans(_: Request) -> Mapping[str, Any]:
+    async def plans(request: Request) -> Mapping[str, Any]:
+        if request.method == "POST":
+            body = await body_of(request)
+            return await run_in_threadpool(lambda: json_values(server.put_plan_image(body)))
         return await run_in_threadpool(lambda: json_values(server.plans()))
 
     async def image(request: Request) -> Response:
         png = await run_in_threadpool(server.plan_image, request.path_params["name"])
         return Response(png, media_type="image/png")
 
-    async def put(request: Request) -> Mapping[str, Any]:
-        body = await body_of(request)
-        return await run_in_threadpool(lambda: json_values(server.put_plan_image(body)))
-
     return [
-        Route("/plans", answering(plans)),
-        Route("/plans", answering(put), methods=["POST"]),
+        Route("/plans", answering(plans), methods=["GET", "POST"]),
         Route("/plans/{name:path}.png", answering(image)),
     ]

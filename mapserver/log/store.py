@@ -27,6 +27,8 @@ APPLICATION_ID = 0x4D575354
 VERSION = 2
 ID = "store id"
 """Among the results."""
+HISTORY = "history"
+"""Among the results, too: see mapweave.mapserver.map_history."""
 READ_AT_ONCE = 256
 ADVICE = (
     "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: robots send "

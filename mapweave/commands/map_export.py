@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 from mapweave.commands.plan import add_plan_option
 
 FORMATS = ("g2o", "tum", "graphml", "geojson")
@@ -17,11 +18,11 @@ def add_to(actions: Any) -> None:
     parser: argparse.ArgumentParser = actions.add_parser(
         "export",
         help="write a map for others' tools",
-        description="Write one component of a map file: its pose graph (g2o), each robot's places over time "
+        description="Write one component of a map: its pose graph (g2o), each robot's places over time "
         "(tum: a file, or a folder if there are several robots), places and edges (graphml), or a route "
         "graph that Nav2's route server loads (geojson).",
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="a .mapweave file")
+    parser.add_argument("file", type=Path, metavar="FILE", help=SOURCES)
     parser.add_argument("--to", choices=FORMATS, required=True, help="format")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder (tum)")
     parser.add_argument(
@@ -40,14 +41,12 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.formats.map_part import MapPart
     from mapweave.hybridmap.annotation import Annotations
     from mapweave.mapserver.floor_plans import placed_plans
-    from mapweave.mapserver.map_files import merged_of
-    from mapweave.storage.map_file import read_map_file
 
-    content = read_map_file(arguments.file)
-    merged = merged_of(content)
+    source = opened(arguments.file)
+    merged = merged_with_progress(source)
     part = MapPart(merged, arguments.component or 0)
     if arguments.plan is not None:
-        plans = placed_plans(Annotations(content.annotations), merged)
+        plans = placed_plans(Annotations(source.content.annotations), merged)
         placed = plans.plan(arguments.plan).part(arguments.component)
         part = MapPart(merged, placed.component, placed.plan_from_merged)
     for path in WRITERS[arguments.to](part, arguments.out):

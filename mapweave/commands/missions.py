@@ -38,8 +38,16 @@ def add_to(commands: Any) -> None:
     go.add_argument(
         "goal", metavar="GOAL", help="a node (r0.1.17), a named place, a position (3.1,-2.0) or home"
     )
+    go.add_argument(
+        "--via", action="append", default=[], metavar="PLACE",
+        help="pass this first: a node, a place or a position; may be given again, in the order of the way",
+    )  # fmt: skip
     _add_common(go, 600.0)
-    go.set_defaults(run=lambda arguments: run(arguments, lambda f: f.go(arguments.robot, arguments.goal)))
+    go.set_defaults(
+        run=lambda arguments: run(
+            arguments, lambda f: f.go(arguments.robot, arguments.goal, via=arguments.via)
+        )
+    )
 
     explore: argparse.ArgumentParser = commands.add_parser(
         "explore",

@@ -178,6 +178,18 @@ def add_plan_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plan", metavar="NAME", help="in the coordinates of this floor plan")
 
 
+def plan_of(arguments: argparse.Namespace) -> PlacedPlan | None:
+    """The plan that `--plan` names, of a server or of the map of `--map`; None if it is not given.
+
+    Raises:
+        MapweaveError: there is none of this name, no server answers, or the map cannot be read.
+    """
+    if arguments.plan is None:
+        return None
+    with record_of(arguments) as record:
+        return record.plans().plan(arguments.plan)
+
+
 def plan_place(placed: PlacedPlan, pose: Pose2 | None) -> str:
     """A pose on a plan, in words."""
     if pose is None:

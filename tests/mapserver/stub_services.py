@@ -9,6 +9,7 @@ from functools import cache
 import cv2
 import numpy as np
 
+from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import Busy
@@ -49,6 +50,15 @@ class StubServices:
         self.answer = ANSWER
         self.holds: dict[str, Scalar] = {"nodes": 12, "summary": "12 nodes"}
         self.events: tuple[MapEvent, ...] = ()
+        self.map: MergedMap | None = None
+        self.fleet = FleetStatus()
+        self.read_only = False
+
+    def merged(self) -> MergedMap:
+        return self.map or two_maps()
+
+    def robots(self) -> FleetStatus:
+        return self.fleet
 
     def status(self) -> dict[str, Scalar]:
         return self.holds

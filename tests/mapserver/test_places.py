@@ -15,6 +15,7 @@ import pytest
 from mapweave.cli import main
 from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEventKind
@@ -158,7 +159,7 @@ def test_a_place_whose_node_is_in_no_map_any_more_says_why(merged: MergedMap) ->
     with pytest.raises(InvalidValue, match=r"place kitchen is at r9\.1\.1, which is not in the merged map"):
         Places(Router(merged), kitchen).resolve("kitchen")
     # All of its map is retired: no node of it is left to take its place.
-    constraint = ManualConstraint((THERE.map, THERE.map), True, "bob", 0, "the old flat")
+    constraint = ManualConstraint(RetiredMap(THERE.map), True, "bob", 0, "the old flat")
     none = replace(merged, poses={}, components=(), graphs=(), constraints=ManualConstraints([constraint]))
     with pytest.raises(InvalidValue, match=r'map r0\.1 is retired by bob on .* "the old flat"'):
         Places(Router(none), record("kitchen", Place(THERE))).resolve("kitchen")

@@ -21,6 +21,7 @@ from mapweave.hybridmap import (
     agent_status,
     annotation,
     area,
+    constraint_subject,
     explanation,
     floor_plan,
     manual_constraint,
@@ -30,8 +31,8 @@ from mapweave.hybridmap import (
     query,
     superseded,
 )  # fmt: skip
+from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -161,9 +162,9 @@ def test_the_page_on_the_wire_names_the_fields() -> None:
         for name, words in ROW.findall(page)
     }
     modules = (
-        annotation, area, floor_plan, pin, query, explanation, manual_constraint, map_event, superseded,
-        map_file, agent_status, mission_order,
+        annotation, area, constraint_subject, floor_plan, pin, query, explanation, manual_constraint,
+        map_event, superseded, map_file, agent_status, mission_order,
     )  # fmt: skip
     classes = {name: getattr(module, name) for module in modules for name in rows if hasattr(module, name)}
-    assert classes.keys() == rows.keys() and len(rows) == 47
+    assert classes.keys() == rows.keys() and len(rows) == 58
     assert {name: [one.name for one in fields(kind)] for name, kind in classes.items()} == rows

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import Apart, RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
@@ -19,7 +20,7 @@ from mapweave.merge.pose_graph.pinned_frames import frame_changes
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
-APART = ManualConstraints([ManualConstraint((A, B), True, "anna", 10**18)])
+APART = ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 10**18)])
 POSE = Pose2(120.25, -3.5, 2.5)
 
 
@@ -110,7 +111,7 @@ def test_pins_outlast_a_retired_node_and_the_beginning_of_a_server(merger: Merge
 def test_components_that_do_not_change_stay_the_same_objects(merger: Merger) -> None:
     pin = Pin(of(A, merger), POSE)
     first = merged(merger, pin, apart=True)
-    merger.constrain(ManualConstraints([*APART.made, ManualConstraint((B, B), True, "anna", 10**18)]))
+    merger.constrain(ManualConstraints([*APART.made, ManualConstraint(RetiredMap(B), True, "anna", 10**18)]))
     second = merger.merged()
     assert second is not first and second.graphs[0] is first.graphs[0]
 
