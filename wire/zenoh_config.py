@@ -14,6 +14,10 @@ ACCEPT_PENDING = 1000
 ACCEPT_TIMEOUT = 2.0
 """s; a silent new connection is dropped after this time. A handshake takes two round trips."""
 
+LARGEST = {"put": 2**18, "query": 2**20, "reply": 2**25}
+"""Bytes of what a client may send: twice a change, several views, the largest piece of a log. The router
+drops what is larger before anything reads it."""
+
 
 def session_values(settings: BusSettings) -> dict[str, object]:
     """Zenoh's configuration, by path."""
@@ -38,6 +42,12 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "transport/link/tx/queue/size/data": ROUTER_QUEUE if settings.mode == "router" else 2,
         "transport/shared_memory/enabled": False,
     }
+    if settings.mode == "router":
+        values["low_pass_filter"] = [
+            {"id": name, "flows": ["ingress"], "messages": [name], "key_exprs": ["mapweave/**"],
+             "size_limit": size}
+            for name, size in LARGEST.items()
+        ]  # fmt: skip
     if settings.session:
         values["id"] = settings.session
     if settings.timestamps:
