@@ -16,6 +16,10 @@ from mapweave.hybridmap.pose import Array, Pose2
 MAX_PAIRS = 64
 MAX_SIDE = 20_000
 """Of an image, px."""
+MAX_BYTES = 16 * 2**20
+"""Of an image as PNG: a plan of 6000 x 4000 px in colour takes about 2 MiB, a photograph of one 20."""
+PIECE = 2**19
+"""Bytes of an image in one message: half of what a router lets through."""
 MAX_PARTS = 16
 """Components that lie on one plan."""
 IDENTITY = Pose2()
@@ -62,6 +66,36 @@ class PlanImage:
     width: Side
     height: Side
     file: Annotated[str, Meta(max_length=255)] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanPiece:
+    """A piece of an image on its way to a server; pieces come in order.
+
+    Attributes:
+        sha256: of the whole PNG file, hexadecimal.
+        size: of the whole, bytes.
+        offset: where the piece begins; 0 begins again.
+        data: the piece.
+    """
+
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    size: Annotated[int, Meta(ge=1, le=MAX_BYTES)]
+    offset: Annotated[int, Meta(ge=0, le=MAX_BYTES)]
+    data: Annotated[bytes, Meta(max_length=PIECE)]
+
+
+@dataclass(frozen=True, slots=True)
+class PlanReceived:
+    """What a server has of an image.
+
+    Attributes:
+        received: bytes.
+        image: the image, once it is whole and on the disk.
+    """
+
+    received: Number
+    image: PlanImage | None = None
 
 
 @dataclass(frozen=True, slots=True)

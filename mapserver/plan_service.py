@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
+from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage, PlanPiece, PlanReceived
 from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.plan_images import PlanImages
 from mapweave.mapserver.services import guarded
@@ -16,7 +17,10 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.plan_image import plan_file
 from mapweave.wire.bus import Bus, Closing
 from mapweave.wire.keys import Keys
-from mapweave.wire.messages import encode
+from mapweave.wire.messages import decode, encode
+
+MOST_AT_ONCE = 4
+"""Images on their way; one more takes the place of the oldest."""
 
 
 class PlanService:
@@ -45,11 +49,15 @@ class PlanService:
         used = {entry.body.image.sha256 for entry in annotations().made if isinstance(entry.body, FloorPlan)}
         self.images = PlanImages(store, used)
         self._lock = threading.Lock()
+        self._incoming: dict[str, bytearray] = {}
         self._placed: tuple[MergedMap, Annotations, PlacedPlans] | None = None
         self._closing: list[Closing] = [
             bus.serve(keys.plans(name), guarded(lambda _: encode(self.plans()))),
             bus.serve(keys.plan_image(name), guarded(lambda payload: self.images.get(_sha256(payload)))),
-            bus.serve(keys.put_plan_image(name), guarded(lambda payload: encode(self.images.put(payload)))),
+            bus.serve(
+                keys.put_plan_image(name),
+                guarded(lambda payload: encode(self.receive(decode(payload, PlanPiece)))),
+            ),
         ]
 
     def close(self) -> None:
@@ -73,6 +81,29 @@ class PlanService:
             InvalidFile: its image is lost.
         """
         return self.images.get(self.plans().plan(name).plan.image.sha256)
+
+    def receive(self, piece: PlanPiece) -> PlanReceived:
+        """Take a piece of an image; the last one puts it on the disk.
+
+        Raises:
+            InvalidValue: pieces are missing, or the whole is no PNG file.
+        """
+        with self._lock:
+            if piece.offset == 0:
+                self._incoming.pop(piece.sha256, None)
+                if len(self._incoming) >= MOST_AT_ONCE:
+                    del self._incoming[next(iter(self._incoming))]
+                self._incoming[piece.sha256] = bytearray()
+            data = self._incoming.get(piece.sha256)
+            if data is None or len(data) != piece.offset or piece.offset + len(piece.data) > piece.size:
+                raise InvalidValue("a piece of the image is missing: send it again from its beginning")
+            data += piece.data
+            if len(data) < piece.size:
+                return PlanReceived(len(data))
+            del self._incoming[piece.sha256]
+        if hashlib.sha256(data).hexdigest() != piece.sha256:
+            raise InvalidValue("the image was damaged on its way: send it again")
+        return PlanReceived(piece.size, self.images.put(bytes(data)))
 
     def put(self, data: bytes) -> PlanImage:
         """Keep an image of any kind as a PNG file; raises InvalidValue if it is none."""

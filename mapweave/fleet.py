@@ -9,6 +9,7 @@ with mapweave.Fleet() as fleet:
 from __future__ import annotations
 
 import getpass
+import hashlib
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +22,7 @@ from mapweave.fleet_constraints import SOON, FleetConstraints
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
-from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
+from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanImage, PlanPiece, PlanReceived
 from mapweave.hybridmap.mission_order import (
     MissionKind,
     MissionOrder,
@@ -310,7 +311,13 @@ class Fleet(FleetConstraints):
             InvalidValue: it is no PNG file, or too large.
             NotConnected: no map server answers.
         """
-        return decode(self._of_server(self._keys.any_put_plan_image(), png), PlanImage)
+        sha256, key = hashlib.sha256(png).hexdigest(), self._keys.any_put_plan_image()
+        for offset in range(0, len(png), PIECE):
+            piece = PlanPiece(sha256, len(png), offset, png[offset : offset + PIECE])
+            received = decode(self._of_server(key, encode(piece)), PlanReceived)
+            if received.image is not None:
+                return received.image
+        raise InvalidValue("a plan is a PNG file")
 
     def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
         annotation = annotation_of_words(

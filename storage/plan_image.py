@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.floor_plan import MAX_SIDE, PlanImage
+from mapweave.hybridmap.floor_plan import MAX_BYTES, MAX_SIDE, PlanImage
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.image_file import check_cost, image_size
 
-MAX_BYTES = 16 * 2**20
-"""Of the PNG: a plan of 6000 x 4000 px in colour takes about 2 MiB, a photograph of one 20."""
 WITH_ALPHA = (4, 6)
 """Colour types of PNG files with transparency."""
 

@@ -15,7 +15,7 @@ from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
-from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
+from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanPiece, PlanReceived
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
@@ -98,7 +98,8 @@ LIMITS: dict[type, Limit] = {
     MissionRequest: Limit("mission request", 2048),
     Missions: Limit("missions", 2**22, 50_000),
     PlacedPlans: Limit("plans", 2**24, 1_000_000),
-    PlanImage: Limit("plan image", 2048),
+    PlanPiece: Limit("piece of a plan", PIECE + 1024),
+    PlanReceived: Limit("plan image", 2048),
     KeptHistory: Limit("history", 2**26, 2_000_000),
 }
 """Kinds of messages."""

@@ -28,7 +28,6 @@ Retry-After in whole seconds and `retry_after` exactly. The pages are in `static
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
 import math
 import time
@@ -62,7 +61,7 @@ from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.live import Live
 from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.http.plans import plan_routes
-from mapweave.mapserver.http.same_site import SameSite
+from mapweave.mapserver.http.same_site import SameSite, is_loopback
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
 
 log = logging.getLogger(__name__)
@@ -374,14 +373,6 @@ def _length(request: Request, what: str) -> int:
     if int(text) == 0:
         raise InvalidValue(f"send {what} as the body")
     return int(text)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is of this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _page(name: str) -> Callable[[Request], Awaitable[Response]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ import pytest
 from mapweave.cli import main
 from mapweave.fleet import Fleet, login
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import PIECE, PlanPiece
 from mapweave.hybridmap.map_event import MapEventKind
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -103,6 +105,23 @@ def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> No
     fleet.withdraw("pin", str(node))
     with pytest.raises(InvalidValue, match="give a position within"):
         fleet.annotate("pin", str(node), node=str(node), merged_from_node=[2e5, 0.0, 0.0])
+
+
+def test_an_image_comes_in_pieces_and_in_order(house: House) -> None:
+    fleet, rng = house.person, np.random.default_rng(0)
+    noise = rng.integers(0, 255, (900, 900, 3)).astype(np.uint8)
+    png = cv2.imencode(".png", noise)[1].tobytes()
+    assert len(png) > 3 * PIECE
+    assert fleet.plan_image(fleet.put_plan_image(png).sha256) == png
+    sha256, plans = hashlib.sha256(png).hexdigest(), house.server._plans
+    plans.receive(PlanPiece(sha256, len(png), 0, png[:1000]))
+    with pytest.raises(InvalidValue, match="a piece of the image is missing"):
+        plans.receive(PlanPiece(sha256, len(png), 2000, png[2000:3000]))
+    with pytest.raises(InvalidValue, match="damaged on its way"):
+        plans.receive(PlanPiece(sha256, 4, 0, b"oops"))
+    for number in range(20):
+        plans.receive(PlanPiece(f"{number:064d}", 10, 0, b"begun"))
+    assert len(plans._incoming) == 4
 
 
 def test_plans_over_http(house: House) -> None:
