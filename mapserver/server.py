@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 
-from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.explanation import Explanation
@@ -117,7 +117,7 @@ class MapServer:
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
         self._constraints = ConstraintRecord(self._store, self._base)
         self._worker.constrain(self._constraints.constraints)
-        self._annotations = AnnotationRecord(self._store)
+        self._annotations = AnnotationRecord(self._store, self._base.annotations)
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
@@ -133,7 +133,7 @@ class MapServer:
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
         )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
-        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
+        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear)
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
@@ -288,6 +288,10 @@ class MapServer:
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file."""
         return self._services.map_file()
+
+    def _hear(self, status: AgentStatus) -> None:
+        self._schedule.observe(status.stamp_ns)
+        self._missions.hear(status)
 
     def _answers(self) -> Answers:
         """The newest ones, with routes by what is closed now."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +12,7 @@ from mapweave.commands import (
     agent,
     calibrate,
     closures,
+    completion,
     demo,
     doctor,
     drive,
@@ -33,12 +35,12 @@ from mapweave.commands import (
     sim,
     status,
 )
+from mapweave.commands.examples import add_examples
+from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
 
-EPILOG = "Start with `mapweave demo`. Each command has its own --help."
-MISSING_EXTRA = 3
-"""Exit status of a command whose libraries are not installed."""
+EPILOG = "Start with `mapweave demo`. Each command has its own --help, with examples."
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -73,9 +75,10 @@ def parser() -> argparse.ArgumentParser:
     for command in (
         demo, server, router, sim, agent, drive, status, missions, place, closures, keys, robots, doctor,
         find_port, find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize, evaluate,
-        settings,
+        settings, completion,
     ):  # fmt: skip
         command.add_to(commands)
+    add_examples(top)
     return top
 
 
@@ -83,10 +86,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Returns:
-        0 if it did what was asked, 1 if it could not (one line on stderr says why), 3 if it needs an extra
-        that is not installed, 130 if interrupted. What 2 means is in the command's own help.
+        See `mapweave.exit_status`; argparse itself exits with 2 on a wrong command line.
     """
-    arguments = parser().parse_args(argv)
+    commands = parser()
+    if "_ARGCOMPLETE" in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(commands)
+    arguments = commands.parse_args(argv)
     try:
         return int(arguments.run(arguments))
     except MissingExtra as error:
@@ -100,12 +107,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return MISSING_EXTRA
     except MapweaveError as error:
         print(f"mapweave: {error}", file=sys.stderr)
-        return 1
+        return FAILED
     except KeyboardInterrupt:
         print("mapweave: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:
-        return 1
+        return FAILED
     except OSError as error:
         # A disk that is full, a folder that may not be written: the system's words say it best, but for one.
         reason = error.strerror or error
@@ -115,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             reason = "cannot be made: what it should be in is a file"
         where = f"{error.filename}: " if error.filename else ""
         print(f"mapweave: {where}{reason}", file=sys.stderr)
-        return 1
+        return FAILED
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from mapweave.wire.keys import Keys
 
 ASKS = (
     "relocalize", "route", "known", "reserve", "mission", "missions", "robots", "map", "explain", "constrain",
-    "annotate", "annotations", "resolve", "history", "status",
+    "constraints", "annotate", "annotations", "resolve", "history", "status",
 )  # fmt: skip
 """Every question to a server, by the last part of its key."""
 COMMANDS = frozenset({"constrain", "annotate", "mission"})

@@ -70,11 +70,12 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
+    from mapweave.terminal import STAMP, stamped
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
-    logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
+    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
     for part in ("mapweave.mapserver", "mapweave.wire"):
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
@@ -103,19 +104,19 @@ def run(arguments: argparse.Namespace) -> int:
                 prepare(data, data / f"{name}.sqlite")
             path = data / f"{name}.sqlite"
             if path.exists() and path.stat().st_size > LARGE:
-                print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
+                print(stamped(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ..."), flush=True)
             base = None
             if arguments.map is not None:
                 base = BaseMap.of(str(arguments.map), opened(arguments.map).content)
             server = MapServer(bus, keys, path, name, how, schedule, base)
             if base is not None:
-                print(f"with {base}", flush=True)
+                print(stamped(f"with {base}"), flush=True)
             stack.enter_context(server)
             where = ", ".join(router.listen)
-            print(f"map server {name} of fleet {keys.fleet} listens at {where}", flush=True)
+            print(stamped(f"map server {name} of fleet {keys.fleet} listens at {where}"), flush=True)
             if address is not None:
                 stack.enter_context(Web(address, server, commands=arguments.http_commands))
-                print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
+                print(stamped(f"for people: http://{':'.join(map(str, address))}/"), flush=True)
             if arguments.demo:
                 stack.enter_context(RecordedFleet(bus, keys, name, data))
             last_line, manager = "", ServiceManager()
@@ -126,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
                     router = renew_access(bus, folder, router, name)
                 now = server.summary()
                 if now != last_line:
-                    print(now, flush=True)
+                    print(stamped(now), flush=True)
                     last_line = now
     finally:
         bus.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
 
 SILENT = 5.0
 """A robot that has sent nothing for longer is shown as silent, s; it sends twice a second."""
-WIDE = 400
-"""Characters of a line that no terminal shows."""
 COLUMNS = ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "last trouble")
 LEAST = 12
 """Characters that a column of words keeps on a narrow terminal."""
@@ -45,8 +42,10 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from rich.console import Console
     from rich.live import Live
+
+    from mapweave.hybridmap.errors import NotConnected
+    from mapweave.terminal import plain_or_terminal
 
     with fleet_of(arguments) as fleet:
         if arguments.json:
@@ -56,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
                     return 0
                 time.sleep(EVERY)
         # A line a robot where another program reads.
-        console = Console(width=None if sys.stdout.isatty() else WIDE)
+        console = plain_or_terminal(stderr=False)
         if not arguments.watch:
             status = fleet.status()
             console.print(table(status, console.width) if status.robots else "no robot is there")
@@ -64,7 +63,11 @@ def run(arguments: argparse.Namespace) -> int:
         with Live(table(fleet.status(), console.width), console=console, auto_refresh=False) as live:
             while True:
                 time.sleep(EVERY)
-                live.update(table(fleet.status(), console.width), refresh=True)
+                try:
+                    shown: Table | str = table(fleet.status(), console.width)
+                except NotConnected as error:  # it may come back
+                    shown = str(error)
+                live.update(shown, refresh=True)
 
 
 def table(status: FleetStatus, width: int) -> Table:
