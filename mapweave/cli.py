@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -25,6 +26,7 @@ from mapweave.commands import (
     missions,
     open_map,
     place,
+    plan,
     record,
     relocalize,
     replay,
@@ -41,6 +43,7 @@ from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help, with examples."
+NEGATIVE = re.compile(r"-[0-9.][0-9.,=e+-]*$")
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -50,6 +53,8 @@ class CommandParser(argparse.ArgumentParser):
         """Make a parser; those of its commands are of this class, too."""
         super().__init__(*args, **kwargs)
         self.set_defaults(command=self.prog)
+        # Positions begin with a minus as well, and are no options: -3.1,2 and -3.1,2=40,50.
+        self._negative_number_matcher = NEGATIVE
 
 
 class PrintVersion(argparse.Action):
@@ -73,9 +78,9 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, drive, status, missions, place, closures, keys, robots, doctor,
-        find_port, find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize, evaluate,
-        settings, completion,
+        demo, server, router, sim, agent, drive, status, missions, place, plan, closures, keys, robots,
+        doctor, find_port, find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize,
+        evaluate, settings, completion,
     ):  # fmt: skip
         command.add_to(commands)
     add_examples(top)

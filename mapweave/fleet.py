@@ -21,6 +21,7 @@ from mapweave.connection import ANSWERED, no_server, reach
 from mapweave.fleet_annotations import FleetAnnotations
 from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
+from mapweave.fleet_plans import FleetPlans
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import (
@@ -83,7 +84,7 @@ def login() -> str:
         return "a person"
 
 
-class Fleet(FleetMap, FleetConstraints, FleetAnnotations):
+class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
     """A connection to a fleet, and its merged map. A context manager; it may be used from any thread.
 
     The merged map is fetched when it is first looked at, and again by `refresh`. Whereabouts, routes and

@@ -83,6 +83,7 @@ class MapFile:
             maps none.
         history: of a merged map: what has become of its maps by itself, in order.
         annotations: what people say about the map, in order.
+        images: PNG files of floor plans, by their SHA-256.
     """
 
     kind: Kind
@@ -96,6 +97,7 @@ class MapFile:
     history: tuple[MapEvent, ...] = ()
     annotations: tuple[Annotation, ...] = ()
     retired: Mapping[NodeId, Number] = field(default_factory=dict)
+    images: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse faded landmarks that the nodes do not have, and unknown constraints (InvalidValue)."""

@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 from mapweave.commands.network import add_network, network_of, reach, settings_of
+from mapweave.commands.plan import add_plan_option, plan_of, plan_place
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from mapweave.hybridmap.floor_plan import PlacedPlan
     from mapweave.hybridmap.node import Node, NodeId
-    from mapweave.hybridmap.query import RelocalizeAnswer, View
+    from mapweave.hybridmap.pose import Pose2
+    from mapweave.hybridmap.query import RelocalizeAnswer, View, Whereabouts
     from mapweave.settings import NetworkSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
@@ -44,6 +47,7 @@ def add_to(commands: Any) -> None:
         "--draw", type=Path, metavar="PNG",
         help="draw the best candidate's landmarks next to the image, joined where they match",
     )  # fmt: skip
+    add_plan_option(parser)
     parser.add_argument("--timeout", type=float, default=5.0, metavar="S", help="longest wait for an answer")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
@@ -56,7 +60,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.drawing.match_picture import draw_matches
     from mapweave.hybridmap.errors import DeviceError
     from mapweave.hybridmap.query import Certainty
-    from mapweave.mapserver.http.json_values import json_values
     from mapweave.storage.image_file import read_grey
     from mapweave.vision.lens import Lens
     from mapweave.vision.sift import Sift
@@ -75,6 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     grey = read_grey(arguments.image, camera, str(camera_file))
 
     lens = Lens(camera, distortion)
+    plan = plan_of(arguments)
 
     @cache
     def view() -> View:
@@ -85,9 +89,9 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         answer, node = _by_map(arguments, view())
     if arguments.json:
-        print(json.dumps(json_values(answer)))
+        print(json.dumps(_json(answer, plan)))
     else:
-        _print(answer)
+        _print(answer, plan)
     if arguments.draw is not None and node is not None:
         best = answer.candidates[0].node_from_robot.mean
         draw_matches(arguments.draw, grey, lens, node, view(), best)
@@ -162,7 +166,24 @@ def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, 
     return way.legs[0].node
 
 
-def _print(answer: RelocalizeAnswer) -> None:
+def _json(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> dict[str, Any]:
+    from mapweave.mapserver.http.json_values import json_values
+
+    values = json_values(answer)
+    for place, candidate in zip(answer.candidates, values["candidates"], strict=True):
+        pose = None if plan is None else _in_plan(place, plan)
+        if plan is not None:
+            candidate["plan_from_robot"] = None if pose is None else json_values(pose)
+    return values
+
+
+def _in_plan(place: Whereabouts, plan: PlacedPlan) -> Pose2 | None:
+    """Where a candidate is on a plan; None where the plan does not lie."""
+    pose = place.merged_from_robot
+    return None if pose is None else plan.pose(place.component, pose.mean)
+
+
+def _print(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> None:
     import numpy as np
 
     print(f"{answer.certainty}: {answer.reason}")
@@ -182,6 +203,8 @@ def _print(answer: RelocalizeAnswer) -> None:
             f"{math.degrees(heading):+.1f} deg (sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
             f"{place.inliers} landmarks agree, probability {place.probability:.3f}"
         )
+        if plan is not None:
+            print(f"    {plan_place(plan, _in_plan(place, plan))}")
     for near in answer.similar:
         side = "left" if (near.turn or 0.0) > 0.0 else "right"
         turn = "" if near.turn is None else f"; turn {abs(math.degrees(near.turn)):.0f} deg {side}"
