@@ -19,6 +19,7 @@ GROUPS = {
     "Places and closures": (
         "place add", "place list", "place remove", "close", "reopen", "prefer", "avoid", "closures",
     ),
+    "Floor plans": ("plan add", "plan show", "plan export", "plan remove", "map pin"),
     "Maps": (
         "map show", "open", "map explain", "map route", "map history", "map diff", "map link", "map unmerge",
         "map retire", "map undo", "map merge",
