@@ -26,8 +26,13 @@ log = logging.getLogger(__name__)
 class AnnotationRecord:
     """The server's record of annotations, on its disk. Entries are added, never removed."""
 
-    def __init__(self, store: Store) -> None:
-        """Read the record."""
+    def __init__(self, store: Store, base: Annotations | None = None) -> None:
+        """Read the record.
+
+        Args:
+            store: where it is kept.
+            base: annotations of before, of a map that is there from the start.
+        """
         self._store = store
         made: list[Annotation] = []
         for body in store.annotations():
@@ -35,7 +40,8 @@ class AnnotationRecord:
                 made.append(decode(body, Annotation))
             except InvalidMessage as error:
                 log.error("an annotation cannot be read (%s); it is left out", error)
-        self._annotations = Annotations(tuple(made))
+        own = Annotations(tuple(made))
+        self._annotations = base + own if base is not None and base.made else own
 
     @property
     def annotations(self) -> Annotations:

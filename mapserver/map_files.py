@@ -12,7 +12,7 @@ from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import Edge
+from mapweave.hybridmap.node import Edge, NodeId
 from mapweave.mapserver.own_maps import PROBABILITY, is_link, maps_of
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
@@ -57,6 +57,7 @@ def map_file_of(
         tuple(history),
         (annotations or Annotations()).made,
         dict(images or {}),
+        _numbered(merged.constraints),
     )
 
 
@@ -73,7 +74,8 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         InvalidFile: its measurements determine no poses.
     """
     s = settings or MergeSettings()
-    maps, constraints = maps_of(content), ManualConstraints(content.constraints)
+    nodes = {node: content.constraints[number] for node, number in content.retired.items()}
+    maps, constraints = maps_of(content), ManualConstraints(content.constraints, nodes)
     links = tuple(_links(change.edge for change in content.changes if isinstance(change, EdgePut)))
     try:
         parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency)
@@ -103,6 +105,12 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         faded,
     )
     return PinnedFrames().moved(merged, Annotations(content.annotations).pins)
+
+
+def _numbered(constraints: ManualConstraints) -> dict[NodeId, int]:
+    """Retired nodes with the numbers of their constraints."""
+    number = {constraint: k for k, constraint in enumerate(constraints.made)}
+    return {node: number[constraint] for node, constraint in constraints.nodes.items()}
 
 
 def _links(edges: Iterable[Edge]) -> list[Link]:

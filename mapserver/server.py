@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 
-from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.explanation import Explanation
@@ -119,7 +119,7 @@ class MapServer:
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
         self._constraints = ConstraintRecord(self._store, self._base)
         self._worker.constrain(self._constraints.constraints)
-        self._annotations = AnnotationRecord(self._store)
+        self._annotations = AnnotationRecord(self._store, self._base.annotations)
         self._pins = self._annotations.annotations.pins
         self._worker.pin(self._pins)
         self._path = path
@@ -139,10 +139,10 @@ class MapServer:
         )  # fmt: skip
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,
-            lambda: self._annotations.annotations, self._path,
+            lambda: self._annotations.annotations, self._path, base.images,
         )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
-        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
+        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear)
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
@@ -328,6 +328,10 @@ class MapServer:
         if annotations.pins != self._pins:
             self._pins = annotations.pins
             self._worker.pin(self._pins)
+
+    def _hear(self, status: AgentStatus) -> None:
+        self._schedule.observe(status.stamp_ns)
+        self._missions.hear(status)
 
     def _answers(self) -> Answers:
         """The newest ones, with routes by what is closed now."""

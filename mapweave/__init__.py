@@ -23,9 +23,11 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.agent_status import AgentStatus as AgentStatus
     from mapweave.hybridmap.agent_status import FleetStatus as FleetStatus
     from mapweave.hybridmap.agent_status import RobotEntry as RobotEntry
+    from mapweave.hybridmap.area import Area as Area
     from mapweave.hybridmap.camera import Camera as Camera
     from mapweave.hybridmap.errors import MapweaveError as MapweaveError
     from mapweave.hybridmap.hybrid_map import HybridMap as HybridMap
+    from mapweave.hybridmap.manual_constraint import ManualConstraint as ManualConstraint
     from mapweave.hybridmap.mission_order import MissionKind as MissionKind
     from mapweave.hybridmap.mission_order import MissionReport as MissionReport
     from mapweave.hybridmap.mission_order import MissionState as MissionState
@@ -58,9 +60,11 @@ else:
         "mapweave.agent.recordings.camera_file": ("read_camera",),
         "mapweave.fleet": ("Fleet",),
         "mapweave.hybridmap.agent_status": ("AgentStatus", "FleetStatus", "RobotEntry"),
+        "mapweave.hybridmap.area": ("Area",),
         "mapweave.hybridmap.camera": ("Camera",),
         "mapweave.hybridmap.errors": ("MapweaveError",),
         "mapweave.hybridmap.hybrid_map": ("HybridMap",),
+        "mapweave.hybridmap.manual_constraint": ("ManualConstraint",),
         "mapweave.hybridmap.mission_order": ("MissionKind", "MissionReport", "MissionState"),
         "mapweave.hybridmap.node": ("Edge", "EdgeKind", "Landmarks", "MapId", "Node", "NodeId"),
         "mapweave.hybridmap.pose": ("Pose2", "PoseGaussian"),

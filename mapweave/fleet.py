@@ -18,7 +18,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from mapweave.fleet_constraints import SOON, FleetConstraints
+from mapweave.connection import ANSWERED, no_server, reach
+from mapweave.fleet_constraints import FleetConstraints
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
@@ -60,9 +61,12 @@ def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0)
         NotConnected: the robot does not answer, or does not take it.
     """
     replies = bus.ask(keys.mission(order.robot), encode(order), timeout)
-    if not replies or replies[0].error:
-        why = replies[0].error if replies else "no answer"
-        raise NotConnected(f"robot {order.robot} did not take its mission: {why}")
+    if not replies:
+        raise NotConnected(
+            f"robot {order.robot} does not answer: is its agent running? `mapweave status` lists the robots"
+        )
+    if replies[0].error:
+        raise NotConnected(f"robot {order.robot} did not take its mission: {replies[0].error}")
     return decode(replies[0].payload, MissionReport)
 
 
@@ -105,12 +109,7 @@ class Fleet(FleetConstraints):
             credentials = read_key_file(Path(keys)).credentials if keys else None
             self._role = None if credentials is None else credentials.role
             endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-            bus = self._own = ZenohBus(BusSettings(endpoints=endpoints, credentials=credentials))
-            if not self._own.wait_connected(SOON):
-                self._own.close()
-                raise NotConnected(
-                    f"no router at {', '.join(endpoints)}: start `mapweave server`, or give --connect"
-                )
+            bus = self._own = reach(BusSettings(endpoints=endpoints, credentials=credentials))
         self._bus = bus
 
     def __enter__(self) -> Fleet:
@@ -129,13 +128,19 @@ class Fleet(FleetConstraints):
             self._own.close()
 
     def status(self) -> FleetStatus:
-        """All robots, as the map server sees them; without one, those that answer themselves."""
-        for reply in self._ask(self._keys.any_robots(), b"", SOON):
+        """All robots, as the map server sees them; without one, those that answer themselves.
+
+        Raises:
+            NotConnected: no map server and no robot answers.
+        """
+        for reply in self._ask(self._keys.any_robots(), b"", ANSWERED):
             return decode(reply.payload, FleetStatus)
         robots = []
-        for reply in self._ask(self._keys.agent_statuses(), b"", SOON):
+        for reply in self._ask(self._keys.agent_statuses(), b"", ANSWERED):
             status = decode(reply.payload, AgentStatus)
             robots.append(RobotEntry(status.robot, True, 0.0, status))
+        if not robots:
+            raise no_server(self._keys.fleet)
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
@@ -147,9 +152,9 @@ class Fleet(FleetConstraints):
         Raises:
             NotConnected: no map server answers.
         """
-        replies = self._ask(self._keys.any_missions(), b"", SOON)
+        replies = self._ask(self._keys.any_missions(), b"", ANSWERED)
         if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+            raise no_server(self._keys.fleet)
         reports = decode(replies[0].payload, Missions).reports
         return tuple(report for report in reports if robot in ("", report.order.robot))
 
@@ -239,7 +244,7 @@ class Fleet(FleetConstraints):
         """
         replies = self._ask(self._keys.any_server_map(), b"", PACKING)
         if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+            raise no_server(self._keys.fleet)
         unpack_map_file(replies[0].payload)
         return replies[0].payload
 
@@ -351,7 +356,7 @@ class Fleet(FleetConstraints):
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
             request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via)
-            replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * SOON)
+            replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * ANSWERED)
             taken = [reply for reply in replies if not reply.error]
             if not taken and replies:
                 raise InvalidValue(replies[0].error.removeprefix("refused: "))
@@ -377,7 +382,7 @@ class Fleet(FleetConstraints):
         after_ns = 0
         for _ in range(TRIES):
             order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal, via=via)
-            report = send_order(self._bus, self._keys, order, SOON)
+            report = send_order(self._bus, self._keys, order, ANSWERED)
             if report.state is not MissionState.REPLACED:
                 break
             after_ns = self._newest(robot)
@@ -385,7 +390,7 @@ class Fleet(FleetConstraints):
 
     def _newest(self, robot: str) -> int:
         """Stamp of the mission that holds a robot."""
-        for reply in self._ask(self._keys.agent_status(robot), b"", SOON):
+        for reply in self._ask(self._keys.agent_status(robot), b"", ANSWERED):
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+from mapweave.connection import ANSWERED
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.constraint_subject import (
     Apart,
@@ -24,8 +25,6 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 
-SOON = 2.0
-"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
 CHECKING = 20.0
 """How long a server may take to check a manual constraint against a large map, s."""
 
@@ -76,7 +75,7 @@ class FleetConstraints:
         Args:
             which: one map, `r0.1`, or nodes, `r0.1.17`; none with an area.
             area: where all nodes are retired, of all maps.
-            begin: of one map alone nodes from then on: ns since 1970, or `2026-03-01T12:00` (UTC).
+            begin: of one map alone nodes from then on: ns since 1970, or `2026-03-01 12:00` (UTC).
             end: and until then.
             because: why.
             check: only say what it would do.
@@ -91,7 +90,7 @@ class FleetConstraints:
             if begin or end:
                 if not isinstance(about, RetiredMap):
                     raise InvalidValue("a time window is of one map")
-                about = read_window(about.map, begin, end)
+                about = read_window(about.map, begin, end, time.time_ns())
         return self.constrain(about, True, because, check=check)
 
     def undo(self, what: int | ManualConstraint, because: str = "", *, check: bool = False) -> str:
@@ -115,7 +114,7 @@ class FleetConstraints:
         Raises:
             NotConnected: no map server answers.
         """
-        replies = self._ask(self._keys.any_constraints(), b"", SOON)
+        replies = self._ask(self._keys.any_constraints(), b"", ANSWERED)
         if not replies:
             raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
         return decode(replies[0].payload, ConstraintList).made

@@ -83,9 +83,9 @@ class OpenedMap:
         from mapweave.offline_merge import merge_parts
 
         maps = maps_of(self.content)
-        if self.source is MapSource.FILE or len(maps) < 2:
-            return merged_of(self.content, settings)
         constraints = ManualConstraints(self.content.constraints)
+        if self.source is MapSource.FILE or (len(maps) < 2 and not constraints.in_force):
+            return merged_of(self.content, settings)
         of_store = self.path if self.source is MapSource.STORE else None
         pins = Annotations(self.content.annotations).pins
         return merge_parts(maps, constraints, progress, settings, of_store, pins)
@@ -96,7 +96,7 @@ class OpenedMap:
         Args:
             merged: see `merged`.
         """
-        if self.source is MapSource.FILE or len(merged.maps) < 2:
+        if self.source is MapSource.FILE or (len(merged.maps) < 2 and not merged.constraints.in_force):
             return self.content
         from mapweave.mapserver.map_files import map_file_of
 

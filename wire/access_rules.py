@@ -14,7 +14,8 @@ from mapweave.wire.keys import Keys
 
 ASKS = (
     "relocalize", "route", "known", "reserve", "mission", "missions", "robots", "map", "explain", "constrain",
-    "annotate", "annotations", "resolve", "plans", "plan_image", "put_plan_image", "history", "status",
+    "constraints", "annotate", "annotations", "resolve", "plans", "plan_image", "put_plan_image", "history",
+    "status",
 )  # fmt: skip
 """Every question to a server, by the last part of its key."""
 COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})

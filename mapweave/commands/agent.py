@@ -10,21 +10,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import (
-    SOON,
     add_network,
     connect,
     network_of,
+    reach,
     settings_of,
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.connection import SOON
 
 if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
     from mapweave.agent.drivers.settings import RobotSettings
     from mapweave.agent.synchronization import Synchronization
+    from mapweave.settings import NetworkSettings
     from mapweave.wire.bus import Bus
     from mapweave.wire.ros2.settings import Ros2Link
+    from mapweave.wire.zenoh_bus import ZenohBus
 
 
 def add_to(commands: Any) -> None:
@@ -178,8 +181,10 @@ def ros2_link(arguments: argparse.Namespace, settings: RobotSettings) -> Ros2Lin
 
 
 def print_error(line: str) -> None:
-    """Print a line for people, beside the output proper."""
-    print(line, file=sys.stderr, flush=True)
+    """Print an event for people, with the time, beside the output proper."""
+    from mapweave.terminal import stamped
+
+    print(stamped(line), file=sys.stderr, flush=True)
 
 
 def open_robot(
@@ -208,6 +213,18 @@ def open_robot(
     if lockstep or arguments.body:
         raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
     return find_driver(driver)(settings), FreeRunning()
+
+
+def bus_of(arguments: argparse.Namespace, settings: RobotSettings, network: NetworkSettings) -> ZenohBus:
+    """A connection of a command that needs the network only if the robot's base is behind it.
+
+    Raises:
+        NotConnected: the base is, and there is no router.
+    """
+    from mapweave.agent.drivers.settings import REMOTE
+
+    remote = (arguments.robot or settings.driver) == REMOTE
+    return (reach(network) if remote else connect(network))[0]
 
 
 def close_on(stop: threading.Event, robot: Robot) -> None:

@@ -128,9 +128,11 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     before = merged_of(content, settings)
     earlier = ManualConstraints(content.constraints)
     constraint, effects = check_manual_constraint(before, earlier, constraint, settings=settings)
-    print(f"{event_words(constraint)}{f'; {effects}' if effects else ''}")
+    words = f"{event_words(constraint)}{f'; {effects}' if effects else ''}"
     if arguments.check:
+        print(f"only checked, nothing is changed: {words}")
         return
+    print(words)
     parts = parts_of({arguments.map: content})
     constraints = parts.constraints + ManualConstraints([constraint])
     merged = merged_with_progress(parts.maps, constraints, settings, parts.annotations.pins)

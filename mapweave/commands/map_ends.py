@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from mapweave.commands.network import connect, network_of, settings_of
+from mapweave.commands.network import network_of, reach, settings_of
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.node import MapId, NodeId
@@ -119,19 +119,16 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
     Raises:
         NotConnected: no server answers, or all refuse.
     """
+    from mapweave.connection import no_server
+
     network = network_of(arguments, settings_of(arguments))
-    bus, keys = connect(network)
+    bus, keys = reach(network, "give --connect, or --map FILE")
     try:
-        where = ", ".join(network.endpoints)
-        if not bus.wait_connected(arguments.timeout):
-            raise NotConnected(
-                f"no router at {where}: start `mapweave server`, give --connect, or --map FILE"
-            )
         replies = _patiently(bus, key_of(keys), payload, arguments.timeout)
     finally:
         bus.close()
     if not replies:
-        raise NotConnected(f"a router is up at {where}, but no map server of fleet {network.fleet} answered")
+        raise no_server(network.fleet)
     good = [reply for reply in replies if not reply.error]
     if not good:
         raise NotConnected(f"the map server refused: {replies[0].error}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
 
 SILENT = 5.0
 """A robot that has sent nothing for longer is shown as silent, s; it sends twice a second."""
-WIDE = 400
-"""Characters of a line that no terminal shows."""
 COLUMNS = ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "last trouble")
 LEAST = 12
 """Characters that a column of words keeps on a narrow terminal."""
@@ -49,8 +46,10 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from rich.console import Console
     from rich.live import Live
+
+    from mapweave.hybridmap.errors import NotConnected
+    from mapweave.terminal import plain_or_terminal
 
     with fleet_of(arguments) as fleet:
         if arguments.json:
@@ -60,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
                     return 0
                 time.sleep(EVERY)
         # A line a robot where another program reads.
-        console = Console(width=None if sys.stdout.isatty() else WIDE)
+        console = plain_or_terminal(stderr=False)
         if not arguments.watch:
             status = fleet.status()
             shown = table(status, console.width, _plan(fleet, arguments))
@@ -68,8 +67,11 @@ def run(arguments: argparse.Namespace) -> int:
             return 0
         with Live(console=console, auto_refresh=False) as live:
             while True:
-                shown = table(fleet.status(), console.width, _plan(fleet, arguments))
-                live.update(shown, refresh=True)
+                try:
+                    lines: Table | str = table(fleet.status(), console.width, _plan(fleet, arguments))
+                except NotConnected as error:  # it may come back
+                    lines = str(error)
+                live.update(lines, refresh=True)
                 time.sleep(EVERY)
 
 

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import cv2
-from rich.console import Console
 
 from mapweave.agent.calibration.correction import declaring, geometry_of
 from mapweave.agent.calibration.online import OnlineCalibration
@@ -40,6 +39,7 @@ from mapweave.processes.ros2_publisher import Ros2Publisher
 from mapweave.processes.server_watch import ServerWatch
 from mapweave.processes.service_manager import ServiceManager
 from mapweave.storage.map_file import MapFile, write_map_file
+from mapweave.terminal import EventLog, plain_or_terminal
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 from mapweave.wire.ros2.settings import Ros2Link
@@ -347,9 +347,10 @@ def run_agent(
     """
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
-    console = Console(stderr=True)
+    console = plain_or_terminal()
+    say = EventLog(console)
     show, manager = AgentProgress(console, options.name, options.total), ServiceManager()
-    describe = partial(_describe, robot, console.print, options.name)
+    describe = partial(_describe, robot, say, options.name)
     publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
 
     def stepped(observation: Observation, step: Step) -> None:
@@ -361,7 +362,7 @@ def run_agent(
     with contextlib.ExitStack() as closing:
         if publisher is not None:
             closing.callback(publisher.close)
-        agent = Agent(describe, bus, keys, settings, options, stepped, console.print)
+        agent = Agent(describe, bus, keys, settings, options, stepped, say)
         manager.ready()
         closing.enter_context(show)
         try:
@@ -370,9 +371,9 @@ def run_agent(
             robot.close()
             path = agent.write_map()
             nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
-            console.print(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
+            say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
             agent.replicator.flush(10.0)
-            _hand_over(console, agent.replicator, bus, options)
+            _hand_over(say, agent.replicator, bus, options)
             agent.close()
 
 
@@ -387,14 +388,15 @@ def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> Rob
         patience.cancel()
 
 
-def _hand_over(console: Console, replicator: Replicator, bus: ZenohBus, options: AgentOptions) -> None:
+def _hand_over(
+    say: Callable[[str], None], replicator: Replicator, bus: ZenohBus, options: AgentOptions
+) -> None:
     if options.patience <= 0:
-        console.print("offline: the map stays in the journal and is sent when a server can be reached")
+        line = "offline: the map stays in the journal and is sent when a server can be reached"
     elif not bus.wait_connected(min(2.0, options.patience)):
-        console.print("no server in reach: the map stays in the journal and is sent when one can be reached")
+        line = "no server in reach: the map stays in the journal and is sent when one can be reached"
     elif replicator.wait_acknowledged(options.patience):
-        console.print(f"server {options.server} has it all")
+        line = f"server {options.server} has it all"
     else:
-        console.print(
-            f"server {options.server} has not acknowledged everything: the rest stays in the journal"
-        )
+        line = f"server {options.server} has not acknowledged everything: the rest stays in the journal"
+    say(f"{options.name}: {line}")

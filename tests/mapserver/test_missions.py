@@ -132,7 +132,7 @@ def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
             call()
     link.close()
     other.close()
-    with pytest.raises(NotConnected, match="robot r0 did not take its mission: no answer"):
+    with pytest.raises(NotConnected, match="robot r0 does not answer: is its agent running"):
         house.person.stop("r0")
 
 
