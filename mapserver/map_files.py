@@ -56,8 +56,8 @@ def map_file_of(
         merged.faded,
         tuple(history),
         (annotations or Annotations()).made,
-        dict(images or {}),
         _numbered(merged.constraints),
+        dict(images or {}),
     )
 
 

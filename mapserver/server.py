@@ -323,15 +323,15 @@ class MapServer:
         """The merged map as a map file."""
         return self._services.map_file()
 
+    def _hear(self, status: AgentStatus) -> None:
+        self._schedule.observe(status.stamp_ns)
+        self._missions.hear(status)
+
     def _apply_annotations(self, annotations: Annotations) -> None:
         # A merge takes its time: only what moves a frame is worth one.
         if annotations.pins != self._pins:
             self._pins = annotations.pins
             self._worker.pin(self._pins)
-
-    def _hear(self, status: AgentStatus) -> None:
-        self._schedule.observe(status.stamp_ns)
-        self._missions.hear(status)
 
     def _answers(self) -> Answers:
         """The newest ones, with routes by what is closed now."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 
 from mapweave.hybridmap.annotation import Annotations
@@ -141,7 +142,7 @@ def merge_parts(
     return merged
 
 
-def merge_map_files(paths: Iterable[Path]) -> MapFile:
+def merge_map_files(paths: Iterable[str | PathLike[str]]) -> MapFile:
     """Merge map files as `mapweave map merge` does.
 
     Returns:
@@ -151,6 +152,6 @@ def merge_map_files(paths: Iterable[Path]) -> MapFile:
         InvalidFile: a file cannot be read, or two hold different maps of one name.
         InvalidValue: a map cannot be merged.
     """
-    parts = parts_of({path: read_map_file(path) for path in paths})
+    parts = parts_of({Path(path): read_map_file(Path(path)) for path in paths})
     merged = merge_parts(parts.maps, parts.constraints, pins=parts.annotations.pins)
     return map_file_of(merged, parts.history, parts.annotations, parts.images)

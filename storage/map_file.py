@@ -96,8 +96,8 @@ class MapFile:
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     history: tuple[MapEvent, ...] = ()
     annotations: tuple[Annotation, ...] = ()
-    images: Mapping[str, bytes] = field(default_factory=dict)
     retired: Mapping[NodeId, Number] = field(default_factory=dict)
+    images: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse faded landmarks that the nodes do not have, and unknown constraints (InvalidValue)."""

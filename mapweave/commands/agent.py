@@ -64,12 +64,22 @@ def add_to(commands: Any) -> None:
         help="publish pose, tf, path and map as ROS 2 topics, for rviz and Nav2 (docs/ros2.md), through this "
         "Zenoh router (default: that of the driver ros2, else tcp/127.0.0.1:7447)",
     )  # fmt: skip
+    add_rerun(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
     )
     add_network(parser)
     parser.set_defaults(run=run)
+
+
+def add_rerun(parser: argparse.ArgumentParser) -> None:
+    """Declare the log for the Rerun viewer."""
+    parser.add_argument(
+        "--rerun", nargs="?", const="connect", metavar="FILE|connect",
+        help="show what it senses and estimates in the Rerun viewer: into FILE.rrd, or to the viewer on this "
+        "computer (default), or to that at rerun+http://HOST:PORT/proxy (docs/see-inside.md)",
+    )  # fmt: skip
 
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
@@ -135,6 +145,7 @@ def run(arguments: argparse.Namespace) -> int:
             server=network.server,
             calibration=calibration_of(arguments, name),
             ros2=None if arguments.ros2 is None else ros2_link(arguments, settings.robot),
+            rerun=arguments.rerun,
         )
         agent = settings.agent
         if arguments.without_rangers:

@@ -55,6 +55,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "mapweave map show office.mapweave",
         "mapweave map show office.mapweave --json --no-picture",
     ),
+    "map diff": ("mapweave map diff monday.mapweave tuesday.mapweave",),
     "map explain": ("mapweave map explain r0.1 r1.1", "mapweave map explain r0.1.5 r1.1.9"),
     "map route": ("mapweave map route r0.1.1 r1.1.17",),
     "map history": ("mapweave map history --most 10",),

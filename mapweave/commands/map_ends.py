@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -13,9 +12,10 @@ from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
-from mapweave.wire.bus import Bus, Reply
+from mapweave.wire.bus import Reply
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.patience import ask_patiently
 
 if TYPE_CHECKING:
     from mapweave.mapserver.routes import Router
@@ -30,17 +30,6 @@ def ends_of(words: list[str]) -> Ends:
     if len(words) != 2:
         raise InvalidValue(f"give two nodes or two maps, not {len(words)}: {EXAMPLE}")
     return read_ends(words[0], words[1])
-
-
-def _patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Reply]:
-    """Ask, and ask busy servers again at their time, until the patience is over."""
-    end = time.monotonic() + timeout
-    while True:
-        replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
-        pause = max((reply.retry_after for reply in replies), default=0.0)
-        if pause <= 0.0 or time.monotonic() + pause > end:
-            return replies
-        time.sleep(pause)
 
 
 def resolved(arguments: argparse.Namespace, words: list[str], router: Router | None = None) -> list[str]:
@@ -124,7 +113,7 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
     network = network_of(arguments, settings_of(arguments))
     bus, keys = reach(network, "give --connect, or --map FILE")
     try:
-        replies = _patiently(bus, key_of(keys), payload, arguments.timeout)
+        replies = ask_patiently(bus, key_of(keys), payload, arguments.timeout)
     finally:
         bus.close()
     if not replies:

@@ -231,7 +231,8 @@ def _merged(record: Fleet | OfflineAnnotations, arguments: argparse.Namespace) -
     from mapweave.commands.network import settings_of
     from mapweave.fleet import Fleet
     from mapweave.mapserver.map_files import merged_of
+    from mapweave.storage.map_file import unpack_map_file
 
     if isinstance(record, Fleet):
-        return merged_of(record.map(), settings_of(arguments).merge)
+        return merged_of(unpack_map_file(record.map_bytes()), settings_of(arguments).merge)
     return record.merged

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.agent import add_calibration, calibration_of
+from mapweave.commands.agent import add_calibration, add_rerun, calibration_of
 from mapweave.commands.network import (
     add_network,
     connect,
@@ -43,6 +43,7 @@ def add_to(commands: Any) -> None:
         "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
     )
     add_calibration(parser)
+    add_rerun(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -101,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
         trajectories=True,
         patience=0.0 if arguments.offline else arguments.patience,
         calibration=calibration_of(arguments, name),
+        rerun=arguments.rerun,
     )
     stop = stop_on_signals()
     bus, keys = connect(network)

@@ -74,6 +74,10 @@ def _add_run(kinds: Any) -> None:
         "--view", type=int, nargs="?", const=8090, metavar="PORT",
         help="show the trial live at http://127.0.0.1:PORT (default port: 8090)",
     )  # fmt: skip
+    parser.add_argument(
+        "--rerun", action="store_true",
+        help="write what each robot senses and estimates for the Rerun viewer: rerun/ROBOT.1.rrd in --out",
+    )  # fmt: skip
     _add_fleet(parser)
     parser.set_defaults(run=run_one)
 
@@ -135,7 +139,7 @@ def run_one(arguments: argparse.Namespace) -> int:
     """Run one trial and print what came of it."""
     from mapweave.extras import TRIAL, need
 
-    need(*TRIAL)
+    need(*TRIAL, *(["rerun"] if arguments.rerun else []))
     from mapweave.scenarios.run import TrialOptions, run_trial
     from mapweave.scenarios.scenario import load_scenario, scenario_path
     from mapweave.scenarios.summary import summary_table
@@ -158,6 +162,7 @@ def run_one(arguments: argparse.Namespace) -> int:
             film_every=0.0 if arguments.no_film else 1.0,
             view=arguments.view,
             quiet=arguments.json,
+            rerun=arguments.rerun,
         ),
     )
     if arguments.json:

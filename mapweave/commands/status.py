@@ -62,16 +62,16 @@ def run(arguments: argparse.Namespace) -> int:
         console = plain_or_terminal(stderr=False)
         if not arguments.watch:
             status = fleet.status()
-            shown = table(status, console.width, _plan(fleet, arguments))
-            console.print(shown if status.robots else "no robot is there")
+            rows = table(status, console.width, _plan(fleet, arguments))
+            console.print(rows if status.robots else "no robot is there")
             return 0
         with Live(console=console, auto_refresh=False) as live:
             while True:
                 try:
-                    lines: Table | str = table(fleet.status(), console.width, _plan(fleet, arguments))
+                    shown: Table | str = table(fleet.status(), console.width, _plan(fleet, arguments))
                 except NotConnected as error:  # it may come back
-                    lines = str(error)
-                live.update(lines, refresh=True)
+                    shown = str(error)
+                live.update(shown, refresh=True)
                 time.sleep(EVERY)
 
 

@@ -63,6 +63,7 @@ CASES: list[tuple[str, str, str]] = [
     ("router", "--listen nowhere", "endpoints look like"),
     ("record", "R0 --out {tmp}/drive --connect {closed}", "R0"),
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
+    ("replay", "{recording} --offline --data {tmp} --rerun {tmp}/walk.rrd", 'needs the extra "rerun"'),
     ("info", "{recording}", "3 images"),
     ("calibrate target", "--out {tmp}/board.pdf", "Print it at 100 %"),
     ("calibrate camera", "{recording}", "no view shows the target"),

@@ -6,8 +6,8 @@ import { colours } from "./colours.js";
 let annotations = [], offered = true;
 
 export const placeNamed = name => annotations.find(one => one.body.kind === "place" && one.name === name);
-// The node at a place, or the one that its area hangs on.
-export const nodeOf = ({ body }) => body.node || body.area?.anchor || body.edge?.[0];
+// The node at a place, or the one that its area, edge or plan hangs on.
+export const nodeOf = ({ body }) => body.node || body.area?.anchor || body.edge?.[0] || body.pairs?.[0].node || body.a;
 
 export async function loadAnnotations(select) {
   if (!offered) return;
@@ -20,7 +20,7 @@ export async function loadAnnotations(select) {
   byId("named").hidden = !annotations.length;
   for (const one of annotations) {
     const item = add(list, "li");
-    button(item, one.name, () => select(nodeOf(one)));
+    button(item, one.name, () => select(nodeOf(one) || ""));
     item.append(` ${one.body.kind}`);
   }
   return annotations.filter(one => one.body.kind === "place").map(one => one.name);

@@ -10,6 +10,7 @@ import { listen } from "./input.js";
 import { listenForPhotos } from "./photo.js";
 import { listenToTabs, openTab } from "./panels.js";
 import { MapModel } from "./map_model.js";
+import { drawPlans, loadPlans } from "./plans.js";
 import { Painter } from "./painter.js";
 import { addEvents, clearEvents } from "./timeline.js";
 import { Viewport } from "./viewport.js";
@@ -17,7 +18,7 @@ import { watch } from "./live.js";
 
 const PICK = 14;              // px about what is pressed
 const MOST_NAMES = 500;       // in the list that helps searching
-const ANNOTATIONS_EVERY = 10000;
+const SAID_EVERY = 10000;       // ms, between two looks at annotations and plans
 
 const model = new MapModel(), viewport = new Viewport(), painter = new Painter(byId("canvas"), model, viewport);
 const page = { robots: [], commands: false, node: "", robot: "", photo: [], places: [], readOnly: false };
@@ -135,6 +136,7 @@ function drawLegend() {
     item.append(words);
   }
 }
+painter.underlays.push(drawPlans);
 // Where the photo may have been taken.
 painter.overlays.push(drawAnnotations, (c, v) => {
   for (const { merged_from_robot, component, probability } of page.photo) {
@@ -170,7 +172,7 @@ watch({
     listNames();
     painter.changed();
     requestAnimationFrame(() => performance.mark("map drawn"));
-    loadAnnotationsNow();
+    loadSaid();
   },
   state({ server, robots }) {
     page.robots = robots;
@@ -192,14 +194,15 @@ watch({
   byId("connection").className = up ? "" : "lost";
   byId("connection").textContent = up ? "live" : "no server, trying again";
 });
-async function loadAnnotationsNow() {
+async function loadSaid() {
+  loadPlans(() => painter.ask());
   const places = await loadAnnotations(selectNode);
   if (!places) return;
   page.places = places;
   listNames();
   painter.ask();
 }
-setInterval(loadAnnotationsNow, ANNOTATIONS_EVERY);
+setInterval(loadSaid, SAID_EVERY);
 
 explanation.shown = answer => { if (answer.a?.id) markLink(answer.a.id, answer.b.id); };
 followTheme(() => { drawLegend(); listComponents(); painter.changed(); });

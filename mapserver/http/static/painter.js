@@ -14,7 +14,7 @@ const words = robot => robot.name + (robot.doing ? `: ${robot.doing}` : "");
 
 export class Painter {
   constructor(canvas, model, viewport) {
-    Object.assign(this, { canvas, model, viewport, robots: [], overlays: [], selected: -1, link: -1, robot: "" });
+    Object.assign(this, { canvas, model, viewport, robots: [], underlays: [], overlays: [], selected: -1, link: -1, robot: "" });
     this.bitmap = document.createElement("canvas");
     this.drawn = null; this.cost = 0; this.waiting = 0; this.asked = false;
   }
@@ -38,6 +38,9 @@ export class Painter {
     c.setTransform(1, 0, 0, 1, 0, 0);
     c.fillStyle = colours.ground;
     c.fillRect(0, 0, this.canvas.width, this.canvas.height);
+    c.setTransform(ratio, 0, 0, ratio, 0, 0);
+    for (const underlay of this.underlays) underlay(c, v, this.model);
+    c.setTransform(1, 0, 0, 1, 0, 0);
     if (this.drawn) {
       const d = this.drawn, [u, w] = v.toScreen(d.x, d.y), zoom = v.scale / d.scale;
       c.drawImage(this.bitmap, Math.round((u - d.width / 2 * zoom) * ratio), Math.round((w - d.height / 2 * zoom) * ratio),
