@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable
 
-from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
+from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.log.store import Store
@@ -55,7 +55,13 @@ class Annotator:
     """Declared on a bus until closed."""
 
     def __init__(
-        self, bus: Bus, keys: Keys, name: str, places: Callable[[], Places], record: AnnotationRecord
+        self,
+        bus: Bus,
+        keys: Keys,
+        name: str,
+        places: Callable[[], Places],
+        record: AnnotationRecord,
+        relabel: Callable[[], None],
     ) -> None:
         """Begin to answer.
 
@@ -65,8 +71,9 @@ class Annotator:
             name: of the server in the fleet.
             places: of the newest merged map. May wait for it.
             record: of annotations.
+            relabel: called when floors have changed.
         """
-        self._places, self._record = places, record
+        self._places, self._record, self._relabel = places, record, relabel
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.annotate(name), guarded(self._annotate)),
@@ -95,6 +102,8 @@ class Annotator:
         with self._turn:
             check_annotation(self._places().merged, self._record.annotations, annotation)
             self._record.add(annotation)
+            if isinstance(annotation.body, Floor):
+                self._relabel()
         log.warning("%s", annotation.words)
         return annotation.words
 

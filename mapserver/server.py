@@ -107,8 +107,8 @@ class MapServer:
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
         self._constraints = ConstraintRecord(self._store)
-        self._worker.constrain(self._constraints.constraints)
         self._annotations = AnnotationRecord(self._store)
+        self._constrain()
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
@@ -129,11 +129,13 @@ class MapServer:
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
-            worker.constrain, lambda: worker.settled, self._settings.merge,
+            lambda _: self._constrain(), lambda: worker.settled, self._settings.merge,
             lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
             lambda: self._annotations.annotations,
         )  # fmt: skip
-        self._annotator = Annotator(self._bus, self._keys, self._name, self._named_places, self._annotations)
+        self._annotator = Annotator(
+            self._bus, self._keys, self._name, self._named_places, self._annotations, self._constrain
+        )
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
@@ -275,6 +277,11 @@ class MapServer:
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file."""
         return self._services.map_file()
+
+    def _constrain(self) -> None:
+        """Merge by the constraints and the floors of the records."""
+        floors = self._annotations.annotations.floors
+        self._worker.constrain(self._constraints.constraints.with_floors(floors))
 
     def _answers(self) -> Answers:
         """The newest ones, with routes by what is closed now."""

@@ -84,7 +84,8 @@ class OpenedMap:
         maps = maps_of(self.content)
         if self.source is MapSource.FILE or len(maps) < 2:
             return merged_of(self.content, settings)
-        constraints = ManualConstraints(self.content.constraints)
+        floors = Annotations(self.content.annotations).floors
+        constraints = ManualConstraints(self.content.constraints, floors=floors)
         of_store = self.path if self.source is MapSource.STORE else None
         return merge_parts(maps, constraints, progress, settings, of_store)
 

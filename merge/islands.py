@@ -119,7 +119,9 @@ class Islands:
             return retired_nodes(maps, constraints, ())
         if self._without_areas is None:
             self._without_areas = Islands(self._settings, self._exact)
-        graphs = self._without_areas.merge(maps, verdicts, touched, ManualConstraints(others)).graphs
+        graphs = self._without_areas.merge(
+            maps, verdicts, touched, ManualConstraints(others, floors=constraints.floors)
+        ).graphs
         return retired_nodes(maps, constraints, graphs)
 
     def _ties(
@@ -145,7 +147,9 @@ def _touched_by(before: ManualConstraints, now: ManualConstraints) -> set[MapId]
     """Maps of which constraints have changed."""
     maps = {which for c in {*before.in_force} ^ {*now.in_force} for which in c.about.maps}
     retired = before.nodes.keys() | now.nodes.keys()
-    return maps | {node.map for node in retired if before.nodes.get(node) is not now.nodes.get(node)}
+    maps |= {node.map for node in retired if before.nodes.get(node) is not now.nodes.get(node)}
+    labelled = before.floors.keys() | now.floors.keys()
+    return maps | {which for which in labelled if before.floors.get(which) != now.floors.get(which)}
 
 
 def _sorted_out(verdicts: Iterable[Verdict]) -> tuple[list[Link], list[RefusedLink]]:

@@ -12,6 +12,7 @@ from mapweave.hybridmap.annotation import (
     Annotation,
     Annotations,
     Closure,
+    Floor,
     Place,
     Preference,
     check_place_name,
@@ -66,7 +67,10 @@ def is_name(name: str) -> bool:
     return bool(name)
 
 
-entries = st.builds(Annotation, lines.filter(is_name), bodies, st.booleans(), lines, stamps, lines)
+entries = st.builds(Annotation, lines.filter(is_name), bodies, st.booleans(), lines, stamps, lines) | st.builds(
+    lambda floor, *more: Annotation(str(floor.node.map), floor, *more),
+    st.builds(Floor, nodes, lines.filter(bool)), st.booleans(), lines, stamps, lines,
+)  # fmt: skip
 
 
 @given(st.lists(entries, max_size=6))
