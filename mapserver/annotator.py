@@ -24,8 +24,13 @@ log = logging.getLogger(__name__)
 class AnnotationRecord:
     """The server's record of annotations, on its disk. Entries are added, never removed."""
 
-    def __init__(self, store: Store) -> None:
-        """Read the record."""
+    def __init__(self, store: Store, base: Annotations | None = None) -> None:
+        """Read the record.
+
+        Args:
+            store: where it is kept.
+            base: annotations of a map that the server is given at its start.
+        """
         self._store = store
         made: list[Annotation] = []
         for body in store.annotations():
@@ -33,7 +38,8 @@ class AnnotationRecord:
                 made.append(decode(body, Annotation))
             except InvalidMessage as error:
                 log.error("an annotation cannot be read (%s); it is left out", error)
-        self._annotations = Annotations(tuple(made))
+        # By date only where there are two records: clocks differ, and one record is in order.
+        self._annotations = base + made if base is not None and base.made else Annotations(tuple(made))
 
     @property
     def annotations(self) -> Annotations:

@@ -29,6 +29,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.mapserver.explanations import explained
 from mapweave.mapserver.log.store import Store
@@ -48,16 +49,26 @@ AnyExplanation = TypeVar("AnyExplanation", bound=PairExplanation | MapsExplanati
 class ConstraintRecord:
     """The server's record of manual constraints, on its disk. Entries are added, never removed."""
 
-    def __init__(self, store: Store) -> None:
-        """Read the record."""
+    def __init__(self, store: Store, base: BaseMap | None = None) -> None:
+        """Read the record.
+
+        Args:
+            store: where it is kept.
+            base: has constraints of before, and maps that can be retired, too.
+        """
         self._store = store
+        self._base = base or BaseMap()
         made: list[ManualConstraint] = []
         for body in store.constraints():
             try:
                 made.append(decode(body, ManualConstraint))
             except InvalidMessage as error:
                 log.error("a manual constraint cannot be read (%s); it is left out", error)
-        self._constraints = ManualConstraints(made)
+        both = dict.fromkeys((*self._base.constraints.made, *made))
+        # By date only where there are two records: clocks differ, and one record is in order.
+        self._constraints = ManualConstraints(
+            sorted(both, key=lambda one: one.stamp_ns) if self._base.constraints.made else made
+        )
 
     @property
     def constraints(self) -> ManualConstraints:
@@ -66,7 +77,7 @@ class ConstraintRecord:
 
     def maps(self) -> list[MapId]:
         """All maps of which the server has anything: they can be retired."""
-        return self._store.maps()
+        return sorted({*self._store.maps(), *self._base.maps})
 
     def add(self, constraint: ManualConstraint) -> None:
         """Add a manual constraint; it is on the disk when this returns.

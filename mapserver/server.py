@@ -16,6 +16,7 @@ from types import TracebackType
 
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.map_event import MapEvent
@@ -24,6 +25,7 @@ from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAn
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.annotator import AnnotationRecord, Annotator
 from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
@@ -80,6 +82,7 @@ class MapServer:
         name: str,
         settings: ServerSettings | None = None,
         schedule: Schedule | None = None,
+        base: BaseMap | None = None,
     ) -> None:
         """Open the store and take up where it was left.
 
@@ -91,9 +94,10 @@ class MapServer:
             settings: how it shares its time.
             schedule: runs its work and gives the time; threads and the machine's clock by default. It
                 starts and ends with the server.
+            base: a map that is there from the start, beside the store.
 
         Raises:
-            InvalidFile: the store is damaged or is none.
+            InvalidFile: the store is damaged or is none, or has another map of a name that is in the base.
         """
         self._bus = bus
         self._keys = keys
@@ -102,12 +106,17 @@ class MapServer:
         self._schedule = clock = schedule or LiveSchedule()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = Store(path)
-        self._places = PlaceDatabase(self._store, path)
+        try:
+            self._base = (base or BaseMap()).beside(self._store)
+        except InvalidFile:
+            self._store.close()
+            raise
+        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()])
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
-        self._constraints = ConstraintRecord(self._store)
-        self._annotations = AnnotationRecord(self._store)
+        self._constraints = ConstraintRecord(self._store, self._base)
+        self._annotations = AnnotationRecord(self._store, self._base.annotations)
         self._constrain()
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
@@ -118,19 +127,23 @@ class MapServer:
         """Begin to serve."""
         worker, clock = self._worker, self._schedule
         worker.start()
-        self._ingest = Ingest(self._bus, self._keys, self._store, self._name, worker.take, replay=worker.read)
+        base = self._base
+        self._ingest = Ingest(
+            self._bus, self._keys, self._store, self._name, worker.take, None,
+            lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
+        )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
         self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
-            lambda: self._history.events, self._missions, self._roster,
+            self._events, self._missions, self._roster,
             clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places,
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
             lambda _: self._constrain(), lambda: worker.settled, self._settings.merge,
-            lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
+            lambda: self._blockages.known(clock.monotonic()), self._events,
             lambda: self._annotations.annotations,
         )  # fmt: skip
         self._annotator = Annotator(
@@ -291,6 +304,11 @@ class MapServer:
 
     def _named_places(self) -> Places:
         return Places(self._answers().router, self._annotations.annotations)
+
+    def _events(self) -> tuple[MapEvent, ...]:
+        """What has become of the maps, those of the base included."""
+        events = dict.fromkeys((*self._base.history, *self._history.events))
+        return tuple(sorted(events, key=lambda event: event.stamp_ns))
 
     def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))

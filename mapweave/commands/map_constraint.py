@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.commands.map_input import opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
@@ -55,12 +56,11 @@ def constraints_of(arguments: argparse.Namespace) -> ManualConstraints:
     """The record of a map file or of a server; the first is number 1."""
     from mapweave.commands.map_ends import ask
     from mapweave.hybridmap.manual_constraint import ConstraintList, ManualConstraints
-    from mapweave.storage.map_file import read_map_file
     from mapweave.wire.keys import Keys
     from mapweave.wire.messages import decode
 
     if arguments.map is not None:
-        return ManualConstraints(read_map_file(arguments.map).constraints)
+        return ManualConstraints(opened(arguments.map).content.constraints)
     return ManualConstraints(
         decode(ask(arguments, Keys.any_constraints, b"")[0].payload, ConstraintList).made
     )

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.map_input import SOURCES, opened
 from mapweave.commands.network import (
     add_network,
     network_of,
@@ -34,6 +35,11 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
     parser.add_argument("--data", type=Path, default=Path("out/server"), help="folder for the store")
     parser.add_argument(
+        "--map", type=Path, metavar="FILE",
+        help=f"a map that is there from the start, beside the store, and that robots join: {SOURCES}; it is "
+        "read at each start and never changed",
+    )  # fmt: skip
+    parser.add_argument(
         "--lockstep", action="store_true", help="answer only what is merged already: repeatable simulation"
     )
     parser.add_argument(
@@ -52,6 +58,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until stopped."""
     from mapweave.hybridmap.node import check_name
+    from mapweave.mapserver.base_map import BaseMap
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
@@ -81,7 +88,12 @@ def run(arguments: argparse.Namespace) -> int:
             path = arguments.data / f"{name}.sqlite"
             if path.exists() and path.stat().st_size > LARGE:
                 print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
-            server = MapServer(bus, keys, path, name, how, schedule)
+            base = None
+            if arguments.map is not None:
+                base = BaseMap.of(str(arguments.map), opened(arguments.map).content)
+            server = MapServer(bus, keys, path, name, how, schedule, base)
+            if base is not None:
+                print(f"with {base}", flush=True)
             stack.enter_context(server)
             where = ", ".join(router.listen)
             print(f"map server {name} of fleet {keys.fleet} listens at {where}", flush=True)

@@ -67,10 +67,11 @@ def is_name(name: str) -> bool:
     return bool(name)
 
 
-entries = st.builds(Annotation, lines.filter(is_name), bodies, st.booleans(), lines, stamps, lines) | st.builds(
-    lambda floor, *more: Annotation(str(floor.node.map), floor, *more),
-    st.builds(Floor, nodes, lines.filter(bool)), st.booleans(), lines, stamps, lines,
-)  # fmt: skip
+floors = st.builds(Floor, nodes, lines.filter(bool))
+entries = st.one_of(
+    st.builds(Annotation, lines.filter(is_name), bodies, st.booleans(), lines, stamps, lines),
+    floors.map(lambda floor: Annotation(str(floor.node.map), floor, False, "anna", 1)),
+)
 
 
 @given(st.lists(entries, max_size=6))

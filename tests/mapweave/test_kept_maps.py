@@ -47,12 +47,12 @@ WAY = [*np.arange(0.0, 1.2, 0.02), *np.arange(1.2, 0.0, -0.02)]
 class Body:
     """A camera that a person carries back and forth, as fast as its agent asks."""
 
-    def __init__(self, bus: ZenohBus) -> None:
+    def __init__(self, bus: ZenohBus, robot: str = "r0") -> None:
         walls = PhotoWalls()
         self._images = [walls.render(Pose2(float(x))) for x in WAY]
         self._tick = 0
-        bus.serve(KEYS.robot_describe("r0"), lambda request: request.reply(encode_description(DESCRIPTION)))
-        bus.serve(KEYS.robot_step("r0"), self._step)
+        bus.serve(KEYS.robot_describe(robot), lambda request: request.reply(encode_description(DESCRIPTION)))
+        bus.serve(KEYS.robot_step(robot), self._step)
 
     def _step(self, request: Request) -> None:
         decode_step(request.payload)

@@ -21,10 +21,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from websockets.sync.client import connect
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
@@ -43,7 +45,7 @@ from tests.mapweave.command_line import complaint
 from tests.waiting import eventually
 
 R0, R1 = MapId("r0", 1), MapId("r1", 1)
-SAID = ManualConstraint((R0, MapId("r9", 1)), True, "anna", 5, "two kitchens")
+SAID = ManualConstraint(Apart((R0, MapId("r9", 1))), True, "anna", 5, "two kitchens")
 EVENT = MapEvent(7, MapEventKind.JOINED, "r0.1 and r1.1 are one map now")
 
 
@@ -212,48 +214,47 @@ def test_a_cut_off_or_newer_file_is_reported_in_one_line(
 def test_a_map_is_served_to_people_and_never_changed(folder: Path, tmp_path: Path) -> None:
     before = state(folder)
     with Children(tmp_path) as children:
-        ports = {name: free_port() for name in ("store", "journal")}
-        for name, port in ports.items():
-            children.start(name, ["open", str(folder / name), "--http", str(port)])
+        port = free_port()
+        children.start("open", ["open", str(folder / "store"), "--http", str(port)])
 
-        def ask(name: str, path: str, body: bytes | None = None) -> tuple[int, Any]:
-            connection = HTTPConnection("127.0.0.1", ports[name], timeout=60)
+        def ask(path: str, body: bytes | None = None) -> tuple[int, Any]:
+            connection = HTTPConnection("127.0.0.1", port, timeout=60)
             connection.request("GET" if body is None else "POST", path, body)
             reply = connection.getresponse()
             content = reply.read()
             connection.close()
             return reply.status, json.loads(content) if "json" in reply.headers["Content-Type"] else content
 
-        def up(name: str) -> bool:
+        def up() -> bool:
             children.check()
             with suppress(OSError):
-                return ask(name, "/status")[0] == 200
+                return ask("/status")[0] == 200
             return False
 
-        for name in ports:
-            eventually(lambda name=name: up(name), 90.0)
-        status, page = ask("store", "/")
+        eventually(up, 90.0)
+        with connect(f"ws://127.0.0.1:{port}/live") as live:
+            assert json.loads(live.recv(30)) == {"kind": "hello", "read_only": True, "commands": False}
+            shown = json.loads(live.recv(30))
+            assert shown["kind"] == "map" and shown["nodes"]["count"] == len(NODES)
+        status, page = ask("/")
         assert status == 200 and b"<html" in page
-        counts = {name: ask(name, "/status")[1] for name in ports}
-        links = open_map(folder / "merged").merged().links
-        assert counts["store"]["links"] == len(links) > 0
-        assert (counts["journal"]["maps"], counts["journal"]["source"]) == (1, "agent's journal")
-        assert ask("store", "/robots")[1]["robots"] == ask("store", "/missions")[1]["reports"] == []
-        kinds = [event["kind"] for event in ask("store", "/history")[1]["history"]]
+        counts, links = ask("/status")[1], open_map(folder / "merged").merged().links
+        assert counts["links"] == len(links) > 0 and counts["source"] == "server's store"
+        assert ask("/robots")[1]["robots"] == ask("/missions")[1]["reports"] == []
+        kinds = [event["kind"] for event in ask("/history")[1]["history"]]
         assert kinds == ["constrained", "joined"]
         link = links[0].pair
-        assert ask("store", f"/explain?a={link[0]}&b={link[1]}")[1]["standing"] == "linked"
-        assert ask("store", f"/route?a={link[0]}&b={link[1]}")[1]["found"]
-        content = unpack_map_file(ask("store", "/map")[1])
+        assert ask(f"/explain?a={link[0]}&b={link[1]}")[1]["standing"] == "linked"
+        assert ask(f"/route?a={link[0]}&b={link[1]}")[1]["found"]
+        content = unpack_map_file(ask("/map")[1])
         assert content_hash(content) == content_hash(open_map(folder / "merged").content)
         for path in ("/robots/r0/go?goal=r0.1.1", "/robots/r0/explore", "/robots/r0/stop"):
-            status, answer = ask("store", path, b"")
+            status, answer = ask(path, b"")
             assert status == 400 and "is only shown, and nothing of it changes" in answer["error"]
         grey = np.random.default_rng(0).integers(0, 255, (120, 160)).astype(np.uint8)
-        status, answer = ask("journal", "/relocalize", cv2.imencode(".png", grey)[1].tobytes())
+        status, answer = ask("/relocalize", cv2.imencode(".png", grey)[1].tobytes())
         assert status == 200 and answer["certainty"] == "unknown"
-        for name in ports:
-            children.end(name)
+        children.end("open")
     assert state(folder) == before
 
 
@@ -266,7 +267,7 @@ LINK = Edge(
 WHOLE = MapFile(
     "merged", "two robots", (*CONTENTS, EdgePut(LINK)), {NODES[0]: (0, LINK.a_from_b)},
     (RefusedPair(NODES[1], NODES[5], "too far"), RefusedPair(NODES[2], NODES[5], "too far")),
-    (SAID, replace(SAID, apart=False, stamp_ns=6)),
+    (SAID, replace(SAID, holds=False, stamp_ns=6)),
     {NODES[1]: Superseded(NODES[2], 12, 0.1, 0.2), NODES[3]: Superseded(NODES[4], 12, 0.1, 0.2)},
     {}, (EVENT,),
 )  # fmt: skip
