@@ -24,8 +24,9 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.map_event import MapEventKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, ResolveRequest
 from mapweave.hybridmap.superseded import Superseded
+from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
@@ -306,3 +307,18 @@ def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.C
                 eventually(lambda: server.status()["components"] == 1)
     for one in (bus, mine):
         one.close()
+
+
+def test_a_map_that_a_server_is_given_brings_its_annotations(fetched: MapFile, tmp_path: Path) -> None:
+    named = replace(fetched, annotations=record("kitchen", Place(THERE)).made)
+    hub = MemoryHub()
+    bus, mine = MemoryBus(hub), MemoryBus(hub)
+    person = Fleet(fleet="fleet", by="bob", bus=mine)
+    with MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0", base=BaseMap.of("room", named)) as server:
+        eventually(lambda: server.status()["nodes"] == 7)
+        assert person.resolve(ResolveRequest(("kitchen",))).found[0].node == THERE
+        person.withdraw("place", "kitchen")
+    with MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0", base=BaseMap.of("room", named)):
+        assert [entry.removed for entry in person.annotations().made] == [False, True]
+    bus.close()
+    mine.close()
