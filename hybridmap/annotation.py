@@ -16,9 +16,11 @@ from msgspec import Meta
 
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import MOST_WORDS
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.wall_time import utc_words
 
 MAX_NAME = 64
@@ -164,8 +166,10 @@ class Floor:
         return f"on floor {self.label}"
 
 
-Body = Place | Closure | Preference | Floor
-BODIES: dict[str, type[Body]] = {body.TAG: body for body in (Place, Closure, Preference, Floor)}
+Body = Place | Closure | Preference | Floor | FloorPlan | Pin
+BODIES: dict[str, type[Body]] = {
+    body.TAG: body for body in (Place, Closure, Preference, Floor, FloorPlan, Pin)
+}
 """Kinds of annotations, by the word that names them in messages."""
 AnyBody = TypeVar("AnyBody", bound=Body)
 
@@ -248,6 +252,12 @@ class Annotations:
             for _, entry in sorted(self._last.items())
             if isinstance(entry.body, body) and not entry.removed
         )
+
+    @property
+    def pins(self) -> tuple[Pin, ...]:
+        """Pins that hold, oldest first."""
+        made = sorted(self.in_force(Pin), key=lambda item: item[0].stamp_ns)
+        return tuple(pin for _, pin in made)
 
     @cached_property
     def floors(self) -> dict[MapId, str]:

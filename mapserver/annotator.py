@@ -6,9 +6,11 @@ import logging
 import threading
 from collections.abc import Callable
 
-from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor
+from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.services import guarded
@@ -29,7 +31,7 @@ class AnnotationRecord:
 
         Args:
             store: where it is kept.
-            base: annotations of a map that the server is given at its start.
+            base: annotations of before, of a map that is there from the start.
         """
         self._store = store
         made: list[Annotation] = []
@@ -38,8 +40,8 @@ class AnnotationRecord:
                 made.append(decode(body, Annotation))
             except InvalidMessage as error:
                 log.error("an annotation cannot be read (%s); it is left out", error)
-        # By date only where there are two records: clocks differ, and one record is in order.
-        self._annotations = base + made if base is not None and base.made else Annotations(tuple(made))
+        own = Annotations(tuple(made))
+        self._annotations = base + own if base is not None and base.made else own
 
     @property
     def annotations(self) -> Annotations:
@@ -67,7 +69,8 @@ class Annotator:
         name: str,
         places: Callable[[], Places],
         record: AnnotationRecord,
-        relabel: Callable[[], None],
+        check: Callable[[Annotation], None],
+        changed: Callable[[Annotations], None],
     ) -> None:
         """Begin to answer.
 
@@ -77,9 +80,11 @@ class Annotator:
             name: of the server in the fleet.
             places: of the newest merged map. May wait for it.
             record: of annotations.
-            relabel: called when floors have changed.
+            check: refuses an annotation that lacks something on this server (InvalidValue).
+            changed: called with the whole record whenever there is a new entry.
         """
-        self._places, self._record, self._relabel = places, record, relabel
+        self._places, self._record = places, record
+        self._check, self._changed = check, changed
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.annotate(name), guarded(self._annotate)),
@@ -107,9 +112,9 @@ class Annotator:
         """
         with self._turn:
             check_annotation(self._places().merged, self._record.annotations, annotation)
+            self._check(annotation)
             self._record.add(annotation)
-            if isinstance(annotation.body, Floor):
-                self._relabel()
+            self._changed(self._record.annotations)
         log.warning("%s", annotation.words)
         return annotation.words
 
@@ -143,3 +148,5 @@ def check_annotation(merged: MergedMap, annotations: Annotations, annotation: An
     merged.check(anchor)
     if merged.component_of(anchor) is None:
         raise InvalidValue(f"node {anchor} is not in the merged map")
+    if isinstance(annotation.body, FloorPlan):
+        check_plan(annotation.body, merged)

@@ -31,21 +31,26 @@ class BaseMap:
         name: of the file.
         maps: the robots' own maps.
         constraints: manual constraints.
-        history: of these maps.
         annotations: what people say about them.
+        history: of these maps.
     """
 
     name: str = ""
     maps: Mapping[MapId, HybridMap] = field(default_factory=dict)
     constraints: ManualConstraints = field(default_factory=ManualConstraints)
-    history: tuple[MapEvent, ...] = ()
     annotations: Annotations = field(default_factory=Annotations)
+    history: tuple[MapEvent, ...] = ()
 
     @staticmethod
     def of(name: str, content: MapFile) -> BaseMap:
         """All that a file has; its links are found again, by the maps that are there then."""
-        constraints, annotations = ManualConstraints(content.constraints), Annotations(content.annotations)
-        return BaseMap(name, maps_of(content), constraints, content.history, annotations)
+        return BaseMap(
+            name,
+            maps_of(content),
+            ManualConstraints(content.constraints),
+            Annotations(content.annotations),
+            content.history,
+        )
 
     def __str__(self) -> str:
         """For example `office.mapweave: 120 nodes of 3 maps`."""

@@ -35,7 +35,7 @@ from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
+from mapweave.storage.map_file import MapFile, read_map_file, unpack_map_file, write_map_file
 from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode_view
@@ -90,7 +90,10 @@ def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house:
         "place hall",
         "place kitchen",
     ]
-    assert person.map().annotations == person.annotations().made and len(person.annotations().made) == 3
+    assert (
+        unpack_map_file(person.map_bytes()).annotations == person.annotations().made
+        and len(person.annotations().made) == 3
+    )
     link.close()
 
 
@@ -142,7 +145,7 @@ def test_places_over_http(house: House) -> None:
 @pytest.fixture(scope="module")
 def fetched(mapped_room: Callable[[], MappedRoom]) -> MapFile:
     house = House(mapped_room())
-    content = house.person.map()
+    content = unpack_map_file(house.person.map_bytes())
     house.close()
     return content
 
