@@ -21,7 +21,7 @@ from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.map import Map
 from mapweave.map_reading import MapReading
-from mapweave.storage.map_file import unpack_map_file
+from mapweave.storage.map_file import MapFile, unpack_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode, encode_view
@@ -69,6 +69,11 @@ class FleetMap(FleetQuestions, Map):
         fetched = MapReading(unpack_map_file(self._packed()))
         with self._lock:
             self._fetched = fetched
+
+    def map(self) -> MapFile:
+        """The content of the merged map, fetched now; see `refresh`."""
+        self.refresh()
+        return self.content
 
     def history(self) -> tuple[MapEvent, ...]:
         """What has become of the maps, oldest first: joined, parted, kept apart and why, with dates.
