@@ -33,6 +33,7 @@ class BaseMap:
         constraints: manual constraints.
         annotations: what people say about them.
         history: of these maps.
+        images: of floor plans, by their names.
     """
 
     name: str = ""
@@ -40,6 +41,7 @@ class BaseMap:
     constraints: ManualConstraints = field(default_factory=ManualConstraints)
     annotations: Annotations = field(default_factory=Annotations)
     history: tuple[MapEvent, ...] = ()
+    images: Mapping[str, bytes] = field(default_factory=dict)
 
     @staticmethod
     def of(name: str, content: MapFile) -> BaseMap:
@@ -50,6 +52,7 @@ class BaseMap:
             ManualConstraints(content.constraints),
             Annotations(content.annotations),
             content.history,
+            content.images,
         )
 
     def __str__(self) -> str:

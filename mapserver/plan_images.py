@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from mapweave.hybridmap.annotation import Annotations
@@ -33,13 +33,15 @@ def _folder_of(store: Path) -> Path:
 class PlanImages:
     """Kept until no plan names them. Thread-safe."""
 
-    def __init__(self, store: Path, used: Iterable[str]) -> None:
+    def __init__(self, store: Path, used: Iterable[str], beside: Mapping[str, bytes] | None = None) -> None:
         """Open the folder of a store.
 
         Args:
             store: path of the store; the folder is made when the first image comes.
             used: names of images that plans use, or have used; others are removed.
+            beside: images that are there besides, in memory.
         """
+        self._beside = dict(beside or {})
         self._folder = _folder_of(store)
         self._lock = threading.Lock()
         kept = {f"{name}{SUFFIX}" for name in used}
@@ -71,8 +73,11 @@ class PlanImages:
         Raises:
             InvalidFile: it is not there, or damaged.
         """
+        path = self._path(sha256)
+        if sha256 in self._beside:
+            return self._beside[sha256]
         try:
-            png = read_whole(self._path(sha256))
+            png = read_whole(path)
         except OSError:
             raise InvalidFile(f"the image {sha256[:12]} of a plan is not on the server's disk") from None
         if hashlib.sha256(png).hexdigest() != sha256:
@@ -81,7 +86,7 @@ class PlanImages:
 
     def __contains__(self, sha256: str) -> bool:
         """Whether an image is there."""
-        return self._path(sha256).is_file()
+        return sha256 in self._beside or self._path(sha256).is_file()
 
     def _path(self, sha256: str) -> Path:
         # A name comes from a message: `PlanImage` has checked it, others may not have.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from mapweave.hybridmap.annotation import Annotation, Annotations
@@ -34,6 +34,7 @@ class PlanService:
         merged: Callable[[], MergedMap],
         annotations: Callable[[], Annotations],
         store: Path,
+        beside: Mapping[str, bytes],
     ) -> None:
         """Begin to answer.
 
@@ -44,10 +45,11 @@ class PlanService:
             merged: the newest merged map. May wait for it.
             annotations: the record, in which the plans are.
             store: path of the server's store, beside which the images are.
+            beside: images of the map that the server was given at its start.
         """
         self._merged, self._annotations = merged, annotations
         used = {entry.body.image.sha256 for entry in annotations().made if isinstance(entry.body, FloorPlan)}
-        self.images = PlanImages(store, used)
+        self.images = PlanImages(store, used, beside)
         self._lock = threading.Lock()
         self._incoming: dict[str, bytearray] = {}
         self._placed: tuple[MergedMap, Annotations, PlacedPlans] | None = None

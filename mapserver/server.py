@@ -139,7 +139,7 @@ class MapServer:
         )  # fmt: skip
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,
-            lambda: self._annotations.annotations, self._path,
+            lambda: self._annotations.annotations, self._path, base.images,
         )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
         self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear)

@@ -19,8 +19,9 @@ GROUPS = {
     "Places and closures": (
         "place add", "place list", "place remove", "close", "reopen", "prefer", "avoid", "closures",
     ),
+    "Floor plans": ("plan add", "plan show", "plan export", "plan remove", "map pin"),
     "Maps": (
-        "map show", "open", "map explain", "map route", "map history", "map link", "map unmerge",
+        "map show", "map diff", "open", "map explain", "map route", "map history", "map link", "map unmerge",
         "map retire", "map undo", "map merge",
         "map fetch", "map export", "map extract", "map import", "map from-photos", "relocalize",
     ),

@@ -44,6 +44,7 @@ from mapweave.hybridmap.errors import MapweaveError
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help, with examples."
 NEGATIVE = re.compile(r"-[0-9.][0-9.,=e+-]*$")
+"""Positions and poses begin with a minus as well: -3.1,2 and -3.1,2=40,50."""
 
 
 class CommandParser(argparse.ArgumentParser):
