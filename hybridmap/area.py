@@ -23,8 +23,6 @@ ROUND = 16
 Corners = tuple[tuple[float, float], ...]
 Floats = NDArray[np.float64]
 
-FORMS = "give a node (r0.1.17), the name of a place, or a position in the merged map (3.1,-2.0)"
-
 
 @dataclass(frozen=True, slots=True)
 class Area:
@@ -160,19 +158,4 @@ def read_corner(word: str) -> tuple[float, float]:
         x, y = map(float, word.split(","))
     except ValueError:
         raise InvalidValue(f"{word!r} is no corner: write X,Y in m, for example 1.5,-2") from None
-    return x, y
-
-
-def position_of(word: str) -> tuple[float, float] | None:
-    """`3.1,-2.0`, m; None if it is no position.
-
-    Raises:
-        InvalidValue: a number is not finite.
-    """
-    try:
-        x, y = map(float, word.split(","))
-    except ValueError:
-        return None
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise InvalidValue(f"{word!r}: {FORMS}")
     return x, y

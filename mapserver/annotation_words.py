@@ -9,11 +9,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body, Place
-from mapweave.hybridmap.area import Area, position_of
+from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ResolveAnswer, Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
+from mapweave.mapserver.places import position_of
 from mapweave.wire.typed import packed, value_of
 
 NODES = ("node", "anchor", "a", "b", "merged_from_node")

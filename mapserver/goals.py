@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from mapweave.hybridmap.area import position_of
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import Places, position_of
 
 HOME = "home"
 FORMS = "give a node (r0.1.17), a named place, a position in the merged map (3.1,-2.0) or home"

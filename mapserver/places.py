@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Place
-from mapweave.hybridmap.area import FORMS, inside, position_of
+from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.node import NodeId
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 NEARBY = 1.5
 """A place that is a node reaches so far, m: a robot there sees the same as from the node."""
+FORMS = "give a node (r0.1.17), the name of a place, or a position in the merged map (3.1,-2.0)"
 
 
 class Places:
@@ -198,3 +199,18 @@ class Places:
         names = [entry.name for entry, _ in self.annotations.in_force(Place)]
         close = difflib.get_close_matches(word, names, 3, 0.6)
         return f" (is it {' or '.join(close)}?)" if close else ""
+
+
+def position_of(word: str) -> tuple[float, float] | None:
+    """`3.1,-2.0`, m; None if it is no position.
+
+    Raises:
+        InvalidValue: a number is not finite.
+    """
+    try:
+        x, y = map(float, word.split(","))
+    except ValueError:
+        return None
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InvalidValue(f"{word!r}: {FORMS}")
+    return x, y

@@ -50,8 +50,8 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
     Raises:
         InvalidValue: a corner is no position.
     """
-    from mapweave.hybridmap.area import position_of
     from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.places import position_of
 
     fields: dict[str, object] = {}
     if arguments.radius is not None:

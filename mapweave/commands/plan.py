@@ -203,8 +203,8 @@ def _pair(word: str) -> dict[str, Any]:
     Raises:
         InvalidValue: it is none.
     """
-    from mapweave.hybridmap.area import position_of
     from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.places import position_of
 
     place, equals, pixel = word.rpartition("=")
     position = position_of(pixel) if equals and place.strip() else None
