@@ -123,7 +123,7 @@ ASKING = {
     "plan add": ["walk/images/0.png", *(f"--pair=r0.1.{k}={k},{k * k}" for k in (1, 2, 3))],
     "plan show": [], "plan export": ["office", "--format", "rmf"], "plan remove": ["office"],
     "map pin": ["r0.1.17"], "place add": ["kitchen", "r0.1.17"], "place list": [],
-    "place remove": ["kitchen"], "close": ["r0.1.1"],
+    "place remove": ["kitchen"], "close": ["r0.1.1"], "floor": ["first", "r0.1.17"],
     "reopen": ["kitchen"], "prefer": ["r0.1.1", "r0.1.2"], "avoid": ["r0.1.1", "r0.1.2"], "closures": [],
     "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"],
     "relocalize": ["walk/images/0.png"],
