@@ -56,10 +56,46 @@ BLOCK = 4
 """Pairs in a row whose errors may go together."""
 FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
 """Variances before any is estimated, per metre or per pair: see `_noise_basis`."""
+LEAST_SIGMA = 0.2
+"""Least standard deviation of a track as a share of what is assumed beforehand: lenses are not quite as they were
+calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels that slip
+count for more than what is seen."""
 ROUNDS = 3
 """Of a batch: reductions of all pairs."""
-FLOOR_WIDTHS = (0.1, 0.06)
-"""Widths of the mode of floor ratios, ever narrower: what stands on the floor is left out."""
+FLOOR_WIDTH = 0.1
+"""Of the kernel with which the floor is first looked for among logarithms of depth ratios."""
+FLOOR_STEPS = 20
+"""Of expectation maximisation."""
+LEAST_SPREAD = 0.4
+"""Points of the floor scatter by no less of what is assumed."""
+FLOOR_ABOVE = 0.7
+"""What stands on the floor seems nearer than the floor behind it, by logarithms of up to this."""
+FLOOR_FLAT = 0.03
+"""Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
+FLOOR_CONTRAST = 3.0
+"""The floor must be so many times as dense as all else where it is densest, else it is not the floor."""
+FLOOR_SIGMA = 1e-3
+"""Of the wheels' scale while no floor is seen: epipolar lines know no scale."""
+STUDENT = 5.0
+"""Degrees of freedom of the pairs' weights."""
+BLOCK = 4
+"""Pairs in a row whose errors may go together."""
+FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
+"""Variances before any is estimated, per metre or per pair: see `_noise_basis`."""
+LEAST_SIGMA = 0.2
+"""Least standard deviation of a track as a share of what is assumed beforehand: lenses are not quite as they were
+calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels that slip
+count for more than what is seen."""
+ROUNDS = 3
+"""Of a batch: reductions of all pairs."""
+FLOOR_WIDTH = 0.1
+"""Of the kernel with which the floor is first looked for among logarithms of depth ratios."""
+FLOOR_STEPS = 20
+"""Of expectation maximisation."""
+LEAST_SPREAD = 0.4
+"""Points of the floor scatter by no less of what is assumed."""
+FLOOR_ABOVE = 0.7
+"""What stands on the floor seems nearer than the floor behind it, by logarithms of up to this."""
 FLOOR_FLAT = 0.03
 """Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
 FLOOR_CONTRAST = 3.0
@@ -149,7 +185,8 @@ class Estimator:
         if keep_wheels:
             prior[[P.WHEEL_SCALE, P.HEIGHT]] = prior[[P.HEIGHT, P.WHEEL_SCALE]]
         self._prior = np.diag(1.0 / prior**2)
-        self._sigma, self._keep_wheels = sigma, keep_wheels
+        self._sigma = self._most_sigma = sigma
+        self._keep_wheels = keep_wheels
         self._noise: Array = FIRST_NOISE.copy()
         self._depth = (0.3, 0.5)
         self.reduced_at: list[Array] = []
@@ -179,7 +216,7 @@ class Estimator:
         first, last = np.array([pair.first_s]), np.array([pair.last_s])
         predicted = predict(self.vector, wheels, first, last)
         noise = self._noises(self.vector, wheels, first, last, predicted)[0]
-        return reduce_pair(pair, predicted[0], noise, self._sigma, self._depth)
+        return reduce_pair(pair, predicted[0], noise, self._sigma, self._depth, self._most_sigma)
 
     def solve(self, wheels: WheelTrack, iterations: int = INNER) -> Estimate:
         """Estimate from the pairs as they are reduced now."""
@@ -277,24 +314,33 @@ class Estimator:
             self._floor = None
             return
         centres = np.arange(-0.6, 0.6, 0.02)
-        density = _kernel(logs - centres[:, None], sigmas, FLOOR_WIDTHS[0]).sum(1)
+        width = FLOOR_WIDTH
+        density = _kernel(logs - centres[:, None], sigmas, width).sum(1)
         # Things stand on the floor and nothing is below it: it is where the density rises.
-        below = _kernel(logs - (centres[:, None] - 4.0 * FLOOR_WIDTHS[0]), sigmas, FLOOR_WIDTHS[0]).sum(1)
+        below = _kernel(logs - (centres[:, None] - 4.0 * width), sigmas, width).sum(1)
         plausible = np.exp(-0.5 * (centres / PRIOR_SIGMAS[P.WHEEL_SCALE]) ** 2)
         mode = centres[int(((density - below) * plausible).argmax())]
-        for width in FLOOR_WIDTHS:
-            for _ in range(10):
-                weight = _kernel(logs - mode, sigmas, width) / (width**2 + sigmas**2)
-                mode = float((weight * logs).sum() / weight.sum())
+        floor, others, scale = 0.4, 0.4, 1.0
+        for _ in range(FLOOR_STEPS):
+            spread = scale * sigmas
+            off = logs - mode
+            on = floor * np.exp(-0.5 * (off / spread) ** 2) / (math.sqrt(math.tau) * spread)
+            above = others * np.clip(0.5 + off / (2.0 * spread), 0.0, 1.0) * (off < FLOOR_ABOVE) / FLOOR_ABOVE
+            whole = on + above + (1.0 - floor - others) / (2.0 * FLOOR_ABOVE)
+            share = on / whole
+            floor, others = float(share.mean()), float(np.mean(above / whole))
+            pull = share / spread**2
+            mode += float((pull * off).sum() / max(pull.sum(), 1e-9))
+            square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
+            scale = float(np.clip(math.sqrt(square), LEAST_SPREAD, 1.0))
         off = logs - mode
-        pulls = np.bincount(which // BLOCK, weight * off)
-        stiffness = (weight * (1.0 - off**2 / (width**2 + sigmas**2))).sum()
+        pulls = np.bincount(which // BLOCK, pull * off)
+        stiffness = (pull * (1.0 - (1.0 - share) * (off / spread) ** 2)).sum()
         sigma = math.sqrt(float((pulls**2).sum())) / max(float(stiffness), 1e-9)
-        self.floor_tracks = int((np.abs(off) < 2.0 * width).sum())
-        heights = _kernel(logs - np.array([[mode], [mode - 4.0 * width]]), sigmas, width).sum(1)
-        clear = (
-            self.floor_tracks >= LEAST_FLOOR and stiffness > 0.0 and heights[0] > FLOOR_CONTRAST * heights[1]
-        )
+        self.floor_tracks = int(share.sum())
+        density = floor / (math.sqrt(math.tau) * float(np.median(spread)))
+        rest = others / FLOOR_ABOVE + (1.0 - floor - others) / (2.0 * FLOOR_ABOVE)
+        clear = self.floor_tracks >= LEAST_FLOOR and stiffness > 0.0 and density > FLOOR_CONTRAST * rest
         self._floor = (float(used + mode), max(sigma, FLOOR_SIGMA)) if clear else None
 
     def _jacobian(
@@ -380,6 +426,8 @@ class Estimator:
         if len(depths):
             mean, spread = np.median(depths, axis=0)
             self._depth = (float(mean), float(max(spread, 0.5 * mean)))
+            scatter = float(np.median([i.scatter for i in self.informations if i.tracks > 5]))
+            self._sigma = float(np.clip(scatter, LEAST_SIGMA * self._most_sigma, self._most_sigma))
 
     def _scatter(self, inverse_hessian: Array, scores: Array) -> Array:
         """(10, 10) covariance by how blocks of pairs pull apart."""
