@@ -33,6 +33,9 @@ USEFUL_SIGMAS = {
     P.PITCH: 0.01, P.ROLL: 0.01, P.HEIGHT: 0.02, P.DELAY: 0.02,
 }  # fmt: skip
 """A drive shows a parameter if its sigma is below this: smaller errors do not show in a map of a room."""
+USEFUL = np.array([USEFUL_SIGMAS[p] for p in P])
+STALE = 0.25
+"""A pair is reduced again when a parameter has moved by this share of a useful sigma since."""
 MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.035, 0.002, 0.001, 0.001, 0.002, 0.002])
 """Errors of the estimator itself, in the order of `Parameter`: depths are not Gaussian, pairs short. Measured
 on synthetic drives, where turns come out up to 0.5 % short and the camera up to 5 cm
@@ -52,6 +55,8 @@ NO_FLOOR_SIGMA = 1e-3
 """Of the wheels' scale while no floor is seen: epipolar lines know no scale."""
 STUDENT = 5.0
 """Degrees of freedom of the pairs' weights."""
+SIGNIFICANT = 3.5
+"""Sigmas from the declared value at which a parameter is declared wrongly."""
 BLOCK = 4
 """Pairs in a row whose errors may go together."""
 FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
@@ -68,8 +73,8 @@ FLOOR_STEPS = 20
 """Of expectation maximisation."""
 LEAST_SPREAD = 0.4
 """Points of the floor scatter by no less of what is assumed."""
-FLOOR_ABOVE = 0.7
-"""What stands on the floor seems nearer than the floor behind it, by logarithms of up to this."""
+FLOOR_RANGE = 1.4
+"""Of logarithms of depth ratios over which all else is spread."""
 FLOOR_FLAT = 0.03
 """Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
 FLOOR_CONTRAST = 3.0
@@ -78,6 +83,8 @@ FLOOR_SIGMA = 1e-3
 """Of the wheels' scale while no floor is seen: epipolar lines know no scale."""
 STUDENT = 5.0
 """Degrees of freedom of the pairs' weights."""
+SIGNIFICANT = 3.5
+"""Sigmas from the declared value at which a parameter is declared wrongly."""
 BLOCK = 4
 """Pairs in a row whose errors may go together."""
 FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
@@ -146,11 +153,10 @@ class Estimate:
 
         Without the floor nothing tells a scale.
         """
-        useful = np.array([USEFUL_SIGMAS[p] for p in P])
         assumed = np.array([PRIOR_SIGMAS[p] for p in P])
         if self.keep_wheels:
             assumed[[P.WHEEL_SCALE, P.HEIGHT]] = assumed[[P.HEIGHT, P.WHEEL_SCALE]]
-        shown = np.asarray((self.sigmas < useful) & (self.sigmas < 0.5 * assumed))
+        shown = np.asarray((self.sigmas < USEFUL) & (self.sigmas < 0.5 * assumed))
         shown[[P.WHEEL_SCALE, P.HEIGHT, P.LEFT]] &= self.floor_tracks >= LEAST_FLOOR
         return shown
 
@@ -190,6 +196,7 @@ class Estimator:
         self._noise: Array = FIRST_NOISE.copy()
         self._depth = (0.3, 0.5)
         self.reduced_at: list[Array] = []
+        self._reduced_sigmas: list[float] = []
         self._floor: tuple[float, float] | None = None
         self.floor_tracks = 0
         self.pairs: list[ImagePair] = []
@@ -201,16 +208,23 @@ class Estimator:
         self.pairs.append(pair)
         self.informations.append(self._reduced(pair, wheels))
         self.reduced_at.append(self.vector.copy())
+        self._reduced_sigmas.append(self._sigma)
         return self.informations[-1]
 
     def drop(self, index: int) -> None:
         """Forget a pair."""
-        del self.pairs[index], self.informations[index], self.reduced_at[index]
+        del self.pairs[index], self.informations[index], self.reduced_at[index], self._reduced_sigmas[index]
+
+    def stale(self, index: int) -> bool:
+        """Whether a pair was reduced with parameters, or a sigma of tracks, that differ from the present."""
+        moved = np.abs(self.vector - self.reduced_at[index]) > STALE * USEFUL
+        return bool(moved.any()) or abs(math.log(self._sigma / self._reduced_sigmas[index])) > STALE
 
     def refresh(self, index: int, wheels: WheelTrack) -> None:
         """Reduce a pair again at the present parameters."""
         self.informations[index] = self._reduced(self.pairs[index], wheels)
         self.reduced_at[index] = self.vector.copy()
+        self._reduced_sigmas[index] = self._sigma
 
     def _reduced(self, pair: ImagePair, wheels: WheelTrack) -> PairInformation:
         first, last = np.array([pair.first_s]), np.array([pair.last_s])
@@ -280,6 +294,7 @@ class Estimator:
     def batch(self, pairs: Sequence[ImagePair], wheels: WheelTrack) -> Estimate:
         """Estimate from many pairs at once, all reduced again in each round."""
         self.pairs, self.informations, self.reduced_at, self._floor = [], [], [], None
+        self._reduced_sigmas = []
         for pair in pairs:
             self.add(pair, wheels)
         estimate = self.solve(wheels)
@@ -320,16 +335,12 @@ class Estimator:
         below = _kernel(logs - (centres[:, None] - 4.0 * width), sigmas, width).sum(1)
         plausible = np.exp(-0.5 * (centres / PRIOR_SIGMAS[P.WHEEL_SCALE]) ** 2)
         mode = centres[int(((density - below) * plausible).argmax())]
-        floor, others, scale = 0.4, 0.4, 1.0
+        floor, scale = 0.5, 1.0
         for _ in range(FLOOR_STEPS):
-            spread = scale * sigmas
-            off = logs - mode
+            spread, off = scale * sigmas, logs - mode
             on = floor * np.exp(-0.5 * (off / spread) ** 2) / (math.sqrt(math.tau) * spread)
-            above = others * np.clip(0.5 + off / (2.0 * spread), 0.0, 1.0) * (off < FLOOR_ABOVE) / FLOOR_ABOVE
-            whole = on + above + (1.0 - floor - others) / (2.0 * FLOOR_ABOVE)
-            share = on / whole
-            floor, others = float(share.mean()), float(np.mean(above / whole))
-            pull = share / spread**2
+            share = on / (on + (1.0 - floor) / FLOOR_RANGE)
+            floor, pull = float(share.mean()), share / spread**2
             mode += float((pull * off).sum() / max(pull.sum(), 1e-9))
             square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
             scale = float(np.clip(math.sqrt(square), LEAST_SPREAD, 1.0))
@@ -339,7 +350,7 @@ class Estimator:
         sigma = math.sqrt(float((pulls**2).sum())) / max(float(stiffness), 1e-9)
         self.floor_tracks = int(share.sum())
         density = floor / (math.sqrt(math.tau) * float(np.median(spread)))
-        rest = others / FLOOR_ABOVE + (1.0 - floor - others) / (2.0 * FLOOR_ABOVE)
+        rest = (1.0 - floor) / FLOOR_RANGE
         clear = self.floor_tracks >= LEAST_FLOOR and stiffness > 0.0 and density > FLOOR_CONTRAST * rest
         self._floor = (float(used + mode), max(sigma, FLOOR_SIGMA)) if clear else None
 
@@ -430,10 +441,24 @@ class Estimator:
             self._sigma = float(np.clip(scatter, LEAST_SIGMA * self._most_sigma, self._most_sigma))
 
     def _scatter(self, inverse_hessian: Array, scores: Array) -> Array:
-        """(10, 10) covariance by how blocks of pairs pull apart."""
+        """(10, 10) covariance by how blocks of pairs pull apart.
+
+        Neighbours count together (Newey and West 1987), since slip goes on from one block to the next.
+        """
         blocks = np.add.reduceat(scores, np.arange(0, len(scores), BLOCK))
+        cross = 0.5 * blocks[:-1].T @ blocks[1:]
+        pulls = _few_blocks(len(blocks)) ** 2 * (blocks.T @ blocks + cross + cross.T)
         prior = inverse_hessian @ self._prior @ inverse_hessian
-        return np.asarray(inverse_hessian @ (blocks.T @ blocks) @ inverse_hessian + prior)
+        return np.asarray(inverse_hessian @ pulls @ inverse_hessian + prior)
+
+
+def _few_blocks(blocks: int) -> float:
+    """Quantile of Student's t over that of a Gaussian, where both are SIGNIFICANT: few blocks tell no sigma.
+
+    Abramowitz and Stegun 26.7.5.
+    """
+    z, free = SIGNIFICANT, max(blocks - 1, 1)
+    return 1.0 + (z**2 + 1.0) / (4.0 * free) + (5.0 * z**4 + 16.0 * z**2 + 3.0) / (96.0 * free**2)
 
 
 def _weights(cost: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import WheelTrack
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
-from mapweave.agent.calibration.estimator import USEFUL_SIGMAS, Estimate, Estimator
+from mapweave.agent.calibration.estimator import USEFUL, Estimate, Estimator
 from mapweave.agent.calibration.floor_points import FloorPoints
 from mapweave.agent.calibration.image_pairs import (
     LEAST_LEFT,
@@ -35,12 +35,10 @@ ENOUGH = 0.04
 """A pair ends when half of its tracks have moved this far, as a share of the image's width,"""
 LEAST = 0.004
 """and says nothing if they have moved less than this."""
-FEWEST_PAIRS = 12
+FEWEST_PAIRS = 20
 SOLVE_EVERY = 4
 """Pairs between two solutions."""
 MOST_PAIRS = 150
-STALE = 0.25
-"""A pair is reduced again when a parameter has moved by this share of a useful sigma since."""
 KEPT_NEW = 40
 """Of these the newest stay; of the others those go that turn least."""
 STEPS = 1
@@ -56,7 +54,6 @@ NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P
 """Named, but not used by themselves. The wheels' scales and drift are what all else is measured by, and the
 floor shows the height only as a multiple of the way. A camera aside or rolled shows too weakly: of two
 simulated explorations each would have changed one of these, wrongly."""
-USEFUL = np.array([USEFUL_SIGMAS[p] for p in Parameter])
 
 
 class OnlineCalibration:
@@ -220,7 +217,7 @@ class OnlineCalibration:
         estimator = self._estimator
         if self._last is not None and len(estimator.pairs) > 1:
             self._stale = (self._stale + 1) % len(estimator.pairs)
-            if (np.abs(estimator.vector - estimator.reduced_at[self._stale]) > STALE * USEFUL).any():
+            if estimator.stale(self._stale):
                 estimator.refresh(self._stale, self._wheels())
 
     def _trim(self) -> None:
