@@ -17,31 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, predict
+from mapweave.agent.calibration.floor_scale import LEAST_FLOOR, floor_scale
 from mapweave.agent.calibration.pair_information import ImagePair, PairInformation, reduce_pair
+from mapweave.agent.calibration.parameter_sigmas import DELAY_SHARE, MODEL_SIGMAS, PRIOR_SIGMAS, useful
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.hybridmap.pose import Array
 
 P = Parameter
-PRIOR_SIGMAS = {
-    P.WHEEL_SCALE: 0.15, P.TURN_SCALE: 0.15, P.DRIFT: 0.05, P.FORWARD: 1.5, P.LEFT: 0.5, P.HEADING: 0.15,
-    P.PITCH: 0.15, P.ROLL: 0.05, P.HEIGHT: 0.01, P.DELAY: 0.15,
-}  # fmt: skip
-"""How far a declared value may be off before anything is seen. Floor and wheels show the height only as a
-multiple of the way: the height, which a tape measures to a percent, is held; the wheels' scale follows."""
-USEFUL_SIGMAS = {
-    P.WHEEL_SCALE: 0.02, P.TURN_SCALE: 0.02, P.DRIFT: 0.005, P.FORWARD: 0.15, P.LEFT: 0.05, P.HEADING: 0.01,
-    P.PITCH: 0.01, P.ROLL: 0.01, P.HEIGHT: 0.02, P.DELAY: 0.02,
-}  # fmt: skip
-"""A drive shows a parameter if its sigma is below this: smaller errors do not show in a map of a room."""
-USEFUL = np.array([USEFUL_SIGMAS[p] for p in P])
 STALE = 0.25
 """A pair is reduced again when a parameter has moved by this share of a useful sigma since."""
-MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.035, 0.002, 0.001, 0.001, 0.002, 0.002])
-"""Errors of the estimator itself, in the order of `Parameter`: depths are not Gaussian, pairs short. Measured
-on synthetic drives, where turns come out up to 0.5 % short and the camera up to 5 cm
-aside; no sigma is smaller."""
-DELAY_SHARE = 0.12
-"""And of the delay, as a share of the time between two readings: nothing is known of what happens within."""
 STEP = np.array([1e-5, 1e-5, 1e-6, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
 """Of the numeric derivative."""
 SLIP_STEP = 1e-5
@@ -62,57 +46,11 @@ BLOCK = 4
 FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
 """Variances before any is estimated, per metre or per pair: see `_noise_basis`."""
 LEAST_SIGMA = 0.2
-"""Least standard deviation of a track as a share of what is assumed beforehand: lenses are not quite as they were
-calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels that slip
-count for more than what is seen."""
+"""Least standard deviation of a track as a share of what is assumed beforehand: lenses are not quite as they
+were calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels that
+slip count for more than what is seen."""
 ROUNDS = 3
 """Of a batch: reductions of all pairs."""
-FLOOR_WIDTH = 0.1
-"""Of the kernel with which the floor is first looked for among logarithms of depth ratios."""
-FLOOR_STEPS = 20
-"""Of expectation maximisation."""
-LEAST_SPREAD = 0.4
-"""Points of the floor scatter by no less of what is assumed."""
-FLOOR_RANGE = 1.4
-"""Of logarithms of depth ratios over which all else is spread."""
-FLOOR_FLAT = 0.03
-"""Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
-FLOOR_CONTRAST = 3.0
-"""The floor must be so many times as dense as all else where it is densest, else it is not the floor."""
-FLOOR_SIGMA = 1e-3
-"""Of the wheels' scale while no floor is seen: epipolar lines know no scale."""
-STUDENT = 5.0
-"""Degrees of freedom of the pairs' weights."""
-SIGNIFICANT = 3.5
-"""Sigmas from the declared value at which a parameter is declared wrongly."""
-BLOCK = 4
-"""Pairs in a row whose errors may go together."""
-FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
-"""Variances before any is estimated, per metre or per pair: see `_noise_basis`."""
-LEAST_SIGMA = 0.2
-"""Least standard deviation of a track as a share of what is assumed beforehand: lenses are not quite as they were
-calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels that slip
-count for more than what is seen."""
-ROUNDS = 3
-"""Of a batch: reductions of all pairs."""
-FLOOR_WIDTH = 0.1
-"""Of the kernel with which the floor is first looked for among logarithms of depth ratios."""
-FLOOR_STEPS = 20
-"""Of expectation maximisation."""
-LEAST_SPREAD = 0.4
-"""Points of the floor scatter by no less of what is assumed."""
-FLOOR_ABOVE = 0.7
-"""What stands on the floor seems nearer than the floor behind it, by logarithms of up to this."""
-FLOOR_FLAT = 0.03
-"""Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
-FLOOR_CONTRAST = 3.0
-"""The mode must be so many times as dense as what seems to lie below it, else it is not the floor."""
-FLOOR_SIGMA = 0.005
-"""Least standard deviation of a scale by the floor: contact edges, mats, slopes."""
-LEAST_BLOCKS = 8
-"""Blocks of pairs that see the floor; the scatter of fewer tells no sigma."""
-LEAST_FLOOR = 60
-"""Points on the floor; with fewer nothing is said of it."""
 INNER = 6
 """Gauss-Newton steps between two reductions of the pairs."""
 
@@ -156,7 +94,7 @@ class Estimate:
         assumed = np.array([PRIOR_SIGMAS[p] for p in P])
         if self.keep_wheels:
             assumed[[P.WHEEL_SCALE, P.HEIGHT]] = assumed[[P.HEIGHT, P.WHEEL_SCALE]]
-        shown = np.asarray((self.sigmas < USEFUL) & (self.sigmas < 0.5 * assumed))
+        shown = np.asarray((self.sigmas < useful(self.declared)) & (self.sigmas < 0.5 * assumed))
         shown[[P.WHEEL_SCALE, P.HEIGHT, P.LEFT]] &= self.floor_tracks >= LEAST_FLOOR
         return shown
 
@@ -217,7 +155,7 @@ class Estimator:
 
     def stale(self, index: int) -> bool:
         """Whether a pair was reduced with parameters, or a sigma of tracks, that differ from the present."""
-        moved = np.abs(self.vector - self.reduced_at[index]) > STALE * USEFUL
+        moved = np.abs(self.vector - self.reduced_at[index]) > STALE * useful(self.declared)
         return bool(moved.any()) or abs(math.log(self._sigma / self._reduced_sigmas[index])) > STALE
 
     def refresh(self, index: int, wheels: WheelTrack) -> None:
@@ -281,13 +219,12 @@ class Estimator:
         self._covariance = self._covariance + np.diag(model**2)
         if self._floor is None:
             self._covariance[P.WHEEL_SCALE, P.WHEEL_SCALE] = 1.0 / self._prior[P.WHEEL_SCALE, P.WHEEL_SCALE]
-        floor_tracks = self.floor_tracks if self._floor else 0
         return Estimate(
             self.vector.copy(),
             self._covariance,
             self.declared,
             len(self.pairs),
-            floor_tracks,
+            self.floor_tracks,
             self._keep_wheels,
         )
 
@@ -306,53 +243,28 @@ class Estimator:
         return estimate
 
     def find_floor(self) -> None:
-        """Take the mode of depths below the horizon for the floor: it ties the way's scale to the height.
+        """Find the floor below the horizon: it ties the way's scale to the height.
 
         Nothing else is learnt from the floor: a pavement or a carpet must not bend the rest.
         """
         used = self.vector[P.WHEEL_SCALE] - self.vector[P.HEIGHT]
-        counts = [len(i.floor_ratios) for i in self.informations]
-        which = np.repeat(np.arange(len(counts)), counts)
-        at = np.array(self.reduced_at).reshape(-1, COUNT)
-        scales = [
-            i.floor_ratios + v[P.WHEEL_SCALE] - v[P.HEIGHT]
-            for i, v in zip(self.informations, at, strict=True)
+        fresh = [
+            k for k, at in enumerate(self.reduced_at) if abs(at[P.PITCH] - self.vector[P.PITCH]) < STALE_PITCH
         ]
-        fresh = np.repeat(np.abs(at[:, P.PITCH] - self.vector[P.PITCH]) < STALE_PITCH, counts)
-        logs = np.concatenate([*scales, np.zeros(0)]) - used
-        sigmas = np.hypot(
-            np.concatenate([*(i.floor_sigmas for i in self.informations), np.zeros(0)]), FLOOR_FLAT
+        ratios = [
+            self.informations[k].floor_ratios
+            + self.reduced_at[k][P.WHEEL_SCALE]
+            - self.reduced_at[k][P.HEIGHT]
+            for k in fresh
+        ]
+        blocks = np.repeat(np.array(fresh, np.int64) // BLOCK, [len(r) for r in ratios])
+        found = floor_scale(
+            np.concatenate([*ratios, np.zeros(0)]) - used,
+            np.concatenate([*(self.informations[k].floor_sigmas for k in fresh), np.zeros(0)]),
+            blocks,
         )
-        which, logs, sigmas = which[fresh], logs[fresh], sigmas[fresh]
-        self.floor_tracks = 0
-        if len(logs) < LEAST_FLOOR or len(np.unique(which // BLOCK)) < LEAST_BLOCKS:
-            self._floor = None
-            return
-        centres = np.arange(-0.6, 0.6, 0.02)
-        width = FLOOR_WIDTH
-        density = _kernel(logs - centres[:, None], sigmas, width).sum(1)
-        # Things stand on the floor and nothing is below it: it is where the density rises.
-        below = _kernel(logs - (centres[:, None] - 4.0 * width), sigmas, width).sum(1)
-        plausible = np.exp(-0.5 * (centres / PRIOR_SIGMAS[P.WHEEL_SCALE]) ** 2)
-        mode = centres[int(((density - below) * plausible).argmax())]
-        floor, scale = 0.5, 1.0
-        for _ in range(FLOOR_STEPS):
-            spread, off = scale * sigmas, logs - mode
-            on = floor * np.exp(-0.5 * (off / spread) ** 2) / (math.sqrt(math.tau) * spread)
-            share = on / (on + (1.0 - floor) / FLOOR_RANGE)
-            floor, pull = float(share.mean()), share / spread**2
-            mode += float((pull * off).sum() / max(pull.sum(), 1e-9))
-            square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
-            scale = float(np.clip(math.sqrt(square), LEAST_SPREAD, 1.0))
-        off = logs - mode
-        pulls = np.bincount(which // BLOCK, pull * off)
-        stiffness = (pull * (1.0 - (1.0 - share) * (off / spread) ** 2)).sum()
-        sigma = math.sqrt(float((pulls**2).sum())) / max(float(stiffness), 1e-9)
-        self.floor_tracks = int(share.sum())
-        density = floor / (math.sqrt(math.tau) * float(np.median(spread)))
-        rest = (1.0 - floor) / FLOOR_RANGE
-        clear = self.floor_tracks >= LEAST_FLOOR and stiffness > 0.0 and density > FLOOR_CONTRAST * rest
-        self._floor = (float(used + mode), max(sigma, FLOOR_SIGMA)) if clear else None
+        self._floor = None if found is None else (float(used + found.log), found.sigma)
+        self.floor_tracks = 0 if found is None else found.tracks
 
     def _jacobian(
         self, wheels: WheelTrack, first: Array, last: Array, at: CameraMotions, off: Array
@@ -467,12 +379,6 @@ def _weights(cost: Array) -> Array:
     What even slip does not explain is what tracks refuse, and these have weights of their own.
     """
     return np.asarray((STUDENT + 6.0) / (STUDENT + np.maximum(cost, 0.0) + 4.0))
-
-
-def _kernel(off: Array, sigmas: Array, width: float) -> Array:
-    """Weights of ratios at a distance from the mode."""
-    variance = width**2 + sigmas**2
-    return np.asarray(np.exp(-0.5 * off**2 / variance) / np.sqrt(variance))
 
 
 def _wider(one: Array, other: Array) -> Array:

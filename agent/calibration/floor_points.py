@@ -50,7 +50,7 @@ class FloorPoints:
         found = corners(part[self._above :], CORNERS, QUALITY, APART_PX, WINDOW_PX)
         if len(found):
             self._image = part
-            self.begin = found + [0.0, self._top]
+            self.begin = found + np.array([0.0, self._top])
             self._centre = centres(part[self._above :], found, WINDOW_PX) - found
             self.here, self._count = self.begin.copy(), len(self.begin)
 
@@ -75,8 +75,8 @@ class FloorPoints:
     def _levelled(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """What matters of an image, without its local mean.
 
-        A floor has little texture: a gain that follows the light passes for motion along the shade of lamps and
-        lens (7 % too short with a simulated phone; 2 % so).
+        A floor has little texture: a gain that follows the light passes for motion along the shade of lamps
+        and lens. With a simulated phone motions come out 7 % too short; 2 % so.
         """
         part = np.ascontiguousarray(image[self._top - self._above :])
         mean = cv2.blur(part, (WINDOW_PX, WINDOW_PX))

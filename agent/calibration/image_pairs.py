@@ -18,7 +18,7 @@ QUALITY, APART_PX = 0.003, 7
 """Of corners: share of the strongest, and distance from each other."""
 LEAST_CORNER = 0.1
 """Smaller eigenvalue of a corner's structure tensor, as a share of the larger; with less it is an edge (Lowe
-2004 has the same ratio of 10). Points slide along edges: along the foot of simulated walls two of three points
+2004 has the same ratio of 10). Points slide along edges: at the foot of simulated walls two of three points
 with 0.02 to 0.1 are more than 1 px off after 0.4 s, one of ten with more."""
 WINDOW_PX = 15
 BACKWARD_PX = 0.5
@@ -120,7 +120,7 @@ class ImagePairs:
             corners(part, CORNERS // 2, QUALITY, APART_PX, WINDOW_PX)
             for part in (image[:middle], image[middle:])
         )
-        self._begin = np.concatenate([upper, lower + [0.0, middle]])
+        self._begin = np.concatenate([upper, lower + np.array([0.0, middle])])
         self._here = self._begin.astype(np.float32)[:, None]
         self._centre = centres(image, self._begin, WINDOW_PX) - self._begin
         self._count = len(self._begin)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import WheelTrack
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
-from mapweave.agent.calibration.estimator import USEFUL, Estimate, Estimator
+from mapweave.agent.calibration.estimator import Estimate, Estimator
 from mapweave.agent.calibration.floor_points import FloorPoints
 from mapweave.agent.calibration.image_pairs import (
     LEAST_LEFT,
@@ -24,6 +24,7 @@ from mapweave.agent.calibration.image_pairs import (
     sigma_of,
 )
 from mapweave.agent.calibration.pair_information import ImagePair
+from mapweave.agent.calibration.parameter_sigmas import useful
 from mapweave.agent.calibration.report import Cause, causes
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, RobotDescription
@@ -191,7 +192,9 @@ class OnlineCalibration:
         before, self._last = self._last, estimate
         if before is None:
             return ()
-        settled = np.abs(estimate.vector - before.vector) < np.maximum(SETTLED * USEFUL, estimate.sigmas)
+        settled = np.abs(estimate.vector - before.vector) < np.maximum(
+            SETTLED * useful(estimate.declared), estimate.sigmas
+        )
         self._adopt(estimate, settled & before.shown)
         known = {cause.parameter for cause in self.causes}
         found = [c for c in causes(estimate) if c.parameter not in known and settled[c.parameter]]
@@ -202,7 +205,12 @@ class OnlineCalibration:
         """Use what the drive shows where it differs enough from what is used."""
         target = self._next.vector
         off = np.abs(estimate.vector - target)
-        change = estimate.shown & settled & (off > WORTH * USEFUL) & (off > SIGMAS * estimate.sigmas)
+        change = (
+            estimate.shown
+            & settled
+            & (off > WORTH * useful(estimate.declared))
+            & (off > SIGMAS * estimate.sigmas)
+        )
         change[NAMED_ONLY] = False
         if not change.any():
             return

@@ -107,7 +107,9 @@ def reduce_pair(
         seen = y[:, :2] / z[:, None]
         slope = _projected(at.translation[0], seen, z)
         residual = pair.after - seen - slope * (mean - rho)[:, None]
-        jacobian = np.concatenate([_jacobian(seen, z, rho, slope, mean), slope[:, :, None] * field[:, None]], axis=2)
+        jacobian = np.concatenate(
+            [_jacobian(seen, z, rho, slope, mean), slope[:, :, None] * field[:, None]], axis=2
+        )
         # (sigma^2 I + spread^2 g g')^-1 by Sherman and Morrison.
         gain = 1.0 / ((sigma / spread) ** 2 + (slope**2).sum(1))
         along_r = (slope * residual).sum(1)

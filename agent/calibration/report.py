@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapweave.agent.calibration.estimator import SIGNIFICANT, USEFUL, Estimate
+from mapweave.agent.calibration.estimator import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.parameter_sigmas import useful
 from mapweave.agent.drive_geometry import Parameter
 from mapweave.hybridmap.pose import Array
 
@@ -95,7 +96,7 @@ def causes(estimate: Estimate, declared: Array | None = None) -> list[Cause]:
     """
     declared = estimate.declared if declared is None else declared
     off = np.abs(estimate.vector - declared)
-    wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > USEFUL)
+    wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > useful(estimate.declared))
     value, was, sigma = readable(estimate.vector), readable(declared), readable_sigmas(estimate)
     found = [
         Cause(p, float(was[p]), float(value[p]), float(sigma[p]), float(off[p] / estimate.sigmas[p]))
