@@ -33,6 +33,8 @@ NOISE_STEPS = 4
 """Of expectation maximisation in each Gauss-Newton step."""
 STALE_PITCH = 0.004
 """Pairs that were reduced with another pitch than the present, rad, tell nothing of the floor."""
+FLOOR_BELOW = 0.2
+"""How far below the horizon floor is seen, rad: a wrong pitch moves it away by its share of this."""
 DELAY_SMOOTH_S = 0.5
 """Over which the wheels' speed is averaged where it serves as an instrument for the delay."""
 NO_FLOOR_SIGMA = 1e-3
@@ -47,8 +49,8 @@ FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
 """Variances before any is estimated, per metre or per pair: see `_noise_basis`."""
 LEAST_SIGMA = 0.2
 """Least standard deviation of a track as a share of what is assumed beforehand: lenses are not quite as they
-were calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels that
-slip count for more than what is seen."""
+were calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels
+that slip count for more than what is seen."""
 ROUNDS = 3
 """Of a batch: reductions of all pairs."""
 INNER = 6
@@ -263,7 +265,8 @@ class Estimator:
             np.concatenate([*(self.informations[k].floor_sigmas for k in fresh), np.zeros(0)]),
             blocks,
         )
-        self._floor = None if found is None else (float(used + found.log), found.sigma)
+        pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) / FLOOR_BELOW
+        self._floor = None if found is None else (float(used + found.log), math.hypot(found.sigma, pitch))
         self.floor_tracks = 0 if found is None else found.tracks
 
     def _jacobian(
@@ -274,6 +277,10 @@ class Estimator:
         for k in range(COUNT):
             moved = self.vector.copy()
             moved[k] += STEP[k]
+            if k == P.WHEEL_SCALE:
+                # What is assumed of depths must not tell the way: the floor alone does.
+                columns.append(0.0 * off)
+                continue
             if k == P.DELAY:
                 columns.append(self._delay_column(moved, wheels, first, last, at))
                 continue

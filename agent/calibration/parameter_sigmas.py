@@ -20,8 +20,8 @@ USEFUL_SIGMAS = {
     P.WHEEL_SCALE: 0.02, P.TURN_SCALE: 0.02, P.DRIFT: 0.005, P.FORWARD: 0.1, P.LEFT: 0.1, P.HEADING: 0.01,
     P.PITCH: 0.01, P.ROLL: 0.01, P.HEIGHT: 0.02, P.DELAY: 0.02,
 }  # fmt: skip
-"""A drive shows a parameter if its sigma is below this: smaller errors do not show in a map. How far the camera
-stands off counts as a share of its height: 16 cm on a car, 3 cm on a robot with a mast of 30 cm."""
+"""A drive shows a parameter if its sigma is below this: smaller errors do not show in a map. How far the
+camera stands off counts as a share of its height: 16 cm on a car, 3 cm on a robot with a mast of 30 cm."""
 MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.015, 0.002, 0.001, 0.001, 0.002, 0.002])
 """Errors of the estimator itself, in the order of `Parameter`: depths are not Gaussian, pairs short. Measured
 on drives through simulated buildings; no sigma is smaller."""
