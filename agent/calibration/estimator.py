@@ -37,8 +37,6 @@ FLOOR_BELOW = 0.2
 """How far below the horizon floor is seen, rad: a wrong pitch moves it away by its share of this."""
 DELAY_SMOOTH_S = 0.5
 """Over which the wheels' speed is averaged where it serves as an instrument for the delay."""
-NO_FLOOR_SIGMA = 1e-3
-"""Of the wheels' scale while no floor is seen: epipolar lines know no scale."""
 STUDENT = 5.0
 """Degrees of freedom of the pairs' weights."""
 SIGNIFICANT = 3.5
@@ -176,11 +174,8 @@ class Estimator:
         """Estimate from the pairs as they are reduced now."""
         first = np.array([pair.first_s for pair in self.pairs])
         last = np.array([pair.last_s for pair in self.pairs])
-        information = self._prior.copy()
         floor = np.zeros(COUNT)
-        if self._floor is None:
-            information[P.WHEEL_SCALE, P.WHEEL_SCALE] = 1.0 / NO_FLOOR_SIGMA**2
-        else:
+        if self._floor is not None:
             floor[[P.WHEEL_SCALE, P.HEIGHT]] = 1.0, -1.0
         at = CameraMotions(
             *(np.stack([getattr(i.at, name) for i in self.informations])
@@ -208,19 +203,16 @@ class Estimator:
             pull = np.einsum("nij,nj->ni", keep, rest)
             scores = weight[:, None] * np.einsum("nji,nj->ni", jacobian, pull)
             data = np.einsum("n,nji,njk,nkl->il", weight, jacobian, marginal, jacobian)
-            hessian = data + information + fixed
-            gradient: Array = scores.sum(0) - information @ (self.vector - self.declared)
+            hessian = data + self._prior + fixed
+            gradient: Array = scores.sum(0) - self._prior @ (self.vector - self.declared)
             gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
             self.vector = self.vector + np.linalg.solve(hessian, gradient)
         self._learn_scene()
-        # What is not known of the scale is not known of all that is measured by it.
-        inverse_hessian = np.linalg.inv(hessian - information + self._prior)
+        inverse_hessian = np.linalg.inv(hessian)
         self._covariance = _wider(inverse_hessian, self._scatter(inverse_hessian, scores))
         model = MODEL_SIGMAS.copy()
         model[P.DELAY] = max(model[P.DELAY], DELAY_SHARE * float(np.median(np.diff(wheels.stamps))))
         self._covariance = self._covariance + np.diag(model**2)
-        if self._floor is None:
-            self._covariance[P.WHEEL_SCALE, P.WHEEL_SCALE] = 1.0 / self._prior[P.WHEEL_SCALE, P.WHEEL_SCALE]
         return Estimate(
             self.vector.copy(),
             self._covariance,
@@ -278,7 +270,7 @@ class Estimator:
             moved = self.vector.copy()
             moved[k] += STEP[k]
             if k == P.WHEEL_SCALE:
-                # What is assumed of depths must not tell the way: the floor alone does.
+                # The floor alone tells it: epipolar lines know no scale, and assumed depths must not.
                 columns.append(0.0 * off)
                 continue
             if k == P.DELAY:

@@ -51,8 +51,8 @@ WORTH = 2.0
 
 NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
 """Named, but not used by themselves. The wheels' scales and drift are what all else is measured by, and the
-floor shows the height only as a multiple of the way: on KITTI 03 the scale is up to 9 % off on the way, by road
-that is not flat. A camera aside or rolled shows too weakly."""
+floor shows the height only as a multiple of the way: on KITTI 03, where the road is not flat, the scale is up
+to 8 % off in the middle of the drive. A camera aside or rolled shows too weakly."""
 
 
 class OnlineCalibration:
