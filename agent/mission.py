@@ -27,9 +27,15 @@ class Carried:
 
 @dataclass(frozen=True)
 class GoTo:
-    """Park where a node's image was taken; the node may be another robot's."""
+    """Park where a node's image was taken; the node may be another robot's.
+
+    Attributes:
+        node: the goal.
+        via: nodes to pass before, in order.
+    """
 
     node: NodeId
+    via: tuple[NodeId, ...] = ()
 
 
 Mission = Idle | Explore | Carried | GoTo

@@ -39,7 +39,7 @@ Defer = Callable[[Callable[[], None]], object]
 def as_mission(order: MissionOrder) -> Mission:
     """What the pipeline shall do."""
     if order.node is not None:
-        return GoTo(order.node)
+        return GoTo(order.node, order.via)
     plain: dict[MissionKind, Mission] = {MissionKind.EXPLORE: Explore(), MissionKind.CARRIED: Carried()}
     return plain.get(order.kind, Idle())
 
@@ -121,8 +121,9 @@ class MissionControl:
         if current is not None and order.rank < current.order.rank:
             newer = f"mission {current.order.id} by {current.order.by} is newer"
             return self._note(MissionReport(order, MissionState.REPLACED, 0.0, newer))
-        if order.node is not None and (reason := self.unknown_goal(order.node)):
-            return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reason))
+        for node in () if order.node is None else (*order.via, order.node):
+            if reason := self.unknown_goal(node):
+                return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reason))
         report = MissionReport(order, MissionState.RUNNING)
         replaced = []
         if current is not None and current.open:

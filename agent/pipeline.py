@@ -163,12 +163,12 @@ class Pipeline:
         match mission:
             case Explore() if self._explorer is None and self._explores:
                 self._explorer = self._new_explorer()
-            case GoTo(goal):
+            case GoTo(goal, via):
                 self._mapper.lose()
                 self._restart()
                 self._navigator = Navigator(
                     self._description, self._lens, self._sift, self.map, goal, self._settings,
-                    self._settings.seed,
+                    self._settings.seed, via,
                 )  # fmt: skip
 
     def step(
@@ -413,6 +413,7 @@ class Pipeline:
         if not nodes and isinstance(self._mission, Explore | Carried):
             detail = f"no nodes yet: {detail or self._mapper.track_report}"
         fix = self._navigator.fix if self._navigator is not None else None
+        c = (self._mapper.map_from_robot if fix is None else fix.node_from_robot).covariance
         return Status(
             doing=doing,
             detail=detail,
@@ -430,4 +431,5 @@ class Pipeline:
             progress=progress,
             located=mapping and self._located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
+            covariance=(float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), float(c[2, 2])),
         )

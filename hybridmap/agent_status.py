@@ -48,6 +48,8 @@ class Status:
         given_up: whether it stands, since the goal cannot be reached; `detail` is the reason.
         progress: share of the present route that is driven.
         tally: statistics of the drive so far.
+        covariance: of the pose by which the robot knows itself, in its own frame: xx, xy, yy, m^2, and of the
+            heading, rad^2; zeros if it is not known.
     """
 
     doing: Line
@@ -66,6 +68,7 @@ class Status:
     given_up: bool = False
     progress: Share = 0.0
     tally: DriveStatistics = NOTHING_DRIVEN
+    covariance: tuple[Amount, float, Amount, Amount] = (0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,7 @@ class RobotEntry:
         status: the last one; None if none has come.
         merged_from_robot: where it is in the merged map, if that is known.
         component: number of that map's component; -1 if it is not known.
+        place: the name of the place where it is; empty if it has none.
     """
 
     robot: Name
@@ -132,6 +136,7 @@ class RobotEntry:
     status: AgentStatus | None = None
     merged_from_robot: Pose2 | None = None
     component: Annotated[int, Meta(ge=-1)] = NO_COMPONENT
+    place: Annotated[str, Meta(max_length=64)] = ""
 
 
 @dataclass(frozen=True)

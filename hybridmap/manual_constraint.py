@@ -2,146 +2,202 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from mapweave.hybridmap.constraint_subject import (
+    NANOSECONDS,
+    Apart,
+    Ends,
+    Linked,
+    RetiredArea,
+    RetiredMap,
+    RetiredNodes,
+    RetiredWindow,
+    Subject,
+)
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import Stamp
-from mapweave.hybridmap.node import NUMBER, MapId, NodeId, check_name
-
-Ends = tuple[NodeId, NodeId] | tuple[MapId, MapId]
-"""Two nodes, or two maps; the smaller first. The same map twice: it is about the map itself."""
-
-EXAMPLE = "two nodes look like r0.1.17 r1.1.5, two maps like r0.1 r1.1"
+from mapweave.hybridmap.node import MapId, NodeId
 
 MOST_WORDS = 300
 """Characters of a reason."""
 
-NANOSECONDS = 1_000_000_000
-
 
 @dataclass(frozen=True, slots=True)
 class ManualConstraint:
-    """That two nodes, or two maps, shall not be linked, or that they may be again; or that a map is retired.
+    """That something is so, or that it no longer is.
 
     Attributes:
-        ends: what it is about. Of two maps it holds for every link between them, also for those to come. The
-            same map twice: the map is retired, and takes no part in anything.
-        apart: whether they shall not be linked; False withdraws an earlier constraint.
+        about: what: nodes or maps kept apart, nodes linked by hand, what is retired.
+        holds: False withdraws an earlier constraint.
         who: has decided.
         stamp_ns: when, wall time since 1970.
         because: why, in that one's words; may be empty.
     """
 
-    ends: Ends
-    apart: bool
+    about: Subject
+    holds: bool
     who: str
     stamp_ns: Stamp
     because: str = ""
 
     def __post_init__(self) -> None:
-        """Put the ends in order.
-
-        Raises:
-            InvalidValue: no two different nodes or maps, or words that are no single printable line.
-        """
-        first, second = sorted(self.ends)
-        if len(first) != len(second) or (first == second and isinstance(first, NodeId)):
-            raise InvalidValue("a manual constraint needs two different nodes, or two maps")
+        """Refuse words that are no single printable line (InvalidValue)."""
         for words in (self.who, self.because):
             if len(words) > MOST_WORDS or not words.isprintable():
                 raise InvalidValue(f"who and why must be one printable line, at most {MOST_WORDS} characters")
-        object.__setattr__(self, "ends", (first, second))
 
-    @property
-    def retires(self) -> MapId | None:
-        """The map that it retires, or takes in again; None if it is about two nodes or two maps."""
-        first, second = self.ends
-        return MapId(*first) if first == second else None
+
+@dataclass(frozen=True, slots=True)
+class ConstraintRequest:
+    """A manual constraint for a server.
+
+    Attributes:
+        constraint: to be kept. Of a link without a pose the server asks the images.
+        check: whether only to say what it would do.
+    """
+
+    constraint: ManualConstraint
+    check: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ConstraintList:
+    """The record of manual constraints.
+
+    Attributes:
+        made: all of them, in order; the first is number 1.
+    """
+
+    made: tuple[ManualConstraint, ...]
 
 
 class ManualConstraints:
-    """All manual constraints in the order of their dates; for the same ends the last holds."""
+    """All manual constraints in the order of their dates; of those about the same the last holds.
 
-    def __init__(self, made: Iterable[ManualConstraint] = ()) -> None:
+    Attributes:
+        made: in order.
+        nodes: retired nodes of maps that are not retired as a whole, each with the constraint that retires
+            it. Only the merge knows them, see mapweave.merge.retired_nodes.
+        retired: retired maps, with the constraints that retire them.
+    """
+
+    def __init__(
+        self, made: Iterable[ManualConstraint] = (), nodes: Mapping[NodeId, ManualConstraint] | None = None
+    ) -> None:
         """Take them over; the same one twice counts once."""
         self.made = tuple(dict.fromkeys(made))
-        self._last = {constraint.ends: constraint for constraint in self.made}
+        self.nodes: Mapping[NodeId, ManualConstraint] = {} if nodes is None else nodes
+        self._last = {constraint.about.key: constraint for constraint in self.made}
+        self.retired: dict[MapId, ManualConstraint] = {}
+        self._apart: dict[Ends, ManualConstraint] = {}
+        for constraint in self.in_force:
+            match constraint.about:
+                case RetiredMap(which):
+                    self.retired[which] = constraint
+                case Apart(ends):
+                    self._apart[ends] = constraint
 
     def __add__(self, other: ManualConstraints) -> ManualConstraints:
         """Both, by the time when they were made."""
         return ManualConstraints(
-            sorted({*self.made, *other.made}, key=lambda r: (r.stamp_ns, r.ends, r.apart))
+            sorted({*self.made, *other.made}, key=lambda c: (c.stamp_ns, c.about.key, c.holds))
         )
+
+    def with_nodes(self, nodes: Mapping[NodeId, ManualConstraint]) -> ManualConstraints:
+        """The same with other retired nodes."""
+        return ManualConstraints(self.made, nodes)
 
     @property
     def in_force(self) -> tuple[ManualConstraint, ...]:
-        """Those that keep something apart, in the order of their ends."""
-        return tuple(self._last[ends] for ends in sorted(self._last) if self._last[ends].apart)
+        """Those that hold, in the order of what they are about."""
+        return tuple(self._last[key] for key in sorted(self._last) if self._last[key].holds)
 
     @property
-    def retired(self) -> dict[MapId, ManualConstraint]:
-        """Retired maps, with the constraints that retire them."""
+    def links(self) -> dict[tuple[NodeId, NodeId], Linked]:
+        """Links by hand, by their nodes, without those that another constraint excludes."""
         return {
-            constraint.retires: constraint for constraint in self.in_force if constraint.retires is not None
+            (link.a, link.b): link
+            for constraint in self.in_force
+            if isinstance(link := constraint.about, Linked) and self.against(link.a, link.b) is None
         }
+
+    def standing(self, about: Subject) -> ManualConstraint | None:
+        """The constraint about this that holds, if there is one."""
+        latest = self._last.get(about.key)
+        return latest if latest is not None and latest.holds else None
 
     def against(self, a: NodeId, b: NodeId) -> ManualConstraint | None:
         """The constraint by which two nodes shall not be linked; None if there is none in force."""
-        for ends in (_ordered(a, b), _ordered(a.map, b.map), (a.map, a.map), (b.map, b.map)):
-            latest = self._last.get(ends)
-            if latest is not None and latest.apart:
-                return latest
-        return None
+        pair = self._apart.get((a, b) if a <= b else (b, a))
+        if pair is None:
+            first, second = sorted((a.map, b.map))
+            pair = self._apart.get((first, second))
+        return pair or self.retires(a) or self.retires(b)
+
+    def retires(self, node: NodeId) -> ManualConstraint | None:
+        """The constraint that retires a node, or its map; None if there is none in force."""
+        return self.retired.get(node.map) or self.nodes.get(node)
 
     def about(self, first: NodeId | MapId, second: NodeId | MapId) -> tuple[ManualConstraint, ...]:
         """Every constraint on these two, or on the maps of these two nodes."""
-        ends = [_ordered(first, second)]
-        maps = [end.map if isinstance(end, NodeId) else end for end in (first, second)]
-        ends += [_ordered(*maps), *((end, end) for end in maps)]
-        return tuple(constraint for constraint in self.made if constraint.ends in ends)
+        nodes = {end for end in (first, second) if isinstance(end, NodeId)}
+        maps = {MapId(*end[:2]) for end in (first, second)}
+        retiring = {
+            constraint.about.key
+            for node, constraint in self.nodes.items()
+            if (node in nodes if nodes else node.map in maps)
+        }
+
+        def bears(about: Subject) -> bool:
+            match about:
+                case Apart():
+                    return {*about.ends} in (nodes, maps)
+                case Linked():
+                    return {about.a, about.b} == nodes if nodes else about.maps == maps
+                case RetiredMap():
+                    return about.map in maps
+                case RetiredNodes():
+                    return bool(nodes & {*about.nodes} if nodes else about.maps & maps)
+                case RetiredArea() | RetiredWindow():
+                    return about.key in retiring
+
+        return tuple(constraint for constraint in self.made if bears(constraint.about))
+
+
+def decided(constraint: ManualConstraint) -> str:
+    """For example `by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
+    when = datetime.fromtimestamp(constraint.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    why = f': "{constraint.because}"' if constraint.because else ""
+    return f"by {constraint.who or 'a person'} on {when}{why}"
 
 
 def reason_of(constraint: ManualConstraint) -> str:
     """For example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
-    when = datetime.fromtimestamp(constraint.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    first, second = constraint.ends
-    scope = "" if isinstance(first, NodeId) else f" with all links between {first} and {second}"
-    why = f': "{constraint.because}"' if constraint.because else ""
-    if constraint.retires is not None:
-        return f"map {constraint.retires} is retired by {constraint.who or 'a person'} on {when}{why}"
-    return f"undone{scope} by {constraint.who or 'a person'} on {when}{why}"
+    about, how = constraint.about, decided(constraint)
+    match about:
+        case Apart((first, second)):
+            scope = "" if isinstance(first, NodeId) else f" with all links between {first} and {second}"
+            return f"undone{scope} {how}"
+        case Linked():
+            return f"linked by hand {how}"
+    return f"{about} {_verb(about)} retired {how}"
 
 
-def read_ends(first: str, second: str) -> Ends:
-    """Two nodes or two maps as people write them.
-
-    Raises:
-        InvalidValue: they are neither.
-    """
-    a, b = read_end(first), read_end(second)
-    if isinstance(a, NodeId) and isinstance(b, NodeId):
-        return a, b
-    if isinstance(a, NodeId) or isinstance(b, NodeId):
-        raise InvalidValue(f"{first} and {second} are a node and a map: {EXAMPLE}")
-    return a, b
-
-
-def read_end(word: str) -> NodeId | MapId:
-    """A node (r0.1.17) or a map (r0.1).
-
-    Raises:
-        InvalidValue: it is neither.
-    """
-    parts = word.split(".")
-    if len(parts) == 3:
-        return NodeId.parse(word)
-    if len(parts) != 2 or not NUMBER.fullmatch(parts[1]):
-        raise InvalidValue(f"{word!r} is neither a node nor a map: {EXAMPLE}")
-    return MapId(check_name(parts[0]), int(parts[1]))
+def event_words(constraint: ManualConstraint) -> str:
+    """A manual constraint as an event, in one sentence."""
+    about, who = constraint.about, constraint.who or "a person"
+    match about:
+        case Apart() | Linked() if constraint.holds:
+            return f"{about}: {reason_of(constraint)}"
+        case Apart():
+            return f"{about}: may be linked again, by {who}"
+        case Linked():
+            return f"{about}: the link by hand is taken back, by {who}"
+    return reason_of(constraint) if constraint.holds else f"{about} {_verb(about)} in use again, by {who}"
 
 
-def _ordered(a: NodeId | MapId, b: NodeId | MapId) -> Ends:
-    first, second = sorted((a, b))
-    return first, second  # type: ignore[return-value]
+def _verb(about: Subject) -> str:
+    return "are" if isinstance(about, RetiredNodes) and len(about.nodes) > 1 else "is"

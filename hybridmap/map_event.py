@@ -20,6 +20,10 @@ class MapEventKind(StrEnum):
     """The merge fails with a map, and is made without it; or it is taken in again."""
     CONSTRAINED = "constrained"
     """A person has decided."""
+    ANNOTATED = "annotated"
+    """A person has said something about the map."""
+    CONTRADICTED = "contradicted"
+    """What robots have measured contradicts a link by hand, which stays."""
     FAILED = "failed"
 
 

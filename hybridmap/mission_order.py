@@ -17,6 +17,9 @@ from mapweave.hybridmap.node import NodeId
 MAX_KEPT = 200
 """Missions in a history; older ones are dropped."""
 
+MAX_VIA = 16
+"""Places that a robot passes on its way to a goal."""
+
 Text = Annotated[str, Meta(max_length=64)]
 """A goal as it was written, or a person's name."""
 
@@ -66,7 +69,9 @@ class MissionRequest:
         kind: what it shall do.
         stamp_ns: when it was given; of two missions of a robot the newer one holds.
         by: who gave it.
-        goal: where to: a node (`r0.1.17`), `x,y` in the merged map, m, or `home`; empty without one.
+        goal: where to: a node (`r0.1.17`), a named place, `x,y` in the merged map, m, or `home`; empty
+            without one.
+        via: what to pass before, in order, in the same words.
     """
 
     id: Name
@@ -75,9 +80,12 @@ class MissionRequest:
     stamp_ns: Stamp
     by: Text
     goal: Text = ""
+    via: Annotated[tuple[Text, ...], Meta(max_length=MAX_VIA)] = ()
 
     def __post_init__(self) -> None:
         """Refuse a goal too many or too few (InvalidValue)."""
+        if self.via and self.kind is not MissionKind.GO:
+            raise InvalidValue(f"mission {self.kind}: takes no places on the way")
         if (self.kind is MissionKind.GO) != bool(self.goal):
             raise InvalidValue(f"mission {self.kind}: {'give' if not self.goal else 'takes no'} goal")
 
@@ -89,6 +97,7 @@ class MissionOrder:
     Attributes:
         id: see MissionRequest; likewise robot, kind, stamp_ns, by and goal.
         node: where to park; None without a goal.
+        via: nodes to pass before, in order.
     """
 
     id: Name
@@ -98,6 +107,7 @@ class MissionOrder:
     by: Text
     node: NodeId | None = None
     goal: Text = ""
+    via: Annotated[tuple[NodeId, ...], Meta(max_length=MAX_VIA)] = ()
 
     def __post_init__(self) -> None:
         """Refuse a node too many or too few (InvalidValue)."""
@@ -121,8 +131,10 @@ class MissionOrder:
         """For people."""
         if self.node is None:
             return str(self.kind)
-        return f"{self.kind} to {self.node}" + (
-            f" ({self.goal})" if self.goal not in ("", str(self.node)) else ""
+        return (
+            f"{self.kind} to {self.node}"
+            + (f" ({self.goal})" if self.goal not in ("", str(self.node)) else "")
+            + (f" via {', '.join(map(str, self.via))}" if self.via else "")
         )
 
 

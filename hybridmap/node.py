@@ -89,6 +89,8 @@ class NodeId(NamedTuple):
 
 
 EdgeId = NodeId
+MERGE_AUTHOR = "merge"
+"""Takes the agent's place in the ids of edges that the merge makes."""
 
 
 @dataclass(frozen=True, eq=False)

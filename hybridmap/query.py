@@ -11,17 +11,19 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import (
     MAX_NUMBER,
     MAX_POSITION,
+    Angle,
     Coordinate,
     LandmarkCount,
     Name,
+    Number,
     Probability,
     Words,
 )
-from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
@@ -29,6 +31,9 @@ MAX_CANDIDATES = 64
 MAX_BLOCKED = 256
 MAX_LEGS = 512
 """A route through a building has tens of legs."""
+MAX_WORDS_ASKED = 64
+REACH = 2.0
+"""A position is the nearest node if that is no farther away, m; robots park at nodes alone."""
 MAX_KNOWN = 512
 """Views in one answer: 8 kB, as much as two or three nodes."""
 
@@ -78,6 +83,7 @@ class Whereabouts:
         inliers: landmarks that agree.
         probability: that this place is the right one, 0 to 1.
         distance_known: if not, the node's scale was not measured, and the covariance includes that.
+        place: the name of the place where this is; empty if it has none.
     """
 
     node: NodeId
@@ -87,6 +93,29 @@ class Whereabouts:
     inliers: LandmarkCount
     probability: Probability
     distance_known: bool = True
+    place: Annotated[str, Meta(max_length=64)] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SimilarPlace:
+    """A place that a view looks like, and what is missing to recognise it.
+
+    Attributes:
+        node: whose view it looks like.
+        matches: landmarks of the node that match.
+        inliers: of these, those that agree on one pose.
+        needed: as many would have to agree.
+        lacks: what is missing, in words.
+        turn: by which the camera would look where the node's did, rad, positive to the left; None if too
+            little agrees to tell.
+    """
+
+    node: NodeId
+    matches: Number
+    inliers: Number
+    needed: Number
+    lacks: Words
+    turn: Angle | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +124,18 @@ class RelocalizeAnswer:
 
     An unknown place may have one candidate: then too few landmarks agree for this view to be certain alone,
     and another view that gives the same place is enough.
+
+    Attributes:
+        certainty: of the outcome.
+        candidates: where the robot may be.
+        reason: of the outcome.
+        similar: if the place is unknown, what came nearest to being recognised, best first.
     """
 
     certainty: Certainty
     candidates: Annotated[tuple[Whereabouts, ...], Meta(max_length=MAX_CANDIDATES)]
     reason: Words
+    similar: Annotated[tuple[SimilarPlace, ...], Meta(max_length=MAX_CANDIDATES)] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +236,14 @@ class ReserveAnswer:
         holder: the robot that holds what comes then; empty if none does.
         aside: both wait for each other: this robot steps aside, to this node; None if it only waits.
         reason: in words.
+        closed: whether a person has closed the way ahead; the robot asks for another one.
     """
 
     granted: Annotated[int, Meta(ge=0, le=MAX_LEGS)]
     holder: Annotated[str, Meta(max_length=32)]
     aside: NodeId | None
     reason: Words
+    closed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,6 +261,47 @@ class KnownRequest:
     x: Coordinate
     y: Coordinate
     reach: Annotated[float, Meta(ge=0.0, le=MAX_POSITION)]
+
+
+@dataclass(frozen=True, slots=True)
+class ResolveRequest:
+    """Which nodes are these words?
+
+    Attributes:
+        words: nodes (r0.1.17), names of places, or positions in the merged map (3.1,-2.0).
+        near: a node, or a place: positions are in the frame of its component; empty: of the largest one.
+        reach: a position is refused if no node is nearer than this, m.
+    """
+
+    words: Annotated[tuple[Annotated[str, Meta(max_length=64)], ...], Meta(max_length=MAX_WORDS_ASKED)]
+    near: Annotated[str, Meta(max_length=64)] = ""
+    reach: Annotated[float, Meta(ge=0.0, le=MAX_POSITION)] = REACH
+
+
+@dataclass(frozen=True, slots=True)
+class Resolved:
+    """A node for a word.
+
+    Attributes:
+        node: an active one, unless the word is a node itself.
+        merged_from_node: its pose in the frame of its component.
+        component: number of the component.
+        place: the name of the place, if the word is one; else empty.
+        note: what is to be said about it, such as that another node was taken; may be empty.
+    """
+
+    node: NodeId
+    merged_from_node: Pose2
+    component: Annotated[int, Meta(ge=0, le=MAX_NUMBER)]
+    place: Annotated[str, Meta(max_length=64)] = ""
+    note: Words = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ResolveAnswer:
+    """One for each word."""
+
+    found: Annotated[tuple[Resolved, ...], Meta(max_length=MAX_WORDS_ASKED)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,12 +56,15 @@ class Ways:
         *,
         poses: Mapping[NodeId, Pose2] | None = None,
         penalties: Mapping[EdgeId, float] | None = None,
-        blocked: Collection[tuple[NodeId, NodeId]] = (),
+        blocked: Collection[tuple[NodeId, NodeId] | frozenset[NodeId]] = (),
         closed: Collection[EdgeId] = (),
         settings: RouteSettings | None = None,
         toll: float | None = None,
+        factors: Mapping[frozenset[NodeId], float] | None = None,
     ) -> None:
         """Take a map; the arguments are those of `find_route`.
+
+        With factors, by pairs of nodes, edges cost so many times as much; they are positive.
 
         With a toll the search also passes pairs that are blocked or cannot be driven; each costs the toll in
         addition, m. The cheapest way then shows what is in the way.
@@ -73,6 +76,9 @@ class Ways:
         self._toll = toll
         self._places = poses if poses is not None else _own_poses(hybrid_map)
         self._barred = {frozenset(pair) for pair in blocked}
+        factors = factors or {}
+        # An edge may cost less than its length: the heuristic must stay below.
+        self._least = min((1.0, *factors.values()))
         self._graph: nx.Graph = nx.Graph()
         # In the order of ids, so that of ways of equal cost the same one is found in any order of insertion.
         for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
@@ -81,9 +87,9 @@ class Ways:
                 continue
             if edge.a not in self._places or edge.b not in self._places:
                 continue
-            cost = edge_cost(edge, self._places, poses is not None, s) + max(
-                (penalties or {}).get(edge.id, 0.0), 0.0
-            )
+            cost = edge_cost(edge, self._places, poses is not None, s)
+            cost *= factors.get(frozenset((edge.a, edge.b)), 1.0) if factors else 1.0
+            cost += max((penalties or {}).get(edge.id, 0.0), 0.0)
             if not self._graph.has_edge(edge.a, edge.b):
                 self._graph.add_edge(edge.a, edge.b, choices=[], barred=barred)
             self._graph.edges[edge.a, edge.b]["choices"].append((cost, edge.id))
@@ -126,7 +132,7 @@ class Ways:
         return None if best is None else best[0]
 
     def _distance(self, node: NodeId, target: NodeId) -> float:
-        return self._places[node].distance(self._places[target]) if self._comparable else 0.0
+        return self._least * self._places[node].distance(self._places[target]) if self._comparable else 0.0
 
     def _why_not(self, start: NodeId, goal: NodeId) -> str:
         present = self._map.graph.subgraph(self._map.nodes)

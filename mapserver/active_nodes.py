@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from mapweave.hybridmap.constraint_subject import RetiredWindow
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
@@ -24,8 +25,8 @@ class Places(Protocol):
 
 
 class ActiveNodes:
-    """The place database without superseded and misplaced nodes and maps retired or set apart, and nodes
-    without what has faded.
+    """The place database without superseded and misplaced nodes, without nodes and maps retired or set
+    apart, and nodes without what has faded.
 
     It belongs to one merged map; make another for the next. New nodes are compared with all of the database.
     """
@@ -50,7 +51,12 @@ class ActiveNodes:
         left_out = (
             node for map_id in self._left_out if map_id in merged.maps for node in merged.maps[map_id].nodes
         )
-        self._inactive = frozenset((*left_out, *set_apart, *_misplaced(merged), *_out_of_range(merged)))
+        retired = merged.constraints.nodes
+        self._inactive = frozenset(
+            (*left_out, *retired, *set_apart, *_misplaced(merged), *_out_of_range(merged))
+        )
+        windows = (constraint.about for constraint in merged.constraints.in_force)
+        self._windows = tuple(about for about in windows if isinstance(about, RetiredWindow))
         self._hidden = self._inactive.union(merged.superseded)
 
     def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
@@ -64,7 +70,10 @@ class ActiveNodes:
         if node_id in self._inactive or node_id.map in self._left_out:
             return None
         found_node = self._node_of(node_id)
-        return None if found_node is None else bounded(without_faded(found_node, self._merged))
+        # A robot may have mapped on in a time window that is retired.
+        if found_node is None or any(window.holds(found_node) for window in self._windows):
+            return None
+        return bounded(without_faded(found_node, self._merged))
 
 
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:

@@ -8,29 +8,34 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
-    MAX_MAPS_LISTED,
     Explanation,
     FleetExplanation,
     MapsExplanation,
     PairExplanation,
     RouteExplanation,
 )
-from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.manual_constraint import (
+    ConstraintList,
+    ConstraintRequest,
+    ManualConstraint,
+    ManualConstraints,
+    event_words,
+)
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
-from mapweave.mapserver.constraint_history import said_of, with_constraints
+from mapweave.mapserver.base_map import BaseMap
+from mapweave.mapserver.constraint_history import with_constraints
+from mapweave.mapserver.explanations import explained
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.services import guarded
-from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
-from mapweave.merge.explanation.node_explanation import explain_nodes
-from mapweave.merge.manual_constraints import check_manual_constraint
-from mapweave.merge.settings import ConsistencySettings
+from mapweave.merge.constraint_checks import check_manual_constraint
+from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
@@ -38,22 +43,32 @@ from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
 
-AnyExplanation = TypeVar("AnyExplanation", PairExplanation, MapsExplanation, RouteExplanation)
+AnyExplanation = TypeVar("AnyExplanation", bound=PairExplanation | MapsExplanation | RouteExplanation)
 
 
 class ConstraintRecord:
     """The server's record of manual constraints, on its disk. Entries are added, never removed."""
 
-    def __init__(self, store: Store) -> None:
-        """Read the record."""
+    def __init__(self, store: Store, base: BaseMap | None = None) -> None:
+        """Read the record.
+
+        Args:
+            store: where it is kept.
+            base: has constraints of before, and maps that can be retired, too.
+        """
         self._store = store
+        self._base = base or BaseMap()
         made: list[ManualConstraint] = []
         for body in store.constraints():
             try:
                 made.append(decode(body, ManualConstraint))
             except InvalidMessage as error:
                 log.error("a manual constraint cannot be read (%s); it is left out", error)
-        self._constraints = ManualConstraints(made)
+        both = dict.fromkeys((*self._base.constraints.made, *made))
+        # By date only where there are two records: clocks differ, and one record is in order.
+        self._constraints = ManualConstraints(
+            sorted(both, key=lambda one: one.stamp_ns) if self._base.constraints.made else made
+        )
 
     @property
     def constraints(self) -> ManualConstraints:
@@ -62,7 +77,7 @@ class ConstraintRecord:
 
     def maps(self) -> list[MapId]:
         """All maps of which the server has anything: they can be retired."""
-        return self._store.maps()
+        return sorted({*self._store.maps(), *self._base.maps})
 
     def add(self, constraint: ManualConstraint) -> None:
         """Add a manual constraint; it is on the disk when this returns.
@@ -88,9 +103,10 @@ class Explainer:
         record: ConstraintRecord,
         constrain: Callable[[ManualConstraints], None],
         settled: Callable[[], bool],
-        consistency: ConsistencySettings,
+        settings: MergeSettings,
         wary: Callable[[], Collection[tuple[NodeId, NodeId]]],
         events: Callable[[], Iterable[MapEvent]],
+        annotations: Callable[[], Annotations] = Annotations,
     ) -> None:
         """Begin to answer.
 
@@ -103,22 +119,25 @@ class Explainer:
             record: of manual constraints.
             constrain: called with all constraints whenever there is a new one.
             settled: whether the newest answers know all that has come.
-            consistency: as in the merge.
+            settings: of the merge.
             wary: pairs of nodes between which robots of late did not get through.
             events: what has become of the maps.
+            annotations: the record.
         """
         self._answers = answers
         self._admission = admission
         self._record = record
         self._constrain = constrain
         self._settled = settled
-        self._consistency = consistency
+        self._settings = settings
         self._wary = wary
         self._events = events
+        self._annotations = annotations
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
-            bus.serve(keys.constrain(name), guarded(self._apply_constraint)),
+            bus.serve(keys.constrain(name), self._constrain_later),
+            bus.serve(keys.constraints(name), guarded(lambda _: encode(self.constraints()))),
             bus.serve(keys.history(name), guarded(lambda _: encode(History(self.history())))),
         ]
 
@@ -128,7 +147,17 @@ class Explainer:
             closing.close()
 
     def _explain_later(self, request: Request) -> None:
-        done = self._admission.submit(lambda: self._explain(request.payload), usual=False)
+        self._later(request, lambda: self._explain(request.payload))
+
+    def _constrain_later(self, request: Request) -> None:
+        """A link is compared with the images and the map, which takes its time."""
+        self._later(
+            request,
+            lambda: encode_record({"said": self.constrain(decode(request.payload, ConstraintRequest))}),
+        )
+
+    def _later(self, request: Request, answer: Callable[[], bytes]) -> None:
+        done = self._admission.submit(answer, usual=False)
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _explain(self, payload: bytes) -> bytes:
@@ -142,35 +171,44 @@ class Explainer:
         """
         # Asked first: later changes may be missing in the answers.
         settled = self._settled()
-        answers = self._answers()
-        merged = answers.merged
-        if request.ends is None:
-            maps = explain_fleet(merged, MAX_MAPS_LISTED)
-            return FleetExplanation(tuple(_still(pair, settled) for pair in maps))
-        first, second = request.ends
-        if isinstance(first, NodeId) and isinstance(second, NodeId):
-            if request.route:
-                explanation = explain_route(answers.router, first, second, request.blocked, self._wary())
-                return _still(explanation, settled)
-            return _still(explain_nodes(merged, first, second, None, self._consistency), settled)
-        two = explain_maps(merged, MapId(*first[:2]), MapId(*second[:2]))
-        return FleetExplanation((_still(two, settled),))
+        explanation = explained(request, self._answers().router, self._settings.consistency, self._wary())
+        if isinstance(explanation, FleetExplanation):
+            return FleetExplanation(tuple(_still(pair, settled) for pair in explanation.maps))
+        return _still(explanation, settled)
 
     def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps and the manual constraints, in order."""
-        return with_constraints(self._events(), self._record.constraints)
+        """The history of the maps, the manual constraints and the annotations, in order."""
+        return with_constraints(self._events(), self._record.constraints, self._annotations())
 
-    def _apply_constraint(self, payload: bytes) -> bytes:
-        constraint = decode(payload, ManualConstraint)
+    def constraints(self) -> ConstraintList:
+        """The record of manual constraints, in order."""
+        return ConstraintList(self._record.constraints.made)
+
+    def constrain(self, request: ConstraintRequest) -> str:
+        """Keep a manual constraint, on the disk, and merge with it; or only say what it would do.
+
+        Returns:
+            What was decided, and its effects, in words.
+
+        Raises:
+            InvalidValue: it has no effect, or the evidence against it.
+            InvalidFile: the disk does not take it.
+        """
         with self._turn:
-            check_manual_constraint(
-                self._answers().merged, self._record.constraints, constraint, self._record.maps()
+            constraint, effects = check_manual_constraint(
+                self._answers().merged,
+                self._record.constraints,
+                request.constraint,
+                self._record.maps(),
+                self._settings,
             )
+            words = f"{event_words(constraint)}{f'; {effects}' if effects else ''}"
+            if request.check:
+                return f"only checked, nothing is changed: {words}"
             self._record.add(constraint)
             self._constrain(self._record.constraints)
-        event = said_of(constraint)
-        log.warning("%s", event)
-        return encode_record({"said": event})
+        log.warning("%s", words)
+        return words
 
 
 def _still(explanation: AnyExplanation, settled: bool) -> AnyExplanation:

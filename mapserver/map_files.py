@@ -7,32 +7,32 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import Edge, MapId
+from mapweave.hybridmap.node import Edge
+from mapweave.mapserver.own_maps import PROBABILITY, is_link, maps_of
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
-from mapweave.merge.pose_graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
+from mapweave.merge.pose_graph.links import Link, RefusedLink, link_of
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, RefusedPair
-from mapweave.wire.codec import element_of
-
-PROBABILITY = "probability"
-"""Name among the evidence of a link in a file: see mapweave.merge.outlier_rejection.link_probability."""
 
 
-def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
+def map_file_of(
+    merged: MergedMap, history: Iterable[MapEvent] = (), annotations: Annotations | None = None
+) -> MapFile:
     """A whole merged map: nodes, edges, links with their probabilities, refusals, manual constraints, poses.
 
     Args:
         merged: the map.
         history: events of its maps.
+        annotations: what people say about it.
     """
     whole = merged.union()
     probabilities = link_probabilities(merged)
@@ -50,18 +50,8 @@ def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
         merged.superseded,
         merged.faded,
         tuple(history),
+        (annotations or Annotations()).made,
     )
-
-
-def maps_of(content: MapFile) -> dict[MapId, HybridMap]:
-    """The robots' own maps in a file, with what was refused of their edges; links are not theirs."""
-    maps: dict[MapId, HybridMap] = {}
-    refused = (EdgePut(r.edge) for r in content.refused if r.edge is not None)
-    for change in (*content.changes, *refused):
-        element = element_of(change)
-        if not (isinstance(change, EdgePut) and _is_link(change.edge)):
-            maps.setdefault(element.map, HybridMap()).apply(change)
-    return maps
 
 
 def merged_of(content: MapFile, settings: MergeSettings | None = None) -> MergedMap:
@@ -108,14 +98,10 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     )
 
 
-def _is_link(edge: Edge) -> bool:
-    return edge.id.map == MapId(MERGE_AUTHOR, 0)
-
-
 def _links(edges: Iterable[Edge]) -> list[Link]:
     links = []
     for edge in edges:
-        if _is_link(edge):
+        if is_link(edge):
             evidence = {name: value for name, value in edge.evidence.items() if name != PROBABILITY}
             links.append(link_of(replace(edge, evidence=evidence)))
     return sorted(links, key=lambda link: link.pair)
@@ -131,5 +117,5 @@ def _refused(pair: RefusedPair) -> RefusedLink:
     if pair.edge is None:
         return RefusedLink(pair.a, pair.b, pair.reason)
     return RefusedLink(
-        pair.a, pair.b, pair.reason, link_of(pair.edge), None if _is_link(pair.edge) else pair.edge.id
+        pair.a, pair.b, pair.reason, link_of(pair.edge), None if is_link(pair.edge) else pair.edge.id
     )

@@ -7,12 +7,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -20,8 +21,6 @@ from mapweave.wire.messages import KeptHistory, decode, encode
 
 log = logging.getLogger(__name__)
 
-NAME = "history"
-"""In the store."""
 MOST = 500
 """Events that are kept: the newest."""
 MOST_APART = 2000
@@ -54,7 +53,7 @@ class MapHistory:
         self._lock = threading.Lock()
         self._kept = KeptHistory()
         self._links: Collection[Link] | None = None
-        record = None if store is None else store.result(NAME)
+        record = None if store is None else store.result(HISTORY)
         if record is not None:
             try:
                 self._kept = decode(record, KeptHistory)
@@ -97,9 +96,16 @@ class MapHistory:
         bad, before_bad = merged.set_apart, self._kept.set_apart
         left_out = [f"map {map_id} is set apart: {bad[map_id]}" for map_id in sorted(bad.keys() - before_bad)]
         taken_in = [f"map {map_id} is no longer set apart" for map_id in sorted(before_bad - bad.keys())]
+        # A link that is taken back, or no longer contradicted, may be reported once more.
+        against_hand = merged.contradicted
+        said = self._kept.contradicted & against_hand.keys()
+        contradicted = [
+            f"the link by hand of {a} and {b}: {against_hand[a, b]}"
+            for a, b in sorted(against_hand.keys() - said)
+        ]
         for words in (*joined, *taken_in):
             log.info("%s", words)
-        for words in (*parted, *held, *left_out):
+        for words in (*parted, *held, *left_out, *contradicted):
             log.warning("%s", words)
         # Of what happens at once, that something came apart is what people must see last.
         fresh = [
@@ -108,36 +114,30 @@ class MapHistory:
             *_briefly(MapEventKind.PARTED, parted),
             *_briefly(MapEventKind.SET_APART, taken_in),
             *_briefly(MapEventKind.SET_APART, left_out),
+            *_briefly(MapEventKind.CONTRADICTED, contradicted),
         ]
         apart_pairs = frozenset(still | set(new))
         self._links = merged.links
-        if fresh or now != before or apart_pairs != self._kept.apart:
-            self._keep(fresh, now, apart_pairs, frozenset(bad))
+        after = KeptHistory((), now, apart_pairs, frozenset(bad), frozenset(against_hand))
+        if fresh or replace(after, events=self._kept.events) != self._kept:
+            self._keep(fresh, after)
 
     def failed(self, words: str) -> None:
         """Record that something could not be done; the same twice is reported once."""
         if not self._kept.events or self._kept.events[-1].words != words:
-            self._keep(
-                [(MapEventKind.FAILED, words)], self._kept.parts, self._kept.apart, self._kept.set_apart
-            )
+            self._keep([(MapEventKind.FAILED, words)], self._kept)
 
-    def _keep(
-        self,
-        fresh: list[tuple[MapEventKind, str]],
-        parts: tuple[frozenset[MapId], ...],
-        apart: frozenset[Pair],
-        set_apart: frozenset[MapId],
-    ) -> None:
+    def _keep(self, fresh: list[tuple[MapEventKind, str]], state: KeptHistory) -> None:
         """Add to the record; it is on the disk when this returns, unless the disk does not take it."""
         now = self._clock()
         more = [MapEvent(now, kind, _one_line(words)) for kind, words in fresh]
-        kept = KeptHistory((*self._kept.events, *more)[-self._most :], parts, apart, set_apart)
+        kept = replace(state, events=(*self._kept.events, *more)[-self._most :])
         with self._lock:
             self._kept = kept
         if self._store is None:
             return
         try:
-            self._store.put_result(NAME, encode(kept))
+            self._store.put_result(HISTORY, encode(kept))
         except (InvalidFile, InvalidValue) as error:
             log.warning("what has happened to the maps is not kept: %s", error)
 

@@ -24,11 +24,11 @@ from mapweave.hybridmap.mission_order import (
     MissionState,
     new_id,
 )
-from mapweave.hybridmap.node import MapId, check_name
+from mapweave.hybridmap.node import MapId, NodeId, check_name
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.roster import Roster
-from mapweave.mapserver.routes import Router
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
@@ -53,7 +53,7 @@ class MissionRelay:
         bus: Bus,
         keys: Keys,
         store: Store,
-        router: Callable[[], Router],
+        places: Callable[[], Places],
         time_ns: Callable[[], int],
     ) -> None:
         """Go on with the record of the store.
@@ -62,10 +62,10 @@ class MissionRelay:
             bus: the connection; stays the caller's.
             keys: of the fleet.
             store: keeps the record.
-            router: of the newest merged map.
+            places: of the newest merged map.
             time_ns: the present time.
         """
-        self._bus, self._keys, self._store, self._router, self._time_ns = bus, keys, store, router, time_ns
+        self._bus, self._keys, self._store, self._places, self._time_ns = bus, keys, store, places, time_ns
         self.roster: Roster | None = None
         self._turn = threading.RLock()
         self._reports: dict[str, MissionReport] = {}
@@ -97,7 +97,13 @@ class MissionRelay:
         return self._hand_on(known.order) if known.open else known
 
     def request(
-        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = ""
+        self,
+        robot: str,
+        kind: MissionKind,
+        goal: str,
+        by: str,
+        mission_id: str = "",
+        via: tuple[str, ...] = (),
     ) -> MissionRequest:
         """A mission that is given now, and is newer than the one that holds the robot.
 
@@ -108,7 +114,7 @@ class MissionRelay:
         report = None if status is None else status.mission
         stamp_ns = max(self._time_ns(), 0 if report is None else report.order.stamp_ns + 1)
         mission_id = check_name(mission_id) if mission_id else new_id()
-        return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal[:64])
+        return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal[:64], via)
 
     def hear(self, status: AgentStatus) -> None:
         """Take note of what a robot reports of its mission."""
@@ -133,14 +139,17 @@ class MissionRelay:
     def _resolved(self, request: MissionRequest) -> MissionReport:
         """The mission as the robot gets it, or refused."""
         robot, node = request.robot, None
+        via: tuple[NodeId, ...] = ()
         status = None if self.roster is None else self.roster.status(robot)
         if status is None and not (self.roster is not None and self.roster.alive(robot)):
             raise InvalidValue(f"no robot {robot} has been heard of")
         if request.goal:
             map_id = MapId(robot, 0 if status is None else status.epoch)
-            node = node_of_goal(request.goal, map_id, self._router())
+            places = self._places()
+            node = node_of_goal(request.goal, map_id, places)
+            via = tuple(node_of_goal(word, map_id, places) for word in request.via)
         order = MissionOrder(
-            request.id, robot, request.kind, request.stamp_ns, request.by, node, request.goal
+            request.id, robot, request.kind, request.stamp_ns, request.by, node, request.goal, via
         )
         return MissionReport(order, MissionState.SENT)
 

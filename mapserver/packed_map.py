@@ -11,6 +11,7 @@ import weakref
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.mapserver.answers import Answers
@@ -34,6 +35,7 @@ class PackedMap:
         history: Callable[[], Iterable[MapEvent]],
         answer: Callable[[Request, Callable[[], bytes]], None],
         executor: Executor,
+        annotations: Callable[[], Annotations] = Annotations,
     ) -> None:
         """Start.
 
@@ -42,7 +44,9 @@ class PackedMap:
             history: of the map, which the file takes along.
             answer: replies to a question with what a function returns, or refuses with what it raises.
             executor: packs, one job at a time; it is shut down with this.
+            annotations: of the map, likewise.
         """
+        self._annotations = annotations
         self._answers = answers
         self._history = history
         self._answer = answer
@@ -50,7 +54,7 @@ class PackedMap:
         self._lock = threading.Lock()
         self._waiting: list[Request] = []
         self._working = False
-        self._packed: tuple[weakref.ref[MergedMap], tuple[MapEvent, ...], bytes] | None = None
+        self._packed: tuple[weakref.ref[MergedMap], tuple[MapEvent, ...], Annotations, bytes] | None = None
 
     def ask(self, request: Request) -> None:
         """Answer some time later.
@@ -77,12 +81,12 @@ class PackedMap:
 
     def pack(self) -> bytes:
         """The file of the newest merge."""
-        merged, history = self._answers().merged, tuple(self._history())
-        if self._packed is not None and self._packed[0]() is merged and self._packed[1] == history:
-            return self._packed[2]
-        data = pack_map_file(map_file_of(merged, history))
+        merged, history, said = self._answers().merged, tuple(self._history()), self._annotations()
+        if self._packed is not None and self._packed[0]() is merged and self._packed[1:3] == (history, said):
+            return self._packed[3]
+        data = pack_map_file(map_file_of(merged, history, said))
         # Bytes of a map that has been replaced are freed with it.
-        self._packed = weakref.ref(merged, self._forget), history, data
+        self._packed = weakref.ref(merged, self._forget), history, said, data
         return data
 
     def _forget(self, reference: weakref.ref[MergedMap]) -> None:

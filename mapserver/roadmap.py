@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mapweave.hybridmap.area import Floats
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -80,10 +81,24 @@ class Roadmap:
         reaches.forget(self.union.edges)
         self.poses = {node: merged.pose(node) for node in merged.poses}
         self.active_poses = {node: p for node, p in self.poses.items() if node not in merged.superseded}
+        self._segments: dict[int, tuple[list[tuple[NodeId, NodeId]], Floats, Floats]] = {}
         self._join_nearby(same_place)
         for k, (node, fate) in enumerate(sorted(merged.superseded.items())):
             if node in self.poses and fate.by in self.poses:
                 self._join(EdgeId(SUCCESSION, 0, k), node, fate.by)
+
+    def segments(self, component: int) -> tuple[list[tuple[NodeId, NodeId]], Floats, Floats]:
+        """Joined pairs of nodes of a component, and (N, 2) where each begins and ends in the merged frame."""
+        if component not in self._segments:
+            members = self.merged.components[component]
+            joined = {(a, b) for a, b in self.union.graph.edges() if a in members and b in members}
+            pairs = [pair for pair in sorted(joined) if pair[0] in self.poses and pair[1] in self.poses]
+            ends = [
+                np.array([(self.poses[pair[k]].x, self.poses[pair[k]].y) for pair in pairs]).reshape(-1, 2)
+                for k in (0, 1)
+            ]
+            self._segments[component] = pairs, ends[0], ends[1]
+        return self._segments[component]
 
     def _join_nearby(self, same_place: float) -> None:
         for number, members in enumerate(self.merged.components):

@@ -14,6 +14,7 @@ from mapweave.hybridmap.agent_status import (
 )
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.places import Places
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
@@ -58,8 +59,9 @@ class Roster:
         with self._turn:
             return self._heard[robot][0] if robot in self._heard else None
 
-    def robots(self, merged: MergedMap) -> FleetStatus:
+    def robots(self, places: Places) -> FleetStatus:
         """All robots, with where they are in a merged map."""
+        merged = places.merged
         now = self._clock()
         with self._turn:
             names = sorted({name for name, maps in self._alive.items() if maps} | self._heard.keys())
@@ -68,7 +70,10 @@ class Roster:
         for name in names[:MAX_ROBOTS]:
             status, at = heard.get(name, (None, now))
             pose, component = (None, NO_COMPONENT) if status is None else whereabouts(status, merged)
-            entries.append(RobotEntry(name, name in alive, max(now - at, 0.0), status, pose, component))
+            place = "" if pose is None else places.name_at(component, pose)
+            entries.append(
+                RobotEntry(name, name in alive, max(now - at, 0.0), status, pose, component, place)
+            )
         return FleetStatus(tuple(entries))
 
     def _take(self, sample: Sample) -> None:

@@ -7,12 +7,14 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+from mapweave.hybridmap.annotation import Annotation
 from mapweave.hybridmap.explanation import Hop, MapsExplanation, RouteExplanation
 from mapweave.hybridmap.node import Edge, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.route import Route, edge_cost
 from mapweave.mapserver.roadmap import IMPLIED
+from mapweave.mapserver.route_rules import RouteRules, rule_words
 from mapweave.mapserver.routes import WARY_COST, Router
 from mapweave.merge.explanation.component_changes import joined_maps
 from mapweave.merge.explanation.map_explanation import explain_maps
@@ -40,14 +42,23 @@ class _Hindrances:
     blocked: frozenset[frozenset[NodeId]]
     wary: frozenset[frozenset[NodeId]]
     wary_cost: float
+    rules: RouteRules
+    within: frozenset[Annotation]
 
     def words(self, pair: frozenset[NodeId]) -> str:
         """Of a pair; empty if it is none."""
         if pair in self.blocked:
             return "reported as blocked"
+        for closure in self.rules.closed.get(pair, ()):
+            if closure not in self.within:
+                return rule_words(closure)
         if pair in self.wary:
             return f"another robot recently could not get through: {self.wary_cost:g} m dearer"
         return ""
+
+    def preferred(self, pair: frozenset[NodeId]) -> str:
+        """Who prefers or avoids a pair, in words; empty if it is not so."""
+        return "; ".join(map(rule_words, self.rules.preferences.get(pair, ())))
 
 
 def explain_route(
@@ -69,27 +80,53 @@ def explain_route(
     for end in (start, goal, *(node for pair in blocked for node in pair)):
         merged.check(end)
     if missing := router.missing(start, goal):
+        if closed := router.closed_goal(goal):
+            return RouteExplanation(start, goal, False, closed)
         return _apart(merged, start, goal, missing)
     if start == goal:
         return RouteExplanation(start, goal, True, "start and goal are one node")
-    hindrances = _Hindrances(frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), WARY_COST)
+    rules, within = router.rules, router.rules.around(start, Pose2())
+    hindrances = _Hindrances(
+        frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), WARY_COST, rules, within
+    )
     route, why_not = Route((), (), 0.0, ""), ""
     poses: Mapping[NodeId, Pose2] = {}
     for poses in router.choices(start, goal):
-        route = router.ways(poses, blocked, wary).find(start, goal)
+        route = router.ways(poses, blocked, wary, within=within).find(start, goal)
         if route.nodes:
             break
         why_not = route.reason
     if not route.nodes:
-        least = router.ways(poses, blocked, wary, TOLL).find(start, goal)
+        least = router.ways(poses, blocked, wary, TOLL, within).find(start, goal)
         gaps = _gaps(router, least, poses, hindrances)
         many = "1 gap is" if len(gaps) == 1 else f"{len(gaps)} gaps are"
         more = f"; {many} on the way that lacks least" if gaps else ""
         return RouteExplanation(start, goal, False, f"{why_not}{more}", gaps=gaps)
-    best = router.ways(poses, toll=0.0).find(start, goal)
+    best = router.ways(poses, toll=0.0, within=within).find(start, goal)
     gaps = _gaps(router, best, poses, hindrances) if best.cost < route.cost - CLEARLY else ()
     hops = tuple(_hops(router, route, poses, hindrances))
-    return RouteExplanation(start, goal, True, _why(router, route, best, hops, gaps), hops, gaps)
+    reason = _why(router, route, best, hops, gaps)
+    if rules:
+        free = router.ways(poses, blocked, wary, within=None).find(start, goal)
+        reason += _detour(route, free, poses, hindrances)
+    return RouteExplanation(start, goal, True, reason, hops, gaps)
+
+
+def _detour(route: Route, free: Route, poses: Mapping[NodeId, Pose2], hindrances: _Hindrances) -> str:
+    """What closures and preferences change of a route, in words; empty if it is the same without them."""
+    if not free.nodes or free.nodes == route.nodes:
+        return ""
+    longer = _length(route, poses) - _length(free, poses)
+    reasons = [
+        hindrances.words(pair) or hindrances.preferred(pair) for pair in map(frozenset, pairwise(free.nodes))
+    ]
+    reasons += [hindrances.preferred(pair) for pair in map(frozenset, pairwise(route.nodes))]
+    said = "; ".join(dict.fromkeys(filter(None, reasons)))
+    return f"; a detour of {longer:.1f} m, since the way without it is {said}" if said else ""
+
+
+def _length(route: Route, poses: Mapping[NodeId, Pose2]) -> float:
+    return sum(poses[a].distance(poses[b]) for a, b in pairwise(route.nodes))
 
 
 def _why(router: Router, route: Route, best: Route, hops: tuple[Hop, ...], gaps: tuple[Hop, ...]) -> str:
@@ -113,10 +150,14 @@ def _hops(
 ) -> Iterator[Hop]:
     edges = router.roads.union.edges
     for (a, b), edge_id in zip(pairwise(way.nodes), way.edges, strict=True):
-        edge, words = edges[edge_id], hindrances.words(frozenset((a, b)))
+        pair = frozenset((a, b))
+        edge, words = edges[edge_id], hindrances.words(pair)
         more = WARY_COST if words else 0.0
-        hop = _hop(router, edge, a, b, poses, more)
-        yield hop if not words else replace(hop, words=f"{hop.words}; {words}")
+        hop = _hop(
+            router, edge, a, b, poses, more, hindrances.rules.factors_for(hindrances.within).get(pair, 1.0)
+        )
+        words = "; ".join(filter(None, (hop.words, words, hindrances.preferred(pair))))
+        yield replace(hop, words=words)
 
 
 def _gaps(
@@ -134,12 +175,20 @@ def _gaps(
     return tuple(out)
 
 
-def _hop(router: Router, edge: Edge, a: NodeId, b: NodeId, poses: Mapping[NodeId, Pose2], more: float) -> Hop:
+def _hop(
+    router: Router,
+    edge: Edge,
+    a: NodeId,
+    b: NodeId,
+    poses: Mapping[NodeId, Pose2],
+    more: float,
+    factor: float = 1.0,
+) -> Hop:
     between = poses[a].inverse() @ poses[b]
     implied = edge.id.agent in IMPLIED
     kind = edge.id.agent if implied else str(edge.kind)
     words = WORDS[kind] if implied or edge.kind not in RECOGNISED else reach_words(router.merged, edge)
-    cost = edge_cost(edge, poses, True, router.costs) + more
+    cost = factor * edge_cost(edge, poses, True, router.costs) + more
     return Hop(a, b, kind, between.distance(Pose2()), between.heading, cost, words)
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from copy import copy
 
 import numpy as np
 
+from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.node import EdgeId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -17,6 +19,7 @@ from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.route import Route, RouteSettings, Ways
 from mapweave.mapserver.active_nodes import without_faded
 from mapweave.mapserver.roadmap import Roadmap
+from mapweave.mapserver.route_rules import RouteRules, rule_words
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 NEAR = 0.5
@@ -37,8 +40,43 @@ ENTRIES = 12
 """Nodes that are tried as the beginning of a route."""
 
 
+class _Shared:
+    """What all routers of one merged map share; made when it is asked for first."""
+
+    def __init__(self, merged: MergedMap, reaches: ReachabilityCache | None) -> None:
+        """Take a merged map and a cache."""
+        self._merged = merged
+        self._reaches = reaches or ReachabilityCache()
+        self._turn = threading.Lock()
+        self._roads: Roadmap | None = None
+        self._rules: tuple[Annotations, frozenset[Annotation], RouteRules] | None = None
+
+    def roads(self) -> Roadmap:
+        """What routes may use."""
+        with self._turn:
+            if self._roads is None:
+                self._roads = Roadmap(self._merged, NEAR, self._reaches)
+            return self._roads
+
+    def rules(self, annotations: Annotations, stamp_ns: int) -> RouteRules:
+        """What is closed and preferred; worked out again when the record has changed, or what holds of it."""
+        holding = frozenset(
+            entry for entry, closure in annotations.in_force(Closure) if closure.holds(stamp_ns)
+        )
+        kept = self._rules
+        if kept is None or kept[0] is not annotations or kept[1] != holding:
+            kept = self._rules = annotations, holding, RouteRules(self.roads(), annotations, stamp_ns)
+        return kept[2]
+
+
 class Router:
-    """Finds routes from node to node. It belongs to one merged map; make another for the next."""
+    """Finds routes from node to node. It belongs to one merged map; make another for the next.
+
+    Attributes:
+        merged: the map.
+        costs: what a way costs.
+        annotations: the record, with closures and preferences.
+    """
 
     def __init__(
         self,
@@ -55,17 +93,24 @@ class Router:
         """
         self.merged = merged
         self.costs = costs or RouteSettings()
-        self._reaches = reaches or ReachabilityCache()
-        self._turn = threading.Lock()
-        self._made: Roadmap | None = None
+        self._shared = _Shared(merged, reaches)
+        self.annotations, self._stamp_ns = Annotations(), 0
+
+    def at(self, annotations: Annotations, stamp_ns: int) -> Router:
+        """The same router, by closures and preferences at a time (wall time, ns); costs nothing."""
+        router = copy(self)
+        router.annotations, router._stamp_ns = annotations, stamp_ns
+        return router
 
     @property
     def roads(self) -> Roadmap:
         """What routes may use; made when it is asked for first."""
-        with self._turn:
-            if self._made is None:
-                self._made = Roadmap(self.merged, NEAR, self._reaches)
-            return self._made
+        return self._shared.roads()
+
+    @property
+    def rules(self) -> RouteRules:
+        """What is closed, preferred and avoided."""
+        return self._shared.rules(self.annotations, self._stamp_ns)
 
     def route(
         self,
@@ -92,25 +137,37 @@ class Router:
         """
         if missing := self.missing(start, goal):
             return RouteAnswer((), missing)
-        reason = ""
-        for poses in self.choices(start, goal):
-            best, reason = self._cheapest(start, goal, poses, blocked, wary, start_from_robot)
-            if best is not None:
-                return self._answer(start, best)
+        within = self.rules.around(start, start_from_robot or Pose2())
+        for rules in (True, False) if self.rules else (True,):
+            reason = ""
+            for poses in self.choices(start, goal):
+                best, why_not = self._cheapest(
+                    start, goal, poses, blocked, wary, start_from_robot, within if rules else None
+                )
+                if best is not None and rules:
+                    return self._answer(start, best)
+                if best is not None:
+                    return RouteAnswer((), self._all_closed(best.nodes, goal, within))
+                reason = reason or why_not
         return RouteAnswer((), reason or f"every way into the map near {start} is blocked")
 
     def missing(self, start: NodeId, goal: NodeId) -> str:
         """Why no route can exist, in words; empty if there may be one."""
         for name, node in (("start", start), ("goal", goal)):
             if node not in self.merged.poses:
-                retired = self.merged.constraints.retired.get(node.map)
+                retired = self.merged.constraints.retires(node)
                 apart = self.merged.set_apart.get(node.map)
                 why = f": {reason_of(retired)}" if retired is not None else ""
                 why = why or (f": map {node.map} is set apart, {apart}" if apart is not None else "")
                 return f"{name} {node} is not in the merged map{why}"
         if self.merged.component_of(start) != self.merged.component_of(goal):
             return f"{start} and {goal} are in parts of the map that nothing joins yet"
-        return ""
+        return self.closed_goal(goal)
+
+    def closed_goal(self, goal: NodeId) -> str:
+        """Why a goal is closed, in words; empty if it is not."""
+        closure = self.rules.closure_at(goal)
+        return "" if closure is None else f"goal {goal} is in {closure.name}, which is {rule_words(closure)}"
 
     def choices(self, start: NodeId, goal: NodeId) -> Iterator[Mapping[NodeId, Pose2]]:
         """Sets of nodes over which a way is searched, one after the other.
@@ -126,12 +183,36 @@ class Router:
         blocked: Collection[tuple[NodeId, NodeId]] = (),
         wary: Collection[tuple[NodeId, NodeId]] = (),
         toll: float | None = None,
+        within: Collection[Annotation] | None = (),
     ) -> Ways:
-        """The ways over nodes with these poses; see `route` and mapweave.hybridmap.route.Ways."""
+        """The ways over nodes with these poses; see `route` and mapweave.hybridmap.route.Ways.
+
+        Args:
+            poses: of the nodes.
+            blocked: pairs of nodes between which the robot cannot drive.
+            wary: pairs of nodes between which another robot did not get through.
+            toll: what a pair that is blocked, closed, or cannot be driven costs, m; None: it is not passed.
+            within: closures of areas which the robot may leave; None: as if nothing were closed or preferred.
+        """
+        rules = self.rules
+        closed = set() if within is None else rules.closed_for(within)
+        barred = [*map(frozenset, blocked), *closed]
         return Ways(
-            self.roads.union, poses=poses, penalties=self._penalties(wary), blocked=blocked,
+            self.roads.union, poses=poses, penalties=self._penalties(wary), blocked=barred,
             closed=self.roads.closed, settings=self.costs, toll=toll,
+            factors={} if within is None else rules.factors_for(within),
         )  # fmt: skip
+
+    def _all_closed(self, nodes: Sequence[NodeId], goal: NodeId, within: Collection[Annotation]) -> str:
+        """Why there is no way, if there would be one without closures."""
+        first = self.rules.first_closed(nodes, within)
+        if first is None:
+            return f"every way to {goal} is closed where the robot is"
+        number, closure = first
+        return (
+            f"every way to {goal} is closed; the cheapest between {nodes[number]} and {nodes[number + 1]}, "
+            f"{rule_words(closure)}"
+        )
 
     def _cheapest(
         self,
@@ -141,12 +222,13 @@ class Router:
         blocked: Collection[tuple[NodeId, NodeId]],
         wary: Collection[tuple[NodeId, NodeId]],
         start_from_robot: Pose2 | None,
+        within: Collection[Annotation] | None,
     ) -> tuple[Route | None, str]:
         """The cheapest way over nodes with these poses, or why the nearest entry has none."""
-        ways = self.ways(poses, blocked, wary)
+        ways = self.ways(poses, blocked, wary, within=within)
         best: Route | None = None
         reason, best_cost = "", math.inf
-        for entry, cost in self._entries(start, poses, start_from_robot, blocked):
+        for entry, cost in self._entries(start, poses, start_from_robot, blocked, within):
             if cost >= best_cost:
                 break
             route = ways.find(entry, goal)
@@ -170,6 +252,7 @@ class Router:
         poses: Mapping[NodeId, Pose2],
         start_from_robot: Pose2 | None,
         blocked: Collection[tuple[NodeId, NodeId]],
+        within: Collection[Annotation] | None,
     ) -> list[tuple[NodeId, float]]:
         """Nodes where the route may begin with what it costs to get there, cheapest first."""
         if start_from_robot is None:
@@ -184,6 +267,12 @@ class Router:
             for distance, node in nearest
             if (distance <= ENTRY_REACH or node == start) and frozenset((start, node)) not in barred
         ]
+        if within is not None and (rules := self.rules):
+            entries = [
+                (node, cost)
+                for node, cost in entries
+                if not rules.bars(component or 0, pose, poses[node], within)
+            ]
         return sorted(entries, key=lambda entry: entry[1])[:ENTRIES]
 
     def _saved(self, pose: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:

@@ -9,17 +9,23 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 
 from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
+from mapweave.mapserver.annotator import AnnotationRecord, Annotator
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
@@ -29,11 +35,13 @@ from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
 from mapweave.mapserver.mission_relay import MissionRelay
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -74,6 +82,7 @@ class MapServer:
         name: str,
         settings: ServerSettings | None = None,
         schedule: Schedule | None = None,
+        base: BaseMap | None = None,
     ) -> None:
         """Open the store and take up where it was left.
 
@@ -85,9 +94,10 @@ class MapServer:
             settings: how it shares its time.
             schedule: runs its work and gives the time; threads and the machine's clock by default. It
                 starts and ends with the server.
+            base: a map that is there from the start, beside the store.
 
         Raises:
-            InvalidFile: the store is damaged or is none.
+            InvalidFile: the store is damaged or is none, or has another map of a name that is in the base.
         """
         self._bus = bus
         self._keys = keys
@@ -96,12 +106,18 @@ class MapServer:
         self._schedule = clock = schedule or LiveSchedule()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = Store(path)
-        self._places = PlaceDatabase(self._store, path)
+        try:
+            self._base = (base or BaseMap()).beside(self._store)
+        except InvalidFile:
+            self._store.close()
+            raise
+        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()])
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
-        self._constraints = ConstraintRecord(self._store)
+        self._constraints = ConstraintRecord(self._store, self._base)
         self._worker.constrain(self._constraints.constraints)
+        self._annotations = AnnotationRecord(self._store)
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
@@ -111,22 +127,26 @@ class MapServer:
         """Begin to serve."""
         worker, clock = self._worker, self._schedule
         worker.start()
-        self._ingest = Ingest(self._bus, self._keys, self._store, self._name, worker.take, replay=worker.read)
-        self._missions = MissionRelay(
-            self._bus, self._keys, self._store, lambda: worker.current().router, clock.time_ns
-        )
+        base = self._base
+        self._ingest = Ingest(
+            self._bus, self._keys, self._store, self._name, worker.take, None,
+            lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
+        )  # fmt: skip
+        self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
         self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
         self._missions.roster = self._roster
         self._services = Services(
-            self._bus, self._keys, self._name, worker.current, self._admission, self._blockages, self.status,
-            lambda: self._history.events, self._missions, self._roster,
-            clock.executor(RELAYS), clock.monotonic, clock.executor(1),
+            self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
+            self._events, self._missions, self._roster,
+            clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places,
         )  # fmt: skip
         self._explainer = Explainer(
-            self._bus, self._keys, self._name, worker.current, self._admission, self._constraints,
-            worker.constrain, lambda: worker.settled, self._settings.merge.consistency,
-            lambda: self._blockages.known(clock.monotonic()), lambda: self._history.events,
+            self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
+            worker.constrain, lambda: worker.settled, self._settings.merge,
+            lambda: self._blockages.known(clock.monotonic()), self._events,
+            lambda: self._annotations.annotations,
         )  # fmt: skip
+        self._annotator = Annotator(self._bus, self._keys, self._name, self._named_places, self._annotations)
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
@@ -140,6 +160,7 @@ class MapServer:
         self._services.close()
         self._roster.close()
         self._explainer.close()
+        self._annotator.close()
         self._admission.close()
         self._ingest.close()
         self._broadcast.close()
@@ -155,22 +176,22 @@ class MapServer:
         """Wait until everything that came before this call is merged; False if the time is over first."""
         return self._worker.settle(timeout)
 
+    @property
+    def read_only(self) -> bool:
+        """Whether nothing can be changed, as with a map file."""
+        return False
+
+    def merged(self) -> MergedMap:
+        """The newest merged map."""
+        return self._worker.current().merged
+
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
         merged = self._worker.answers.merged
-        loops = sum(link.within for link in merged.links)
         traffic = self._store.traffic()
         return {
-            "nodes": len(merged.poses),
-            "superseded": len(merged.superseded),
-            "maps": len(merged.maps),
-            "components": len(merged.components),
-            "links": len(merged.links) - loops,
-            "loops": loops,
-            "refused": sum(refusal.link is not None for refusal in merged.refused),
+            **merged.counts(),
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
-            "constraints": len(merged.constraints.in_force),
-            "set_apart": len(merged.set_apart),
             "event": self._ingest.failure or self._worker.event,
             "settled": self._worker.settled,
             "bytes": traffic.payload_bytes,
@@ -190,7 +211,7 @@ class MapServer:
         Raises:
             Busy: too many ask.
         """
-        return self._admission.submit(lambda: self._worker.current().relocalizer.answer(look()), ticket)
+        return self._admission.submit(lambda: self._services.locate(look()), ticket)
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
         """Ask why nodes or maps are linked or are not, or why a route leads so, from any thread.
@@ -201,8 +222,40 @@ class MapServer:
         return self._admission.submit(lambda: self._explainer.explain(request), usual=False)
 
     def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps and the manual constraints, in order."""
+        """The history of the maps, the manual constraints and the annotations, in order."""
         return self._explainer.history()
+
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+        return self._annotations.annotations
+
+    def annotate(self, annotation: Annotation) -> str:
+        """Add an annotation to the record, from any thread; returns what it says, in words.
+
+        Raises:
+            InvalidValue: it says nothing new, or is about something that is not there.
+        """
+        return self._annotator.annotate(annotation)
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words, from any thread.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+        """
+        return self._annotator.resolve(request)
+
+    def constraints(self) -> ConstraintList:
+        """The record of manual constraints, in order."""
+        return self._explainer.constraints()
+
+    def constrain(self, request: ConstraintRequest) -> str:
+        """Keep a manual constraint, or only check it, from any thread; says what it does in words.
+
+        Raises:
+            InvalidValue: it has no effect, or contradicts the map.
+        """
+        return self._explainer.constrain(request)
 
     def command(self, request: MissionRequest) -> MissionReport:
         """Hand a mission on to its robot, from any thread; waits for the robot's answer.
@@ -212,9 +265,17 @@ class MapServer:
         """
         return self._missions.command(request)
 
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
+    def give(
+        self,
+        robot: str,
+        kind: MissionKind,
+        goal: str,
+        by: str,
+        mission_id: str = "",
+        via: tuple[str, ...] = (),
+    ) -> MissionReport:
         """Give a robot a mission that is newer than the one that holds it; see `command`."""
-        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id))
+        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id, via))
 
     def missions(self) -> Missions:
         """The missions that are known, oldest first."""
@@ -222,11 +283,25 @@ class MapServer:
 
     def robots(self) -> FleetStatus:
         """The robots, and where they are."""
-        return self._roster.robots(self._worker.current().merged)
+        return self._roster.robots(self._named_places())
 
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file."""
         return self._services.map_file()
+
+    def _answers(self) -> Answers:
+        """The newest ones, with routes by what is closed now."""
+        answers = self._worker.current()
+        router = answers.router.at(self._annotations.annotations, self._schedule.time_ns())
+        return replace(answers, router=router)
+
+    def _named_places(self) -> Places:
+        return Places(self._answers().router, self._annotations.annotations)
+
+    def _events(self) -> tuple[MapEvent, ...]:
+        """What has become of the maps, those of the base included."""
+        events = dict.fromkeys((*self._base.history, *self._history.events))
+        return tuple(sorted(events, key=lambda event: event.stamp_ns))
 
     def _publish(self) -> None:
         self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))

@@ -5,18 +5,29 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 
 from mapweave.hybridmap.errors import Busy, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
-from mapweave.hybridmap.query import KnownRequest, ReserveRequest, RouteAnswer, RouteRequest
+from mapweave.hybridmap.query import (
+    KnownRequest,
+    RelocalizeAnswer,
+    ReserveAnswer,
+    ReserveRequest,
+    RouteAnswer,
+    RouteRequest,
+    View,
+)
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.packed_map import PackedMap
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
+from mapweave.mapserver.route_rules import rule_words
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
@@ -46,6 +57,7 @@ class Services:
         relays: Executor,
         clock: Callable[[], float],
         executor: Executor,
+        places: Callable[[], Places],
     ) -> None:
         """Begin to answer.
 
@@ -63,7 +75,9 @@ class Services:
             relays: waits for robots' answers; it is shut down with this.
             clock: only grows, s.
             executor: packs the whole map; it is shut down with this.
+            places: named places of the newest merged map. May wait for it.
         """
+        self._places = places
         self._clock = clock
         self._answers = answers
         self._admission = admission
@@ -74,8 +88,9 @@ class Services:
         self._relays = relays
         self._reservations = Reservations()
         self._map = PackedMap(
-            answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor
-        )
+            answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
+            lambda: places().annotations,
+        )  # fmt: skip
         self._closing: list[Closing] = [
             bus.serve(keys.relocalize(name), self._relocalize_later),
             bus.serve(keys.route(name), guarded(self._route)),
@@ -84,7 +99,7 @@ class Services:
             bus.serve(keys.reserve(name), guarded(self._reserve)),
             bus.serve(keys.server_mission(name), self._command_later),
             bus.serve(keys.missions(name), guarded(lambda _: encode(missions.missions()))),
-            bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(answers().merged)))),
+            bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(places())))),
             bus.serve(keys.server_status(name), guarded(self._tell_status)),
             bus.announce(keys.server_alive(name)),
         ]
@@ -111,7 +126,11 @@ class Services:
 
     def _relocalize(self, payload: bytes) -> bytes:
         view = decode_view(payload)
-        return encode(within_range(self._answers().relocalizer.answer(view)))
+        return encode(within_range(self.locate(view)))
+
+    def locate(self, view: View) -> RelocalizeAnswer:
+        """Where a view was taken, with the names of the places."""
+        return self._places().named(self._answers().relocalizer.answer(view))
 
     def _route(self, payload: bytes) -> bytes:
         request = decode(payload, RouteRequest)
@@ -127,7 +146,15 @@ class Services:
 
     def _reserve(self, payload: bytes) -> bytes:
         request = decode(payload, ReserveRequest)
-        return encode(self._reservations.ask(request, self._answers().router, self._clock()))
+        router, closed = self._answers().router, None
+        if rules := router.rules:
+            within = rules.around(request.start, request.start_from_robot)
+            closed = rules.first_closed((request.start, *request.route), within)
+        if closed is None:
+            return encode(self._reservations.ask(request, router, self._clock()))
+        self._reservations.ask(replace(request, route=()), router, self._clock())
+        number, closure = closed
+        return encode(ReserveAnswer(number, "", None, f"the way ahead is {rule_words(closure)}", True))
 
     def _known(self, payload: bytes) -> bytes:
         request = decode(payload, KnownRequest)

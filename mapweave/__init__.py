@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.query import Certainty as Certainty
     from mapweave.hybridmap.query import RelocalizeAnswer as RelocalizeAnswer
     from mapweave.hybridmap.query import View as View
-    from mapweave.mapserver.map_files import maps_of as maps_of
+    from mapweave.mapserver.own_maps import maps_of as maps_of
     from mapweave.mapserver.relocalization.relocalizer import Relocalizer as Relocalizer
     from mapweave.offline_merge import merge_map_files as merge_map_files
     from mapweave.offline_relocalization import relocalizer_of as relocalizer_of
@@ -65,7 +65,7 @@ else:
         "mapweave.hybridmap.node": ("Edge", "EdgeKind", "Landmarks", "MapId", "Node", "NodeId"),
         "mapweave.hybridmap.pose": ("Pose2", "PoseGaussian"),
         "mapweave.hybridmap.query": ("Certainty", "RelocalizeAnswer", "View"),
-        "mapweave.mapserver.map_files": ("maps_of",),
+        "mapweave.mapserver.own_maps": ("maps_of",),
         "mapweave.mapserver.relocalization.relocalizer": ("Relocalizer",),
         "mapweave.offline_merge": ("merge_map_files",),
         "mapweave.offline_relocalization": ("relocalizer_of", "view_of"),

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from mapweave.hybridmap.constraint_subject import Apart, Linked
 from mapweave.hybridmap.explanation import (
     ALIASED,
     Hop,
@@ -163,17 +164,12 @@ def _near(near_miss: NearMiss, reason: str) -> str:
 
 def _constraint(constraint: ManualConstraint) -> str:
     when = datetime.fromtimestamp(constraint.stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    word = (
-        "decided that they shall not be linked"
-        if constraint.apart
-        else "decided that they may be linked again"
-    )
+    match constraint.about, constraint.holds:
+        case Apart(), holds:
+            word = "they shall not be linked" if holds else "they may be linked again"
+        case Linked(), holds:
+            word = "they see one place" if holds else "they are no longer linked by hand"
+        case _, holds:
+            word = "it is retired" if holds else "it is in use again"
     why = f': "{constraint.because}"' if constraint.because else ""
-    if constraint.retires is not None:
-        word = "decided that it is retired" if constraint.apart else "decided that it is in use again"
-    ends = (
-        f"{constraint.ends[0]} and {constraint.ends[1]}"
-        if constraint.retires is None
-        else f"map {constraint.retires}"
-    )
-    return f"{when} {constraint.who or 'a person'} {word} ({ends}){why}"
+    return f"{when} {constraint.who or 'a person'} decided that {word} ({constraint.about}){why}"

@@ -8,7 +8,17 @@ from importlib.util import find_spec
 from mapweave.hybridmap.errors import MapweaveError
 
 MODULES = {
-    "server": ("faiss", "gtsam", "numba", "python_multipart", "scipy", "starlette", "uvicorn"),
+    "server": (
+        "cryptography",
+        "faiss",
+        "gtsam",
+        "numba",
+        "python_multipart",
+        "scipy",
+        "starlette",
+        "uvicorn",
+        "wsproto",
+    ),
     "sim": ("pybullet",),
     "eval": ("evo",),
     "viz": ("matplotlib",),

@@ -11,11 +11,15 @@ from __future__ import annotations
 import getpass
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
+from typing import Any
 
+from mapweave.fleet_constraints import SOON, FleetConstraints
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import (
     MissionKind,
@@ -27,15 +31,20 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.identities.key_file import read_key_file
+from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.storage.map_file import MapFile, unpack_map_file
-from mapweave.wire.bus import Bus, Reply, Sample
+from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-SOON = 2.0
-"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
+ANSWER = 10.0
+"""A server that merges answers questions about its map late, s."""
 PACKING = 120.0
 """How long a server may take to pack a large map, s."""
 TRIES = 3
@@ -63,7 +72,7 @@ def login() -> str:
         return "a person"
 
 
-class Fleet:
+class Fleet(FleetConstraints):
     """A connection to a fleet. A context manager; its methods may be called from any thread."""
 
     def __init__(
@@ -71,6 +80,7 @@ class Fleet:
         connect: str | Sequence[str] = "tcp/127.0.0.1:7447",
         fleet: str = "demo",
         by: str = "",
+        keys: str | Path = "",
         bus: Bus | None = None,
     ) -> None:
         """Connect.
@@ -79,6 +89,7 @@ class Fleet:
             connect: Zenoh endpoint of the router, or several, of which the first in reach is taken.
             fleet: its name.
             by: gives the missions; the login name by default.
+            keys: key file of an operator or viewer, where the router asks for one.
             bus: a connection to use instead; it stays the caller's.
 
         Raises:
@@ -87,9 +98,12 @@ class Fleet:
         self._keys = Keys(check_name(fleet))
         self._by = (by or login())[:64]
         self._own: ZenohBus | None = None
+        self._role: Role | None = None
         if bus is None:
+            credentials = read_key_file(Path(keys)).credentials if keys else None
+            self._role = None if credentials is None else credentials.role
             endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-            bus = self._own = ZenohBus(BusSettings(mode="client", endpoints=endpoints))
+            bus = self._own = ZenohBus(BusSettings(endpoints=endpoints, credentials=credentials))
             if not self._own.wait_connected(SOON):
                 self._own.close()
                 raise NotConnected(
@@ -137,18 +151,19 @@ class Fleet:
         reports = decode(replies[0].payload, Missions).reports
         return tuple(report for report in reports if robot in ("", report.order.robot))
 
-    def go(self, robot: str, goal: str, wait: float = 0.0) -> MissionReport:
-        """Send a robot to a node (`r0.1.17`), a position in the merged map (`3.1,-2.0`) or `home`.
+    def go(self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = ()) -> MissionReport:
+        """Send a robot to a node (`r0.1.17`), a place, a position in the merged map (`3.1,-2.0`) or `home`.
 
         Args:
             robot: which.
             goal: where to.
             wait: until it is there or has given up, s at most.
+            via: what to pass before, in order, in the same words.
 
         Raises:
             MapweaveError: the robot or the goal does not exist, or the robot does not answer.
         """
-        return self._give(robot, MissionKind.GO, goal, wait)
+        return self._give(robot, MissionKind.GO, goal, wait, tuple(via))
 
     def explore(self, robot: str, wait: float = 0.0) -> MissionReport:
         """Let a robot map all floor that it can reach; see `go`."""
@@ -164,6 +179,7 @@ class Fleet:
         Raises:
             NotConnected: one does not answer; the others are stopped.
         """
+        self._check_role()
         names = [robot] if robot else [entry.robot for entry in self.status().robots if entry.alive]
         reports, silent = [], []
         for name in names:
@@ -229,19 +245,85 @@ class Fleet:
         """The merged map; see `map_bytes`."""
         return unpack_map_file(self.map_bytes())
 
-    def _give(self, robot: str, kind: MissionKind, goal: str, wait: float) -> MissionReport:
+    def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
+        """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
+
+        Args:
+            kind: of the annotation: place, closure, preference.
+            name: for the same kind and name the last one holds.
+            because: why.
+            fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a
+                place, a position `3.1,-2.0` in the merged map. An area is `corners`, positions in the merged
+                map (in the component of the place or node `near`), or `radius`, m, around `node`.
+
+        Returns:
+            What it says, in words.
+
+        Raises:
+            MapweaveError: it says nothing new, is about something that is not there, or no server answers.
+        """
+        return self._annotate(name, {"kind": kind, **fields}, False, because)
+
+    def withdraw(self, kind: str, name: str, because: str = "") -> str:
+        """Withdraw what was said about the map; see `annotate`."""
+        return self._annotate(name, {"kind": kind}, True, because)
+
+    def annotations(self) -> Annotations:
+        """What people say about the map.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._of_server(self._keys.any_annotations(), b""), Annotations)
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words: names of places, and positions in the merged map.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+            NotConnected: no map server answers.
+        """
+        return decode(self._of_server(self._keys.any_resolve(), encode(request)), ResolveAnswer)
+
+    def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
+        annotation = annotation_of_words(
+            name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
+        )
+        said = decode_record(self._of_server(self._keys.any_annotate(), encode(annotation)))["said"]
+        return str(said)
+
+    def _of_server(self, key: str, payload: bytes) -> bytes:
+        """The answer of a map server.
+
+        Raises:
+            InvalidValue: it refuses.
+            NotConnected: none answers.
+        """
+        replies = self._bus.ask(key, payload, ANSWER)
+        for reply in replies:
+            if not reply.error:
+                return reply.payload
+        if replies:
+            raise InvalidValue(replies[0].error.removeprefix("refused: "))
+        raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+
+    def _give(
+        self, robot: str, kind: MissionKind, goal: str, wait: float, via: tuple[str, ...] = ()
+    ) -> MissionReport:
         """By way of the map server; without one directly."""
         check_name(robot)
+        self._check_role()
         report, after_ns = None, 0
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
-            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal)
+            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via)
             replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * SOON)
             taken = [reply for reply in replies if not reply.error]
             if not taken and replies:
                 raise InvalidValue(replies[0].error.removeprefix("refused: "))
             if not taken:
-                report = self._direct(robot, kind, _node(goal), goal)
+                nodes = tuple(node for word in via if (node := _node(word)) is not None)
+                report = self._direct(robot, kind, _node(goal), goal, nodes)
                 break
             report = decode(taken[0].payload, MissionReport)
             if report.state is not MissionState.REPLACED:
@@ -250,10 +332,17 @@ class Fleet:
         assert report is not None, "it was tried"
         return self.wait(report, wait) if wait > 0.0 else report
 
-    def _direct(self, robot: str, kind: MissionKind, node: NodeId | None, goal: str) -> MissionReport:
+    def _check_role(self) -> None:
+        """The router drops what a role may not send; without a word, so that is said here."""
+        if self._role in (Role.VIEWER, Role.ROBOT):
+            raise InvalidValue(f"this is the key of a {self._role}: missions need an operator's")
+
+    def _direct(
+        self, robot: str, kind: MissionKind, node: NodeId | None, goal: str, via: tuple[NodeId, ...] = ()
+    ) -> MissionReport:
         after_ns = 0
         for _ in range(TRIES):
-            order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal)
+            order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal, via=via)
             report = send_order(self._bus, self._keys, order, SOON)
             if report.state is not MissionState.REPLACED:
                 break
@@ -266,9 +355,6 @@ class Fleet:
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0
-
-    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
-        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
 
 
 def _node(goal: str) -> NodeId | None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.map_files import map_file_of, maps_of
+from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
+from mapweave.mapserver.own_maps import maps_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, read_map_file
@@ -31,12 +34,14 @@ class Parts:
         constraints: manual constraints in any of the files.
         notes: what was left out, one sentence each.
         history: history of the maps in any of the files, in order.
+        annotations: what people say about them in any of the files.
     """
 
     maps: dict[MapId, HybridMap]
     constraints: ManualConstraints
     notes: tuple[str, ...] = ()
     history: tuple[MapEvent, ...] = ()
+    annotations: Annotations = field(default_factory=Annotations)
 
 
 def parts_of(files: Mapping[Path, MapFile]) -> Parts:
@@ -68,7 +73,8 @@ def parts_of(files: Mapping[Path, MapFile]) -> Parts:
         constraints += ManualConstraints(content.constraints)
     events = {hybrid_map for content in files.values() for hybrid_map in content.history}
     history = sorted(events, key=lambda hybrid_map: (hybrid_map.stamp_ns, hybrid_map.kind, hybrid_map.words))
-    return Parts(maps, constraints, tuple(notes), tuple(history))
+    said = sum((Annotations(content.annotations) for content in files.values()), Annotations())
+    return Parts(maps, constraints, tuple(notes), tuple(history), said)
 
 
 def _length(hybrid_map: HybridMap) -> int:
@@ -95,6 +101,7 @@ def merge_parts(
     constraints: ManualConstraints,
     progress: Progress = lambda done, of: None,
     settings: MergeSettings | None = None,
+    store: Path | None = None,
 ) -> MergedMap:
     """Merge robots' maps as the map server does.
 
@@ -103,6 +110,7 @@ def merge_parts(
         constraints: manual constraints.
         progress: see `Progress`.
         settings: how they are merged.
+        store: the server's store from which they come: what that server has compared is not compared again.
 
     Raises:
         InvalidValue: a map cannot be merged; writing the others would lose it.
@@ -112,6 +120,11 @@ def merge_parts(
     changes = [
         (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()
     ]
+    if store is not None:
+        VerificationCacheKeeper(store, fresh=True).restore(merger)
+        merger.read(changes)
+        progress(len(changes), len(changes))
+        changes = []
     for k, (map_id, change) in enumerate(changes):
         merger.apply(map_id, change)
         progress(k + 1, len(changes))
@@ -132,4 +145,4 @@ def merge_map_files(paths: Iterable[Path]) -> MapFile:
         InvalidValue: a map cannot be merged.
     """
     parts = parts_of({path: read_map_file(path) for path in paths})
-    return map_file_of(merge_parts(parts.maps, parts.constraints), parts.history)
+    return map_file_of(merge_parts(parts.maps, parts.constraints), parts.history, parts.annotations)

@@ -11,6 +11,7 @@ from mapweave.mapserver.active_nodes import ActiveNodes
 from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.map_file import MapFile
 from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
 from mapweave.vision.sift import Sift
@@ -25,7 +26,11 @@ def relocalizer_of(content: MapFile) -> Relocalizer:
     Raises:
         InvalidFile: the file's measurements determine no poses.
     """
-    merged = merged_of(content)
+    return relocalizer_in(merged_of(content))
+
+
+def relocalizer_in(merged: MergedMap) -> Relocalizer:
+    """A relocalizer that answers from a merged map; see `relocalizer_of`."""
     nodes = {node.id: node for one in merged.maps.values() for node in one.nodes.values()}
     places = PlaceDatabase()
     places.put(nodes.values())

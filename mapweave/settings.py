@@ -21,11 +21,13 @@ class NetworkSettings:
         fleet: name that robots, server and simulator share.
         endpoints: Zenoh endpoints of the router, tried in order. The server listens at them.
         server: name of the map server that must have a change before the agent may forget it.
+        keys: key file of this robot or person; for a server or router the folder of `mapweave keys init`.
     """
 
     fleet: str = "demo"
     endpoints: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     server: str = "s0"
+    keys: str = ""
 
 
 @dataclass(frozen=True)

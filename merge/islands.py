@@ -11,14 +11,16 @@ from dataclasses import replace
 
 import networkx as nx
 
+from mapweave.hybridmap.constraint_subject import RetiredArea
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.merge.manual_constraints import apply_constraints
+from mapweave.merge.manual_constraints import CutMaps, apply_constraints
 from mapweave.merge.merging import MergeCache, decide
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
+from mapweave.merge.retired_nodes import retired_nodes
 from mapweave.merge.settings import MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
 
@@ -45,6 +47,8 @@ class Islands:
         self._merged_islands: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
         self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
         self._constraints = ManualConstraints()
+        self._cut_maps = CutMaps()
+        self._without_areas: Islands | None = None
 
     def merge(
         self,
@@ -65,8 +69,8 @@ class Islands:
         Returns:
             What `merge_maps` makes of all maps; of large islands nearly so.
         """
-        for constraint in {*constraints.in_force} ^ {*self._constraints.in_force}:
-            touched = touched | {end.map if isinstance(end, NodeId) else end for end in constraint.ends}
+        constraints = constraints.with_nodes(self._retired_nodes(maps, verdicts, touched, constraints))
+        touched = touched | _touched_by(self._constraints, constraints)
         islands = self._ties(maps, verdicts, constraints)
         merged_islands: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
         for island in islands:
@@ -92,14 +96,31 @@ class Islands:
         earlier: Sequence[StandingDecisions],
     ) -> tuple[MergedMap, StandingDecisions]:
         links, refused = _sorted_out(verdicts)
-        undone = apply_constraints(maps, links, constraints)
+        undone = apply_constraints(maps, links, constraints, self._cut_maps)
         everything = undone.maps, undone.links, [*refused, *undone.refused], self._settings, self._cache
         small = sum(len(hybrid_map.nodes) for hybrid_map in maps.values()) <= self._exact
         before = None if small or not earlier else StandingDecisions.union(earlier)
-        merged, stands = decide(*everything, before)
+        merged, stands = decide(*everything, before, undone.certain)
         if stands.changed > CHANGED * stands.size:
-            merged, stands = decide(*everything)
+            merged, stands = decide(*everything, None, undone.certain)
         return undone.completed(merged), stands
+
+    def _retired_nodes(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        touched: set[MapId],
+        constraints: ManualConstraints,
+    ) -> dict[NodeId, ManualConstraint]:
+        """Where a retired area lies the merge without retired areas says, so that it does not say itself."""
+        others = [c for c in constraints.made if not isinstance(c.about, RetiredArea)]
+        if not any(isinstance(c.about, RetiredArea) for c in constraints.in_force):
+            self._without_areas = None
+            return retired_nodes(maps, constraints, ())
+        if self._without_areas is None:
+            self._without_areas = Islands(self._settings, self._exact)
+        graphs = self._without_areas.merge(maps, verdicts, touched, ManualConstraints(others)).graphs
+        return retired_nodes(maps, constraints, graphs)
 
     def _ties(
         self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, constraints: ManualConstraints
@@ -108,6 +129,8 @@ class Islands:
         ties: nx.Graph = nx.Graph()
         ties.add_nodes_from(maps)
         ties.add_edges_from(verdicts.ties(constraints))
+        by_hand = ((a.map, b.map) for a, b in constraints.links)
+        ties.add_edges_from(pair for pair in by_hand if pair[0] in maps and pair[1] in maps)
         for map_id, hybrid_map in maps.items():
             entry = self._abroad.get(map_id)
             if entry is None or entry[0] is not hybrid_map:
@@ -116,6 +139,13 @@ class Islands:
             ties.add_edges_from((map_id, neighbour) for neighbour in entry[1])
         parts = (frozenset(part & maps.keys()) for part in nx.connected_components(ties))
         return sorted((island for island in parts if island), key=min)
+
+
+def _touched_by(before: ManualConstraints, now: ManualConstraints) -> set[MapId]:
+    """Maps of which constraints have changed."""
+    maps = {which for c in {*before.in_force} ^ {*now.in_force} for which in c.about.maps}
+    retired = before.nodes.keys() | now.nodes.keys()
+    return maps | {node.map for node in retired if before.nodes.get(node) is not now.nodes.get(node)}
 
 
 def _sorted_out(verdicts: Iterable[Verdict]) -> tuple[list[Link], list[RefusedLink]]:
@@ -154,4 +184,5 @@ def _together(
     refused.sort(key=lambda refusal: refusal.pair)
     components = tuple(component for _, component in graphs)
     whole = MergedMap(dict(sorted(maps.items())), tuple(links), tuple(refused), components, poses, solved)
-    return replace(whole, constraints=constraints)
+    contradicted = {pair: words for merged in islands for pair, words in merged.contradicted.items()}
+    return replace(whole, constraints=constraints, contradicted=contradicted)

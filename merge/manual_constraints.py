@@ -1,18 +1,25 @@
-"""Apply manual constraints: excluded links take no part in the merge; refusals say who, when and why."""
+"""Apply manual constraints: what is excluded takes no part in the merge; refusals say who, when and why."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
 
 from mapweave.hybridmap.change import EdgePut
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.manual_constraint import ManualConstraints, reason_of
+from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse, refuse_edge
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.retired_nodes import without_nodes
+
+BY_HAND = "by_hand"
+"""Name among the evidence of a link that a person has made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,15 +27,17 @@ class AppliedConstraints:
     """What is left to merge.
 
     Attributes:
-        maps: without the edges that are excluded; maps with none of these are the very same objects.
+        maps: without what is excluded; maps with none of this are the very same objects.
         links: without those that are excluded.
+        certain: links by hand.
         refused: what was taken away, with reasons.
         whole: the maps as they came.
-        constraints: manual constraints, in force or not.
+        constraints: manual constraints, in force or not, with the nodes that they retire.
     """
 
     maps: Mapping[MapId, HybridMap]
     links: tuple[Link, ...]
+    certain: tuple[Link, ...]
     refused: tuple[RefusedLink, ...]
     whole: Mapping[MapId, HybridMap]
     constraints: ManualConstraints
@@ -42,103 +51,98 @@ class AppliedConstraints:
         return replace(merged, maps=dict(sorted(self.whole.items())), constraints=self.constraints)
 
 
-def apply_constraints(
-    maps: Mapping[MapId, HybridMap], links: Iterable[Link], constraints: ManualConstraints
-) -> AppliedConstraints:
-    """Remove what is excluded: retired maps, links, and a robot's own loop closures.
+@dataclass(frozen=True, eq=False)
+class CutMaps:
+    """Maps without what constraints exclude, made once: later merges know a map by its identity.
 
-    Drives and turns that a robot measured while it mapped are kept.
+    Attributes:
+        made: by map: the whole map, what is excluded of it, and the map that is left.
+    """
+
+    made: dict[MapId, tuple[HybridMap, frozenset[NodeId], frozenset[EdgeId], HybridMap]] = field(
+        default_factory=dict
+    )
+
+    def without(self, whole: HybridMap, nodes: frozenset[NodeId], edges: frozenset[EdgeId]) -> HybridMap:
+        """A map without some nodes and edges; at least one."""
+        which = min(nodes or edges).map
+        known = self.made.get(which)
+        if known is None or known[0] is not whole or known[1:3] != (nodes, edges):
+            left = without_nodes(whole, nodes) if nodes else whole
+            if edges:
+                left = HybridMap(
+                    change
+                    for change in left.contents()
+                    if not (isinstance(change, EdgePut) and change.edge.id in edges)
+                )
+            known = self.made[which] = whole, nodes, edges, left
+        return known[3]
+
+
+@lru_cache(maxsize=4096)
+def link_by_hand(linked: Linked) -> Link:
+    """The link that a person has made: for one constraint always the same object."""
+    shared = np.array(linked.shared, np.int64).reshape(-1, 2)
+    return Link(linked.a, linked.b, linked.a_from_b, shared, {**dict(linked.evidence), BY_HAND: 1.0})
+
+
+def apply_constraints(
+    maps: Mapping[MapId, HybridMap],
+    links: Iterable[Link],
+    constraints: ManualConstraints,
+    cut_maps: CutMaps | None = None,
+) -> AppliedConstraints:
+    """Remove what is excluded: retired maps and nodes, links, and a robot's own loop closures.
+
+    Drives and turns that a robot measured while it mapped are kept, also across retired nodes (see
+    mapweave.merge.retired_nodes). Links by hand take the place of what was verified of their nodes.
 
     Args:
         maps: by id; they are not changed.
         links: verified.
-        constraints: manual constraints.
+        constraints: manual constraints, with the nodes that they retire.
+        cut_maps: of merges before; it is filled.
     """
     if not constraints.in_force:
-        return AppliedConstraints(maps, tuple(links), (), maps, constraints)
+        return AppliedConstraints(maps, tuple(links), (), (), maps, constraints)
+    cut_maps = cut_maps or CutMaps()
+    by_hand = {
+        pair: _with_landmarks(link_by_hand(linked), maps)
+        for pair, linked in constraints.links.items()
+        if all(node.map in maps and node in maps[node.map].nodes for node in pair)
+    }
     kept: list[Link] = []
     refused: list[RefusedLink] = []
     for link in links:
         constraint = constraints.against(*link.pair)
-        if constraint is None:
-            kept.append(link)
-        else:
+        if constraint is not None:
             refused.append(refuse(link, reason_of(constraint)))
-    retired = constraints.retired
-    left = {map_id: hybrid_map for map_id, hybrid_map in maps.items() if map_id not in retired}
-    kept = [link for link in kept if link.a.map not in retired and link.b.map not in retired]
+        elif link.key not in by_hand:
+            kept.append(link)
+    left = {map_id: hybrid_map for map_id, hybrid_map in maps.items() if map_id not in constraints.retired}
+    nodes_of: dict[MapId, set[NodeId]] = {}
+    for node in constraints.nodes:
+        nodes_of.setdefault(node.map, set()).add(node)
     for map_id, hybrid_map in tuple(left.items()):
+        nodes = frozenset(nodes_of.get(map_id, ()))
         out = [
             (edge, constraint)
             for edge in hybrid_map.edges.values()
             if edge.kind in CLAIMS and (constraint := constraints.against(edge.a, edge.b)) is not None
         ]
-        if out:
-            removed = {edge.id for edge, _ in out}
-            refused += [refuse_edge(edge, reason_of(constraint)) for edge, constraint in out]
-            left[map_id] = HybridMap(
-                change
-                for change in hybrid_map.contents()
-                if not (isinstance(change, EdgePut) and change.edge.id in removed)
-            )
-    return AppliedConstraints(left, tuple(kept), tuple(refused), maps, constraints)
+        refused += [refuse_edge(edge, reason_of(constraint)) for edge, constraint in out]
+        edges = frozenset(edge.id for edge, _ in out)
+        if nodes or edges:
+            left[map_id] = cut_maps.without(hybrid_map, nodes, edges)
+    return AppliedConstraints(left, tuple(kept), tuple(by_hand.values()), tuple(refused), maps, constraints)
 
 
-def check_manual_constraint(
-    merged: MergedMap,
-    constraints: ManualConstraints,
-    constraint: ManualConstraint,
-    existing_maps: Container[MapId] = (),
-) -> None:
-    """Refuse a constraint that would change nothing: it is a mistake.
-
-    Args:
-        merged: what it is made about.
-        constraints: earlier constraints, merged already or not.
-        constraint: the new one.
-        existing_maps: that are there, in the merged map or not: any of them can be retired.
-
-    Raises:
-        InvalidValue: there is nothing to undo, or nothing to take back.
-    """
-    first, second = constraint.ends
-    in_force = next((r for r in constraints.in_force if r.ends == constraint.ends), None)
-    if constraint.retires is not None:
-        if constraint.retires not in existing_maps:
-            merged.check(constraint.retires)
-        _check_retirement(in_force, constraint, constraint.retires)
-        return
-    if not constraint.apart:
-        if in_force is None:
-            raise InvalidValue(f"no manual constraint keeps {first} and {second} apart")
-        return
-    if in_force is not None:
-        raise InvalidValue(f"{first} and {second} are apart already: {reason_of(in_force)}")
-    for end in (first, second):
-        merged.check(end)
-    pairs = [link.pair for link in merged.links]
-    false = {refusal.edge for refusal in merged.refused}
-    pairs += [
-        (edge.a, edge.b)
-        for hybrid_map in merged.maps.values()
-        for edge in hybrid_map.edges.values()
-        if edge.kind in CLAIMS and edge.id not in false
-    ]
-    for a, b in pairs:
-        if {a, b} == {first, second} or {a.map, b.map} == {first, second}:
-            return
-    for edge in merged.maps[MapId(*first[:2])].edges.values():
-        if {edge.a, edge.b} == {first, second} and edge.kind not in CLAIMS:
-            way = f"their robot's way (edge {edge.id}, {edge.kind})"
-            raise InvalidValue(
-                f"{first} and {second} are joined by {way}, and that measurement cannot be undone; a map "
-                "that is wrong as a whole can be retired"
-            )
-    raise InvalidValue(f"no link joins {first} and {second}: there is nothing to undo")
+@lru_cache(maxsize=4096)
+def _without_landmarks(link: Link) -> Link:
+    return replace(link, shared=np.zeros((0, 2), np.int64))
 
 
-def _check_retirement(in_force: ManualConstraint | None, constraint: ManualConstraint, which: MapId) -> None:
-    if constraint.apart and in_force is not None:
-        raise InvalidValue(f"map {which} is retired already: {reason_of(in_force)}")
-    if not constraint.apart and in_force is None:
-        raise InvalidValue(f"map {which} is not retired")
+def _with_landmarks(link: Link, maps: Mapping[MapId, HybridMap]) -> Link:
+    """A link by hand without its landmarks, where a node no longer has as many."""
+    counts = [len(maps[node.map].nodes[node].landmarks) for node in link.pair]
+    return link if (link.shared < counts).all() else _without_landmarks(link)

@@ -8,10 +8,13 @@
 5. Where two robots would have been at the same place at the same time, the links that cause this are
    refuted, and the merge continues at 2 with the rest.
 6. Drives of a robot among others' nodes are checked against the result.
+
+Links by hand join pieces before all others, and never fall. What contradicts them is reported.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
@@ -24,6 +27,7 @@ from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
+from mapweave.merge.outlier_rejection.link_probability import standpoints
 from mapweave.merge.outlier_rejection.readmission import readmitted
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
@@ -31,7 +35,7 @@ from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
-from mapweave.merge.settings import MergeSettings
+from mapweave.merge.settings import ConsistencySettings, MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
 
 
@@ -75,6 +79,7 @@ def decide(
     settings: MergeSettings,
     cache: MergeCache,
     before: StandingDecisions | None = None,
+    certain: Iterable[Link] = (),
 ) -> tuple[MergedMap, StandingDecisions]:
     """Merge, and return the decisions, so that the next merge can begin from them.
 
@@ -86,6 +91,7 @@ def decide(
         cache: of merges with the same settings.
         before: standing decisions on the same maps. A link keeps its decision until links between the same
             two maps come or go; None: all are decided.
+        certain: links by hand, the smaller id first; none of `links` is between the same two nodes.
 
     Returns:
         The merged map, and the standing decisions.
@@ -94,12 +100,14 @@ def decide(
     fragments = cache.decisions.fragments(maps, s.consistency)
     solver = ComponentSolver(fragments)
     by_node = solver.by_node
-    given = {link.pair: link for link in links if link.a in by_node and link.b in by_node}
+    by_hand = {link.pair: link for link in certain if link.a in by_node and link.b in by_node}
+    given = {link.pair: link for link in links if link.a in by_node and link.b in by_node} | by_hand
     standing = before or StandingDecisions()
     unchanged = {pair for pair, link in given.items() if standing.given.get(pair) is link}
     news = (given.keys() - unchanged) | (standing.given.keys() - unchanged)
     fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
-    weighed = _weighed(given, standing, unchanged, fresh, by_node, maps, cache.decisions, s)
+    others = {pair: link for pair, link in given.items() if pair not in by_hand}
+    weighed = _weighed(others, standing, unchanged, fresh, by_node, maps, cache.decisions, s) | by_hand
     held = [link for pair, link in weighed.items() if pair in standing.believed and pair in unchanged]
     refuted = standing.refuted & unchanged
     closed = {
@@ -110,13 +118,17 @@ def decide(
     if before is not None:
         removed = [standing.weighed[pair] for pair in standing.believed - unchanged]
         solver.resume(standing.graphs, standing.fragments, held, removed)
+    held += [link for pair, link in by_hand.items() if pair not in unchanged]
     refutation = Refutation(maps, fragments, s.exclusion, cache.trajectories)
-    open_ = [link for pair, link in weighed.items() if pair not in refuted]
+    open_ = [weighed[pair] for pair in others if pair not in refuted]
+    contradicted = {pair: words for pair, words in standing.contradicted.items() if pair in unchanged}
     groups = cache.decisions.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
     # Each round refutes a link at least, so there is a last one.
     while True:
         solved, kept, unjoined = _joined(solver, groups, held, closed, s, whole=before is None)
-        impossible = refutation.impossible(solved, kept, None if before is None else solver.changed)
+        changed = None if before is None else solver.changed
+        impossible, against_hand = refutation.impossible(solved, kept, changed, by_hand)
+        contradicted |= against_hand
         if not impossible:
             break
         for key, reason in impossible.items():
@@ -127,7 +139,8 @@ def decide(
     refutations = {r.pair: r for group in groups.values() for r in group.refuted}
     because = {pair: standing.refused[pair] for pair in closed | refuted}
     because |= {r.pair: r for r in unjoined} | refutations
-    refusals = [r for r in refused if r.a in by_node and r.b in by_node] + list(because.values())
+    refusals = [r for r in refused if r.a in by_node and r.b in by_node and r.pair not in by_hand]
+    refusals += because.values()
     refusals += [r for fragment in fragments for r in fragment.refused]
     refusals += refuse_drives(maps, solved, s.consistency)
     merged = MergedMap(
@@ -137,6 +150,7 @@ def decide(
         tuple(frozenset(graph.nodes) for graph in solved),
         Poses(solved),
         tuple(solved),
+        contradicted=_contradicted(solved, list(by_hand.values()), s.consistency) | contradicted,
     )
     return merged, StandingDecisions(
         given,
@@ -146,9 +160,24 @@ def decide(
         frozenset(refuted | refutations.keys()),
         merged.graphs,
         tuple(fragments),
+        contradicted,
         len(given) if before is None else standing.size,
         0 if before is None else standing.changed + len(news),
     )
+
+
+def _contradicted(
+    solved: Sequence[PoseGraph], by_hand: Sequence[Link], s: ConsistencySettings
+) -> dict[Pair, str]:
+    """Links by hand that the rest of the map puts elsewhere, and where."""
+    out = {}
+    for graph in solved if by_hand else ():
+        inside = [link for link in by_hand if link.a in graph.rows]
+        for link, standpoint in zip(inside, standpoints(inside, graph, kept=True), strict=True):
+            if standpoint.distance2 > s.gate:
+                sigmas = math.sqrt(standpoint.distance2)
+                out[link.pair] = f"the rest of the map contradicts it by {sigmas:.1f} standard deviations"
+    return out
 
 
 def _joined(

@@ -28,6 +28,7 @@ class StandingDecisions:
         refuted: those of them that mutual exclusion refutes.
         graphs: the components.
         fragments: the pieces of map that these are made of.
+        contradicted: links by hand that mutual exclusion contradicts, and how.
         size: links that there were when all were decided together.
         changed: links that have come or gone since.
     """
@@ -39,6 +40,7 @@ class StandingDecisions:
     refuted: frozenset[Pair] = frozenset()
     graphs: tuple[PoseGraph, ...] = ()
     fragments: tuple[Fragment, ...] = ()
+    contradicted: Mapping[Pair, str] = field(default_factory=dict)
     size: int = 0
     changed: int = 0
 
@@ -62,6 +64,7 @@ class StandingDecisions:
             frozenset().union(*(decisions.refuted for decisions in some)),
             tuple(graph for decisions in some for graph in decisions.graphs),
             tuple(fragment for decisions in some for fragment in decisions.fragments),
+            {pair: words for decisions in some for pair, words in decisions.contradicted.items()},
             sum(decisions.size for decisions in some),
             sum(decisions.changed for decisions in some),
         )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.storage.database_reader import reading
 
 
 class Database:
@@ -26,6 +27,7 @@ class Database:
         schema: str,
         repair: Callable[[sqlite3.Connection], None] | None = None,
         advice: str = "",
+        read_only: bool = False,
     ) -> None:
         """Open the file, or make it.
 
@@ -37,6 +39,7 @@ class Database:
             schema: SQL that makes the tables of a new file.
             repair: called before the check of the file's pages; may take out rows that are damaged.
             advice: what to do about a damaged file, for people; appended to the reason.
+            read_only: change nothing, neither the file nor its folder; the file must be there.
 
         Raises:
             InvalidFile: damaged, of another kind or version, in use, or not readable.
@@ -46,19 +49,28 @@ class Database:
         self.what = kind
         self._repair = repair
         self._advice = f"; {advice}" if advice else ""
+        self._closing = ExitStack()
         with self.guard():
-            # Threads take turns: a shared Database is used under the caller's lock.
-            self.connection = sqlite3.connect(
-                path, timeout=5.0, isolation_level=None, check_same_thread=False
-            )
+            if read_only:
+                self.connection = self._closing.enter_context(reading(path, kind))
+            else:
+                # Threads take turns: a shared Database is used under the caller's lock.
+                self.connection = sqlite3.connect(
+                    path, timeout=5.0, isolation_level=None, check_same_thread=False
+                )
+        self._closing.callback(self.connection.close)
         # Text with a flipped bit may be no UTF-8; its meaning is checked by the reader.
         self.connection.text_factory = lambda data: data.decode("utf-8", "replace")
         try:
             with self.guard():
-                self._prepare(application_id, version, schema)
+                if read_only:
+                    self._check_kind(application_id, version)
+                else:
+                    self._prepare(application_id, version, schema)
+                self._check_pages()
             self._inode = self._inode_now()
         except BaseException:
-            self.connection.close()
+            self._closing.close()
             raise
 
     def _inode_now(self) -> tuple[int, int] | None:
@@ -82,6 +94,9 @@ class Database:
                 raise self._damaged(str(error)) from None
             advice = self._advice if code == sqlite3.SQLITE_NOTADB else ""
             raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error}){advice}") from None
+        except UnicodeDecodeError:
+            # SQLite quotes a damaged schema in its error, which then is no text.
+            raise self._damaged("its schema is no text") from None
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
@@ -108,21 +123,15 @@ class Database:
 
     def close(self) -> None:
         """Close the file. Idempotent."""
-        self.connection.close()
+        self._closing.close()
 
     def _prepare(self, application_id: int, version: int, schema: str) -> None:
         run = self.connection.execute
         run("PRAGMA locking_mode=EXCLUSIVE")
         run("PRAGMA synchronous=FULL")
-        kind = run("PRAGMA application_id").fetchone()[0]
         empty = run("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
-        if not empty and kind != application_id:
-            raise InvalidFile(f"{self.path}: is not a Mapweave {self.what}")
-        stored_version = run("PRAGMA user_version").fetchone()[0]
-        if not empty and stored_version != version:
-            raise InvalidFile(
-                f"{self.path}: {self.what} of format {stored_version}, this program uses {version}"
-            )
+        if not empty:
+            self._check_kind(application_id, version)
         run("PRAGMA journal_mode=WAL")
         if empty:
             run("BEGIN IMMEDIATE")
@@ -133,8 +142,20 @@ class Database:
             run("COMMIT")
         if self._repair is not None and not empty:
             self._repair(self.connection)
+
+    def _check_kind(self, application_id: int, version: int) -> None:
+        run = self.connection.execute
+        if run("PRAGMA application_id").fetchone()[0] != application_id:
+            raise InvalidFile(f"{self.path}: is not a Mapweave {self.what}")
+        stored_version = run("PRAGMA user_version").fetchone()[0]
+        if stored_version != version:
+            raise InvalidFile(
+                f"{self.path}: {self.what} of format {stored_version}, this program uses {version}"
+            )
+
+    def _check_pages(self) -> None:
         # A message that begins with the file's name may have two lines; the second gives the reason.
-        damage = str(run("PRAGMA quick_check(1)").fetchone()[0])
+        damage = str(self.connection.execute("PRAGMA quick_check(1)").fetchone()[0])
         if damage != "ok":
             raise self._damaged(damage.splitlines()[-1])
 

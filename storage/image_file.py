@@ -20,6 +20,7 @@ MAX_SEGMENTS = 1024
 """Segments of a JPEG before its image. Phones write tens; Exif and colour profiles at most 255 each."""
 MAX_SCANS = 20
 """Scans of a progressive JPEG. Encoders write about ten; each one costs a pass over all pixels."""
+PNG = b"\x89PNG\r\n\x1a\n"
 PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 
 
@@ -87,6 +88,8 @@ def check_cost(data: bytes) -> None:
         raise InvalidValue(f"an image of {width}x{height} px is too large, at most {MAX_PIXELS} are taken")
     if data.startswith(b"\xff\xd8") and data.count(b"\xff\xda") > MAX_SCANS:
         raise InvalidValue(f"a JPEG of more than {MAX_SCANS} scans takes too long to decode")
+    if data.startswith(PNG):
+        _check_chunks(data)
 
 
 def image_size(data: bytes) -> tuple[int, int]:
@@ -95,7 +98,7 @@ def image_size(data: bytes) -> tuple[int, int]:
     Raises:
         InvalidValue: it is no PNG, JPEG, PGM or BMP.
     """
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 24:
+    if data.startswith(PNG) and len(data) >= 24:
         width, height = struct.unpack(">II", data[16:24])
         return width, height
     if data.startswith(b"BM") and len(data) >= 26:
@@ -106,6 +109,18 @@ def image_size(data: bytes) -> tuple[int, int]:
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
     raise InvalidValue("send a JPEG or PNG image")
+
+
+def _check_chunks(data: bytes) -> None:
+    """Refuse a PNG with a chunk that is longer than the file: the decoder takes so much memory first."""
+    at = len(PNG)
+    while at < len(data):
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if end > len(data):
+            raise InvalidValue("the image is damaged")
+        if data[at + 4 : at + 8] == b"IEND":
+            return
+        at = end
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:

@@ -26,6 +26,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.annotation import Annotation
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import Number, Words
@@ -79,6 +80,7 @@ class MapFile:
         superseded: of a merged map: superseded nodes.
         faded: of a merged map: (N,) which of a node's N landmarks are faded.
         history: of a merged map: what has become of its maps by itself, in order.
+        annotations: what people say about the map, in order.
     """
 
     kind: Kind
@@ -90,6 +92,7 @@ class MapFile:
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     history: tuple[MapEvent, ...] = ()
+    annotations: tuple[Annotation, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse faded landmarks that the nodes do not have (InvalidValue)."""

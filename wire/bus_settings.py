@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from dataclasses import dataclass
 from typing import Literal
 
 from mapweave.hybridmap.errors import SettingsError
+from mapweave.wire.credentials import Access, Credentials
 
 RETRY_FIRST = 0.1
 """Pause before the second attempt to connect, s; doubled each time."""
@@ -25,6 +27,15 @@ ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/\S+:\d+(\?\S*)?(#\S*)?")
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
+def is_loopback(endpoint: str) -> bool:
+    """Whether only this machine reaches an endpoint."""
+    host = endpoint.partition("/")[2].partition("?")[0].rpartition(":")[0].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 @dataclass(frozen=True, slots=True)
 class BusSettings:
     """How a bus connects.
@@ -35,6 +46,9 @@ class BusSettings:
         listen: where a router waits for clients.
         session: id of the Zenoh session, hexadecimal; empty for a random one.
         timestamps: whether what is published gets a time, without which nothing is kept for late subscribers.
+        credentials: prove who this is; None on this machine alone.
+        access: who is admitted by a router, and to what; None: all clients to everything.
+        fleet: of the rules of `access`.
     """
 
     mode: Literal["client", "router"] = "client"
@@ -42,6 +56,9 @@ class BusSettings:
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     session: str = ""
     timestamps: bool = False
+    credentials: Credentials | None = None
+    access: Access | None = None
+    fleet: str = "demo"
 
     def __post_init__(self) -> None:
         """Refuse what cannot work.
@@ -57,3 +74,14 @@ class BusSettings:
         for endpoint in used:
             if not ENDPOINT.fullmatch(endpoint):
                 raise SettingsError(f"endpoint {endpoint!r}: endpoints look like {DEFAULT_ENDPOINT}")
+            if self.mode == "router" and self.credentials is None and not is_loopback(endpoint):
+                raise SettingsError(
+                    f"without keys a router listens on this machine alone, not at {endpoint}: make keys with "
+                    "`mapweave keys init`, and give them with --keys"
+                )
+            if (
+                self.credentials is not None
+                and self.credentials.certified
+                and not endpoint.startswith("tls/")
+            ):
+                raise SettingsError(f"endpoint {endpoint!r}: with certificates endpoints begin with tls/")

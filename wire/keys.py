@@ -9,8 +9,8 @@
     mapweave/1/<fleet>/agent/<agent>/drive            question: a person's velocity command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
-    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain and
-                                                      history
+    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain,
+                                                      constraints, annotate, annotations, resolve and history
     mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
@@ -208,6 +208,38 @@ class Keys:
     def any_constrain(self) -> str:
         """Pattern: every server of the fleet."""
         return f"{self.root}/server/*/constrain"
+
+    def annotate(self, server: str) -> str:
+        """Annotations to a server."""
+        return self._of_server("annotate", server)
+
+    def any_annotate(self) -> str:
+        """Pattern: every server of the fleet."""
+        return f"{self.root}/server/*/annotate"
+
+    def annotations(self, server: str) -> str:
+        """The record of annotations, from a server."""
+        return self._of_server("annotations", server)
+
+    def any_annotations(self) -> str:
+        """Pattern: every server of the fleet."""
+        return f"{self.root}/server/*/annotations"
+
+    def resolve(self, server: str) -> str:
+        """Which nodes names and positions are, by a server."""
+        return self._of_server("resolve", server)
+
+    def any_resolve(self) -> str:
+        """Pattern: every server of the fleet."""
+        return f"{self.root}/server/*/resolve"
+
+    def constraints(self, server: str) -> str:
+        """The record of manual constraints of a server."""
+        return self._of_server("constraints", server)
+
+    def any_constraints(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/constraints"
 
     def history(self, server: str) -> str:
         """The history of the maps, from a server."""

@@ -12,12 +12,13 @@ from typing import Any, TypeVar
 import msgspec
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
-from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import (
     MAX_CANDIDATES,
     MAX_KNOWN,
@@ -27,6 +28,8 @@ from mapweave.hybridmap.query import (
     RelocalizeAnswer,
     ReserveAnswer,
     ReserveRequest,
+    ResolveAnswer,
+    ResolveRequest,
     RouteAnswer,
     RouteRequest,
     View,
@@ -49,12 +52,14 @@ class KeptHistory:
         parts: maps that were one when it was written, each in one set.
         apart: pairs of maps that are reported as kept apart.
         set_apart: maps that are reported as set apart.
+        contradicted: links by hand that are reported as contradicted.
     """
 
     events: tuple[MapEvent, ...] = ()
     parts: tuple[frozenset[MapId], ...] = ()
     apart: frozenset[tuple[MapId, MapId]] = frozenset()
     set_apart: frozenset[MapId] = frozenset()
+    contradicted: frozenset[tuple[NodeId, NodeId]] = frozenset()
 
 
 VIEW = Limit("view", MAX_LANDMARKS_BYTES + 256)
@@ -71,7 +76,14 @@ LIMITS: dict[type, Limit] = {
     PairExplanation: Limit("explanation", 2 * MAX_BODY_BYTES + 4_000_000, 200_000),
     FleetExplanation: Limit("explanation", 8_000_000, 500_000),
     RouteExplanation: Limit("explanation of a route", 16_000_000, 200_000),
-    ManualConstraint: Limit("manual constraint", 4096),
+    # A link has up to 150 pairs of landmarks, a retirement up to 1000 nodes.
+    ManualConstraint: Limit("manual constraint", 2**16, 8192),
+    ConstraintRequest: Limit("manual constraint", 2**16, 8192),
+    ConstraintList: Limit("manual constraints", 2**26, 2_000_000),
+    Annotation: Limit("annotation", 2**16),
+    Annotations: Limit("annotations", 2**26, 4_000_000),
+    ResolveRequest: Limit("resolve request", 2**14),
+    ResolveAnswer: Limit("resolved places", 2**16),
     History: Limit("history", 2**26, 1_000_000),
     AgentStatus: Limit("agent status", 2**15),
     DriveRequest: Limit("drive request", 256),

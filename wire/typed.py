@@ -4,7 +4,8 @@
 value. `msgspec.convert` checks every type and range; a value checks what else it requires when it is created.
 
 Some types have their own form, see docs/wire.md: poses are 36 bytes, a node is the body of its change, an
-array is `[kind, shape, bytes]`, a map with node ids as keys is a list of pairs.
+array is `[kind, shape, bytes]`, a map with node ids as keys is a list of pairs. Of dataclasses that represent
+each other (`A | B`) each has a `TAG`, which travels as the field `kind`.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.annotation import BODIES, MAX_ANNOTATIONS, Annotation
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.limits import MAX_FLOAT, Coordinate
-from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -78,6 +80,18 @@ def _events(events: list[dict[str, Any]]) -> tuple[MapEvent, ...]:
     return tuple(_convert(event, _schema(MapEvent)) for event in read)
 
 
+def _annotations(entries: list[dict[str, Any]]) -> tuple[Annotation, ...]:
+    """Skips annotations of unknown kinds: a newer program may have written them."""
+    bodies = [entry.get("body") for entry in entries]
+    newer = [
+        isinstance(body, dict) and isinstance(body.get("kind"), str) and body["kind"] not in BODIES
+        for body in bodies
+    ]
+    return tuple(
+        _convert(entry, _schema(Annotation)) for entry, skip in zip(entries, newer, strict=True) if not skip
+    )
+
+
 def _distortion(plain: list[float] | dict[str, Any]) -> Distortion:
     return _convert(plain, _schema(Equidistant if isinstance(plain, dict) else RadialTangential))  # type: ignore[no-any-return]
 
@@ -92,6 +106,9 @@ FORMS: dict[Any, Form] = {
     Ends: Form(tuple[list[Any], list[Any]], _ends),
     Distortion: Form(list[float] | dict[str, Any], _distortion),
     tuple[MapEvent, ...]: Form(list[dict[str, Any]], _events),
+    tuple[Annotation, ...]: Form(
+        Annotated[list[dict[str, Any]], Meta(max_length=MAX_ANNOTATIONS)], _annotations
+    ),
 }
 PACKERS: Packers = {
     PoseGaussian: pack_pose,
@@ -117,7 +134,8 @@ def packed(value: Any, packers: Packers = PACKERS) -> Any:
     if (pack_value := packers.get(type(value))) is not None:
         return pack_value(value)
     if is_dataclass(value):
-        return {field.name: packed(getattr(value, field.name), packers) for field in fields(value)}
+        tag = {"kind": value.TAG} if hasattr(value, "TAG") else {}
+        return tag | {field.name: packed(getattr(value, field.name), packers) for field in fields(value)}
     match value:
         case msgspec.Struct():
             return msgspec.to_builtins(value, builtin_types=(bytes,))
@@ -164,6 +182,20 @@ def decode(data: bytes, kind: type[Value], limit: Limit) -> Value:
     return value
 
 
+def value_of(plain: Any, kind: type[Value]) -> Value:
+    """A value of plain data, as `packed` returns it.
+
+    Raises:
+        InvalidValue: something is missing, of another type or out of range.
+    """
+    schema: Any = kind
+    try:
+        value: Value = _convert(plain, _schema(schema))
+    except msgspec.ValidationError as error:
+        raise InvalidValue(str(error).splitlines()[0]) from None
+    return value
+
+
 class _Opaque(type):
     """Metaclass of types that msgspec passes to `_read`. It accepts every value that `_read` returns."""
 
@@ -194,6 +226,8 @@ def _schema(kind: Any) -> Any:
         members = [member for member in inner if member is not NoneType]
         if len(members) < len(inner):
             return _schema(reduce(or_, members)) | None
+        if all(hasattr(member, "TAG") for member in members):
+            return _opaque(kind)
         return reduce(or_, map(_schema, members))
     return origin[tuple(member if member is ... else _schema(member) for member in inner)]
 
@@ -225,6 +259,8 @@ def _value(kind: Any, plain: Any) -> Any:
     if kind in FORMS:
         form = FORMS[kind]
         return form.read(_convert(plain, form.plain))
+    if get_origin(kind) in (Union, UnionType):
+        kind = _tagged(kind, plain)
     if is_dataclass(kind):
         make: Any = kind
         read = _convert(plain, _fields(make))
@@ -234,6 +270,15 @@ def _value(kind: Any, plain: Any) -> Any:
     pair: Any = tuple[tuple(map(_schema, get_args(kind)))]  # type: ignore[misc]
     # An empty map is packed as a map: the type of its keys is unknown.
     return dict(_convert(plain, list[pair] | _EmptyMap))
+
+
+def _tagged(kind: Any, plain: Any) -> Any:
+    """The member of a union that a tag names."""
+    members = {member.TAG: member for member in get_args(kind)}
+    tag = plain.get("kind") if isinstance(plain, dict) else None
+    if not isinstance(tag, str) or tag not in members:
+        raise InvalidValue(f"`kind` must be one of {', '.join(members)}")
+    return members[tag]
 
 
 _EmptyMap = Annotated[dict[str, Any], Meta(max_length=0)]

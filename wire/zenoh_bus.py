@@ -29,6 +29,8 @@ from mapweave.wire.zenoh_entities import Declared, Owner, Service, Subscription,
 log = logging.getLogger(__name__)
 
 _D = TypeVar("_D", bound=Declared)
+REFUSALS = "off,zenoh_link_tls=warn,zenoh_transport=warn"
+"""What of Zenoh's own log a router with keys shows."""
 
 
 class ZenohBus:
@@ -53,8 +55,10 @@ class ZenohBus:
         self._in_use = 0
         self._in_use_changed = threading.Condition()
         self._connecting = threading.Thread(target=self._connect, name="zenoh-connect", daemon=True)
+        self._links: list[object] = []
         if self._settings.mode == "router":
             self._session = _open_router(self._settings)
+            self._watch_links(self._session)
         self.owner = Owner(Dispatcher(f"zenoh-{self._settings.mode}", QUEUE_LIMIT))
         exit_closing.remember(self)
         if self._session is None:
@@ -125,6 +129,30 @@ class ZenohBus:
             self._closed.wait(0.01)
         return self.connected()
 
+    def reopen(self, settings: BusSettings) -> None:
+        """Open a router again with other settings, for example other access rules, which Zenoh reads once.
+
+        Its clients connect again by themselves. What is published meanwhile is lost, as without a connection.
+
+        Raises:
+            NotConnected: it cannot listen any more, or is closed.
+        """
+        with self.owner.lock:
+            if self._closed.is_set():
+                raise NotConnected("this bus is closed")
+            session, self._session = self._session, None
+            for entity in self.owner.declared:
+                entity.detach()
+            with self._in_use_changed:
+                self._in_use_changed.wait_for(lambda: self._in_use == 0)
+            if session is not None:
+                session.close()  # type: ignore[no-untyped-call]
+            session = _open_router(settings)
+            for entity in self.owner.declared:
+                entity.declare(session)
+            self._settings, self._session = settings, session
+            self._watch_links(session)
+
     def close(self) -> None:
         """Take everything back and disconnect."""
         with self.owner.lock:
@@ -178,6 +206,33 @@ class ZenohBus:
                 declared.declare(self._session)
         return declared
 
+    def _watch_links(self, session: zenoh.Session) -> None:
+        """Log who connects, and who is denied everything."""
+        access = self._settings.access
+        if access is None:
+            return
+        members = {member.subject: member for member in access.members}
+        revoked = dict(access.revoked)
+        known: set[str] = set()
+
+        def report(event: zenoh.LinkEvent) -> None:
+            subject, where = event.link.auth_identifier or "a client without a name", str(event.link.dst)
+            if event.kind == zenoh.SampleKind.DELETE:
+                known.discard(where)
+                log.info("%s at %s disconnects", subject, where)
+                return
+            if where in known:
+                return
+            known.add(where)
+            if subject in members:
+                log.info("%s %s connects from %s", members[subject].role, members[subject].name, where)
+            elif subject in revoked:
+                log.warning("refused: %s at %s: this key was revoked %s", subject, where, revoked[subject])
+            else:
+                log.warning("refused: %s at %s: no identity of this fleet", subject, where)
+
+        self._links = [session.info.declare_link_events_listener(report)]
+
     def _connect(self) -> None:
         """Try until there is a router, then declare what was asked for in the meantime."""
         config = _config(self._settings)
@@ -210,6 +265,9 @@ class ZenohBus:
 
 
 def _open_router(settings: BusSettings) -> zenoh.Session:
+    if settings.access is not None:
+        # Zenoh itself says why it refuses a handshake: a foreign authority, no certificate, a wrong password.
+        zenoh.init_log_from_env_or(REFUSALS)
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import base64
+
+from mapweave.wire.access_rules import access_control
 from mapweave.wire.bus_settings import LEASE, RETRY_FIRST, RETRY_LONGEST, ROUTER_QUEUE, BusSettings
+from mapweave.wire.credentials import Credentials
+from mapweave.wire.keys import Keys
 
 ACCEPT_PENDING = 1000
 """Connections of which a router does not know yet who they are."""
 ACCEPT_TIMEOUT = 2.0
 """s; a silent new connection is dropped after this time. A handshake takes two round trips."""
+
+LARGEST = {"put": 2**18, "query": 2**20, "reply": 2**25}
+"""Bytes of what a client may send: twice a change, several views, the largest piece of a log. The router
+drops what is larger before anything reads it."""
 
 
 def session_values(settings: BusSettings) -> dict[str, object]:
@@ -33,8 +42,46 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "transport/link/tx/queue/size/data": ROUTER_QUEUE if settings.mode == "router" else 2,
         "transport/shared_memory/enabled": False,
     }
+    if settings.mode == "router":
+        values["low_pass_filter"] = [
+            {"id": name, "flows": ["ingress"], "messages": [name], "key_exprs": ["mapweave/**"],
+             "size_limit": size}
+            for name, size in LARGEST.items()
+        ]  # fmt: skip
     if settings.session:
         values["id"] = settings.session
     if settings.timestamps:
         values["timestamping/enabled"] = True
+    if settings.credentials is not None:
+        values |= _proof(settings.credentials, settings.mode == "router")
+    if settings.access is not None:
+        certified = settings.credentials is not None and settings.credentials.certified
+        values["access_control"] = access_control(Keys(settings.fleet), settings.access, certified)
+        if settings.access.passwords:
+            values["transport/auth/usrpwd/dictionary_file"] = settings.access.passwords
     return values
+
+
+def _proof(credentials: Credentials, listens: bool) -> dict[str, object]:
+    if not credentials.certified:
+        return {
+            "transport/auth/usrpwd/user": credentials.name,
+            "transport/auth/usrpwd/password": credentials.password,
+        }
+    side = "listen" if listens else "connect"
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate_base64": _base64(credentials.authority),
+            f"{side}_private_key_base64": _base64(credentials.private_key),
+            f"{side}_certificate_base64": _base64(credentials.certificate),
+            "enable_mtls": True,
+            "close_link_on_expiration": True,
+            # A router has whatever address the network gave it. Its certificate is one of the fleet's
+            # authority, and no robot's key would pass: see the name constraint of `server_name`.
+            "verify_name_on_connect": True,
+        }
+    }
+
+
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode()

@@ -84,6 +84,12 @@ class Declared:
         if entity is not None:
             entity.undeclare()
 
+    def detach(self) -> None:
+        """Take it back from a session that ends, to be declared in the next; with the owner's lock held."""
+        entity, self._entity = self._entity, None
+        if entity is not None:
+            entity.undeclare()
+
     def wanted(self) -> bool:
         """Whether handlers may still be called."""
         return self._open
@@ -139,6 +145,13 @@ class Watcher(Declared):
 
     def _declare_in(self, session: zenoh.Session) -> Any:
         return session.liveliness().declare_subscriber(self.key, self._receive, history=True)
+
+    def detach(self) -> None:
+        """Take it back; who comes again is alive again."""
+        super().detach()
+        seen, self._seen = self._seen, set()
+        for key in seen:
+            self._owner.dispatcher.presence(self._handler, key, False, self.wanted)
 
     def _receive(self, sample: zenoh.Sample) -> None:
         key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT

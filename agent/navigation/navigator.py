@@ -94,12 +94,14 @@ class Navigator:
         goal: NodeId,
         settings: AgentSettings | None = None,
         seed: int = 0,
+        via: tuple[NodeId, ...] = (),
     ) -> None:
-        """Start lost, with a goal."""
+        """Start lost, with a goal, and nodes to pass before, in order."""
         self.stage: str = Stage.LOST
         self.detail = ""
         self.fix: Fix | None = None
         self.goal = goal
+        self._via = list(via)
         self.legs = 0
         self.progress = 0.0
         self.tally = DriveStatistics()
@@ -184,7 +186,7 @@ class Navigator:
             if self.fix is None:
                 yield from self._find()
             assert self.fix is not None, "the search ends with a fix"
-            route = yield from self._get_route(self.fix, self.goal)
+            route = yield from self._get_route(self.fix, self._via[0] if self._via else self.goal)
             if (undriven := self._undriven(route)) is not None:
                 self._blocks.add(*undriven, self._motion.now)
             elif route:
@@ -289,6 +291,10 @@ class Navigator:
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._failed_views = 0
+            if self._via and follower.to_goal <= THERE:
+                del self._via[0]
+                self._following = False
+                return
             if self._touched:
                 follower.progress = RouteProgress.BLOCKED
             if follower.progress not in (RouteProgress.DRIVING, RouteProgress.PARKING):
@@ -307,7 +313,9 @@ class Navigator:
                     # Twice: localize again, so that parking begins from another heading.
                     self.fix, self._expected, self._parking_retried = None, self._on_own_map(self.fix), False
             case RouteProgress.UNSURE if (
-                self._goal_hidden and follower.fix.blind < self._settings.navigation.blind_distance
+                self._goal_hidden
+                and not self._via
+                and follower.fix.blind < self._settings.navigation.blind_distance
             ):
                 self.stage, self.detail = Stage.ARRIVED, HIDDEN
                 self.tally = self.tally.passed([0.0])
@@ -317,14 +325,19 @@ class Navigator:
                 yield from self._relocalize()
 
     def _let_pass(self, right_of_way: RightOfWay, follower: RouteFollower) -> Generator[Command, None, bool]:
-        """Stand while another robot holds the way ahead; returns whether to go on then."""
+        """Stand while another robot holds the way ahead; returns whether to go on then.
+
+        Where the way ahead is closed by a person, another one is asked for at once.
+        """
         began, self._following, go_on = self._motion.now, False, True
         while go_on and not right_of_way.may_drive(follower.leg, follower.fix):
             if right_of_way.holder:
                 self.stage, self.detail = Stage.YIELDING, f"{right_of_way.holder} drives there"
                 self._trouble = f"{right_of_way.holder} is in the way"
+            if right_of_way.closed:
+                self._trouble = self.detail = right_of_way.closed
             self._aside = right_of_way.aside
-            go_on = self._aside is None
+            go_on = self._aside is None and not right_of_way.closed
             if go_on and self._motion.now - began > YIELDED:
                 # It is stuck, or stands there: another way may be free.
                 self._blocks.add(*follower.blocked, self._motion.now)

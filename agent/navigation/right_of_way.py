@@ -25,12 +25,14 @@ class RightOfWay:
     Attributes:
         holder: the robot that drives where this one wants to; empty without one.
         aside: the node to which this one must step aside; None if it need not.
+        closed: why the way ahead is closed, in words; empty if it is not.
     """
 
     def __init__(self, motion: MotionPrimitives, route: Sequence[NodeId]) -> None:
         """Take a route; nothing is known of it yet."""
         self.holder = ""
         self.aside: NodeId | None = None
+        self.closed = ""
         self._motion = motion
         self._route = tuple(route)
         self._asked: tuple[int, int, float] | None = None
@@ -55,10 +57,11 @@ class RightOfWay:
             number = self._motion.number()
             self._motion.post(MayIDrive(number, fix.node, fix.node_from_robot.mean, self._route[leg:]))
             self._asked, self._last = (number, leg, now), now
-        return self._granted is not None and leg < self._granted
+        return self._granted is not None and leg < self._granted and not self.closed
 
     def _take(self, content: object, first: int) -> None:
         if isinstance(content, ReserveAnswer):
             self._granted, self.holder, self.aside = first + content.granted, content.holder, content.aside
+            self.closed = content.reason if content.closed else ""
         else:
-            self._granted, self.holder, self.aside = len(self._route), "", None
+            self._granted, self.holder, self.aside, self.closed = len(self._route), "", None, ""

@@ -280,7 +280,7 @@ def _camera(
     info = (near or infos)[0]
     _, message = next(opened.messages(info.name), (0, None))
     if message is None:
-        raise DeviceError(opened.damage[-1])
+        raise DeviceError((opened.damage or [f"{opened.path}: {info.name} has no message"])[-1])
     try:
         camera, model, coefficients = camera_of(message)
         mount = _mount(opened, str(message.header.frame_id))

@@ -89,7 +89,7 @@ class Journal:
 
         Args:
             path: of the file.
-            agent: whose; None takes whose it is, and begins none.
+            agent: whose; None takes whose it is and only reads: neither file nor folder is changed.
 
         Raises:
             InvalidFile: damaged, of another kind, another agent's, without an owner, or in use.
@@ -97,22 +97,31 @@ class Journal:
         if agent is not None:
             check_name(agent)
         self._lock = threading.RLock()
-        self._database = Database(path, "agent journal", APPLICATION_ID, VERSION, SCHEMA)
+        self._database = Database(
+            path, "agent journal", APPLICATION_ID, VERSION, SCHEMA, read_only=agent is None
+        )
         try:
-            with self._database.transaction() as rows:
-                owner = rows.execute("SELECT agent FROM owner").fetchone()
-                if owner is None and agent is not None:
-                    rows.execute("INSERT INTO owner VALUES (?)", (agent,))
-                elif owner is None:
-                    raise InvalidFile(f"{path}: this journal has no owner")
-                elif agent not in (None, owner[0]):
-                    raise InvalidFile(f"{path}: is the journal of agent {owner[0]}, not of {agent}")
-                # A journal of before has none.
-                rows.execute("CREATE TABLE IF NOT EXISTS mission (id TEXT PRIMARY KEY, body BLOB NOT NULL)")
-            self.agent = str(owner[0]) if agent is None else agent
+            self.agent = self._owner(path) if agent is None else self._own(path, agent)
         except BaseException:
             self._database.close()
             raise
+
+    def _owner(self, path: Path) -> str:
+        rows = self._read("SELECT agent FROM owner")
+        if not rows:
+            raise InvalidFile(f"{path}: this journal has no owner")
+        return str(rows[0][0])
+
+    def _own(self, path: Path, agent: str) -> str:
+        with self._database.transaction() as rows:
+            owner = rows.execute("SELECT agent FROM owner").fetchone()
+            if owner is None:
+                rows.execute("INSERT INTO owner VALUES (?)", (agent,))
+            elif owner[0] != agent:
+                raise InvalidFile(f"{path}: is the journal of agent {owner[0]}, not of {agent}")
+            # A journal of before has none.
+            rows.execute("CREATE TABLE IF NOT EXISTS mission (id TEXT PRIMARY KEY, body BLOB NOT NULL)")
+        return agent
 
     def open_map(self, epoch: int | None) -> MapId:
         """Begin a map or go on with one.

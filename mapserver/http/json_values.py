@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -18,6 +19,23 @@ def json_values(value: Any) -> dict[str, Any]:
     """What `json.dumps` takes: the fields of a value by name."""
     fields: dict[str, Any] = packed(value, AS_JSON)
     return fields
+
+
+def constraint_values(record: ManualConstraints) -> dict[str, Any]:
+    """The record of manual constraints: each with its number, whether it is in force, and in words."""
+    holding = set(record.in_force)
+    return {
+        "constraints": [
+            {
+                "number": number,
+                "in_force": constraint in holding,
+                "words": event_words(constraint),
+                "time": time_of(constraint.stamp_ns),
+                **json_values(constraint),
+            }
+            for number, constraint in enumerate(record.made, 1)
+        ]
+    }
 
 
 def time_of(stamp_ns: int) -> str:

@@ -1,8 +1,8 @@
 """ASGI applications on a thread of their own, by uvicorn, with limits on what a connection may take.
 
-Each connection carries one request. The head of the request has a time limit, so has the connection as a
-whole, and a peer that takes nothing of an answer is dropped. Uvicorn by itself waits for ever in all three
-cases.
+Each connection carries one request, or a WebSocket. The head of the request has a time limit, so has the
+connection as a whole unless it is a WebSocket, and a peer that takes nothing of an answer is dropped. Uvicorn
+by itself waits for ever in all three cases.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from mapweave.hybridmap.errors import NotConnected
+from mapweave.mapserver.http.websocket import WebSocketConnection
 
 MAX_HEAD_BYTES = 16384
 """Of a request: its first line and headers."""
@@ -33,6 +34,8 @@ MAX_WAITING = 512
 """Connections that have not sent the head of a request yet; a new one takes the place of the oldest."""
 LINGER = 1.0
 """s in which a peer may finish sending what is refused: a connection that is reset loses the answer too."""
+MAX_VIEWER_BYTES = 1024
+"""Of a message by a viewer, which has nothing to say."""
 START = 10.0
 """s in which the thread has to be there."""
 POLICY = (
@@ -117,6 +120,14 @@ class Connection(H11Protocol):
             self._head.cancel()
             self.waiting.pop(self, None)
 
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        """Hand a viewer on: it stays as long as it likes, within limits of its own."""
+        for timer in (self._head, self._whole, self._stall):
+            if timer is not None:
+                timer.cancel()
+        self.waiting.pop(self, None)
+        super().handle_websocket_upgrade(event)
+
     def send_400_response(self, msg: str) -> None:
         """Answer what is no HTTP as everything else is answered, and let the peer finish sending."""
         body = json_bytes(
@@ -176,12 +187,17 @@ class HttpThread:
         """
         self._socket = _listen(address)
         self.port = int(self._socket.getsockname()[1])
-        protocol = type("Connection", (Connection,), {"limits": limits or Limits(), "waiting": {}})
+        limits = limits or Limits()
+        protocol = type("Connection", (Connection,), {"limits": limits, "waiting": {}})
+        viewer = type("Viewer", (WebSocketConnection,), {"stall": limits.stall})
         config = uvicorn.Config(
             app,
             http=protocol,
             loop="asyncio",
-            ws="none",
+            ws=viewer,
+            ws_max_size=MAX_VIEWER_BYTES,
+            ws_ping_interval=limits.stall,
+            ws_ping_timeout=limits.stall,
             lifespan="off",
             interface="asgi3",
             # The terminal belongs to the program that serves.

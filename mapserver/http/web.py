@@ -1,7 +1,9 @@
 """The map server for people: a photograph in, JSON out, explanations of merges and routes, and pages.
 
-    GET /             the page for photographs
-    GET /why          the page that explains why maps are one, or are not
+    GET /             the page: the merged map live, robots, and where a photograph was taken
+    GET /why          the same page, with an explanation: ?a=r0.1.17&b=r1.1.5
+    WebSocket /live   what the page draws, see live.py
+    GET /nodes/NODE   one node, JSON
     GET /status       what the server holds, JSON
     GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
@@ -9,8 +11,12 @@
     GET /robots       what every robot is doing, JSON
     GET /missions     the missions that are known, JSON
     GET /map          the merged map, a map file
+    GET /annotations  what people say about the map: named places and so on, JSON
+    POST /annotations JSON: adds an annotation, or withdraws one
+    GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
+    POST /constraints links, unmerges, retires, or takes back, JSON in and out; see constraint_request.py
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
 An error comes back as one JSON object with `error`. A busy server answers 503 with
@@ -23,38 +29,43 @@ import asyncio
 import ipaddress
 import logging
 import math
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import Future
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
-from starlette.routing import Mount, Route
+from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
-from mapweave.hybridmap.explanation import Explanation
-from mapweave.hybridmap.manual_constraint import EXAMPLE, read_ends
-from mapweave.hybridmap.map_event import History, MapEvent
-from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.map_event import History
+from mapweave.hybridmap.mission_order import MissionKind, Missions
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.query import ExplainRequest
+from mapweave.mapserver.http.annotations import annotate, annotations_json, ends_of_words
+from mapweave.mapserver.http.answering import Answering
+from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
-from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.http.json_values import constraint_values, json_values
+from mapweave.mapserver.http.live import Live
+from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
-from mapweave.wire.log_messages import Scalar
 
 log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).with_name("static")
-PAGES = {"/": "index.html", "/why": "why.html"}
+PAGES = ("/", "/why")
 MOST_BYTES = 16 * 2**20
 """Longest body, 16 MiB."""
 PATIENCE = 10.0
@@ -64,42 +75,19 @@ MOST_AT_ONCE = 32
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
-METHODS = dict.fromkeys(
-    (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
-) | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+METHODS = (
+    dict.fromkeys(
+        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/nodes/NODE"),
+        "GET",
+    )
+    | dict.fromkeys(("/constraints", "/annotations"), "GET or POST")
+    | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
+)
 BY = "http"
 """Gives a mission, if the request does not say."""
 
 
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
-
-
-class Answering(Protocol):
-    """The questions, as of a MapServer: from any thread; a MapweaveError refuses one."""
-
-    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
-        """Where a view was taken."""
-
-    def explain(self, request: ExplainRequest) -> Future[Explanation]:
-        """Explain a merge or a route."""
-
-    def status(self) -> dict[str, Scalar]:
-        """What the server holds and does."""
-
-    def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps."""
-
-    def robots(self) -> FleetStatus:
-        """The robots, and where they are."""
-
-    def missions(self) -> Missions:
-        """The missions that are known."""
-
-    def give(self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str = "") -> MissionReport:
-        """Give a robot a mission; waits for its answer."""
-
-    def map_file(self) -> Future[bytes]:
-        """The merged map as a map file."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -133,7 +121,7 @@ class Web(HttpThread):
             server: answers.
             patience: time limit for a body, and for an answer, s.
             limits: of connections.
-            commands: whether other machines may move robots, too.
+            commands: whether other machines may move robots and correct the map, too.
 
         Raises:
             NotConnected: the port cannot be used, for example since it is taken.
@@ -204,13 +192,17 @@ class Questions:
         answering: dict[str, Answer] = {
             "/status": self._status, "/history": self._history, "/explain": self._explain,
             "/route": self._explain, "/robots": self._robots, "/missions": self._missions, "/map": self._map,
+            "/nodes/{node}": self._node,
         }  # fmt: skip
         routes = [
-            *(Route(path, _page(name)) for path, name in PAGES.items()),
+            *(Route(path, _page("index.html")) for path in PAGES),
+            WebSocketRoute("/live", Live(server, self._may_command).serve),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
+            Route("/annotations", self._answering(self._annotations), methods=["GET", "POST"]),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
+            Route("/constraints", self._answering(self._constraints), methods=["GET", "POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such})
@@ -260,6 +252,17 @@ class Questions:
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
 
+    async def _annotations(self, request: Request) -> Mapping[str, Any]:
+        if request.method != "POST":
+            return await run_in_threadpool(annotations_json, self._server)
+        self._check_commands(request)
+        body = await self._body(request, "JSON")
+        return await run_in_threadpool(annotate, self._server, body, request.query_params.get("by", BY))
+
+    async def _node(self, request: Request) -> Mapping[str, Any]:
+        node = NodeId.parse(request.path_params["node"])
+        return await run_in_threadpool(lambda: json_values(node_details(self._server.merged(), node)))
+
     async def _map(self, _: Request) -> Response:
         data = await self._result(self._server.map_file)
         headers = {"Content-Disposition": 'attachment; filename="merged.mapweave"'}
@@ -273,8 +276,9 @@ class Questions:
         query = request.query_params
         goal, by, mission_id = query.get("goal", ""), query.get("by", BY), query.get("id", "")
         report = await run_in_threadpool(
-            self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id
-        )
+            self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id,
+            tuple(query.getlist("via")),
+        )  # fmt: skip
         return json_values(report)
 
     async def _stop(self, request: Request) -> Mapping[str, Any]:
@@ -284,27 +288,47 @@ class Questions:
         def stop() -> Mapping[str, Any]:
             names = [entry.robot for entry in self._server.robots().robots if entry.alive]
             return json_values(
-                Missions(tuple(self._server.give(name, MissionKind.STOP, "", by) for name in names))
+                Missions(tuple(self._server.give(name, MissionKind.STOP, "", by, "", ()) for name in names))
             )
 
         return await run_in_threadpool(stop)
 
+    async def _constraints(self, request: Request) -> Mapping[str, Any]:
+        if request.method != "POST":
+            return await run_in_threadpool(
+                lambda: constraint_values(ManualConstraints(self._server.constraints().made))
+            )
+        self._check_commands(request)
+        body = await self._body(request, "JSON")
+
+        def constrain() -> Mapping[str, Any]:
+            record = self._server.constraints().made
+            return {"said": self._server.constrain(read_request(body, BY, time.time_ns(), record))}
+
+        return await run_in_threadpool(constrain)
+
+    def _may_command(self, host: str) -> bool:
+        return self._commands or is_loopback(host)
+
     def _check_commands(self, request: Request) -> None:
-        """There is no password: unless it is set otherwise, robots are moved from this machine alone."""
+        """There is no password: robots are moved and maps corrected from this machine, unless it is set."""
         host = "" if request.client is None else request.client.host
-        if not self._commands and not is_loopback(host):
+        if not self._may_command(host):
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
-                "robots take missions from this machine alone: start the server with --http-commands",
+                "missions and corrections are taken from this machine alone: start the server with "
+                "--http-commands",
             )
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
-        ends, path, query = None, request.url.path, dict(request.query_params)
+        ends: Ends | None = None
+        path, query = request.url.path, dict(request.query_params)
         route = path == "/route"
         if query or route:
             if query.keys() != {"a", "b"}:
                 raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
-            ends = read_ends(query["a"].strip(), query["b"].strip())
+            words = query["a"].strip(), query["b"].strip()
+            ends = await run_in_threadpool(ends_of_words, self._server, words)
         asked = ExplainRequest(ends, route)
         explanation = await self._result(lambda: self._server.explain(asked))
         return await run_in_threadpool(json_values, explanation)
@@ -322,9 +346,9 @@ class Questions:
         async with asyncio.timeout(self._patience):
             return await asyncio.wrap_future(await run_in_threadpool(ask))
 
-    async def _body(self, request: Request) -> bytes:
+    async def _body(self, request: Request, what: str = "a JPEG or PNG image") -> bytes:
         """All of it, in the time that a body may take; refused before it is sent if it is too long."""
-        length = _length(request)
+        length = _length(request, what)
         body = bytearray()
         async with asyncio.timeout(self._patience):
             async for piece in request.stream():
@@ -335,14 +359,14 @@ class Questions:
         return bytes(body)
 
 
-def _length(request: Request) -> int:
+def _length(request: Request, what: str) -> int:
     text = request.headers.get("Content-Length", "")
     if "Transfer-Encoding" in request.headers or not (text.isascii() and text.isdigit()):
-        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the image with Content-Length")
+        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the body with Content-Length")
     if len(text) > 12 or int(text) > MOST_BYTES:
         raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES >> 20} MiB are taken")
     if int(text) == 0:
-        raise InvalidValue("send a JPEG or PNG image as the body")
+        raise InvalidValue(f"send {what} as the body")
     return int(text)
 
 

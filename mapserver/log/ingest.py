@@ -14,11 +14,11 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.node import MapId, check_name
 from mapweave.mapserver.log.agent_log import NEVER, AgentLog, PullSettings
@@ -76,6 +76,8 @@ class Ingest:
         on_change: Callable[[Change], None],
         settings: IngestSettings | None = None,
         replay: Callable[[Iterable[Change]], None] | None = None,
+        objection: Callable[[ChangeBody], str] = lambda body: "",
+        taken: Collection[MapId] = (),
     ) -> None:
         """Replay the store, then listen.
 
@@ -89,6 +91,8 @@ class Ingest:
                 take note, because the next change waits for it.
             settings: how.
             replay: called instead with all that is in the store at once, map by map.
+            objection: why a change cannot be of the map whose name it has; its log is refused then.
+            taken: maps that are here and not in the store: no new one may have their names.
 
         Raises:
             InvalidFile: the store cannot be read.
@@ -97,6 +101,7 @@ class Ingest:
         self._keys = keys
         self._store = store
         self._name = check_name(server_name)
+        self._objection, self._taken = objection, tuple(taken)
         self._on_change = on_change
         self._settings = settings or IngestSettings()
         self._counters = IngestCounters()
@@ -291,14 +296,22 @@ class Ingest:
             agent_log = self._logs[map_id] = AgentLog(map_id, log_id, self._settings.pull)
         if agent_log.log_id == log_id:
             return agent_log
-        reason = f"another log goes by the name {map_id} here: begin a fresh map"
+        self._refuse(map_id, log_id, f"another log goes by the name {map_id} here: begin a fresh map")
+        return None
+
+    def _refuse(self, map_id: MapId, log_id: int, reason: str) -> None:
+        """Notify an agent that its log is not taken."""
         ack = Ack(map_id, log_id, 0, (Refusal(0, reason),), self._store.id)
         self._bus.publish(self._keys.ack(self._name, map_id.agent), ack.encode())
-        return None
 
     def _apply(self, agent_log: AgentLog, entries: list[Entry], covered: int | None) -> None:
         """Commit, pass on, acknowledge: in this order."""
         if not entries and covered is None:
+            return
+        objections = (self._objection(e.change.body) for e in entries if isinstance(e.change, Change))
+        if reason := next(filter(None, objections), ""):
+            agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)
+            self._refuse(agent_log.map, agent_log.log_id, reason)
             return
         try:
             applied = self._store.apply(agent_log.map, agent_log.log_id, entries, covered)
@@ -338,7 +351,8 @@ class Ingest:
     def _tell_newest(self, request: Request) -> None:
         """Which numbers an agent must not give to a new map: it may have lost its disk."""
         _, agent = self._keys.parse_ack(request.key)
-        epochs = (stored.epoch for stored in self._store.maps() if stored.agent == agent)
+        maps = (*self._store.maps(), *self._taken)
+        epochs = (known.epoch for known in maps if known.agent == agent)
         request.reply(NewestMap(max(epochs, default=0)).encode())
 
     def _pull(self, map_id: MapId, asked: LogRequest) -> None:

@@ -43,6 +43,9 @@ CREATE TABLE refused (
 CREATE TABLE manual_constraint (
     number INTEGER NOT NULL, body BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (number)
 ) WITHOUT ROWID;
+CREATE TABLE annotation (
+    number INTEGER NOT NULL, body BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (number)
+) WITHOUT ROWID;
 CREATE TABLE result (
     name TEXT NOT NULL, value BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (name)
 ) WITHOUT ROWID
@@ -75,6 +78,7 @@ def insert(rows: sqlite3.Connection, table: str, values: Sequence[object]) -> No
 
 def repair(connection: sqlite3.Connection) -> None:
     """Take damaged rows out of all tables, and note which changes are to be pulled again."""
+    _complete(connection)
     bad = {table: _count_bad(connection, table) for table in TABLES}
     if not any(bad.values()):
         return
@@ -94,7 +98,7 @@ def repair(connection: sqlite3.Connection) -> None:
     except BaseException:
         connection.execute("ROLLBACK")
         raise
-    for table in ("manual_constraint", "refused", "node", "result", "damaged"):
+    for table in ("manual_constraint", "annotation", "refused", "node", "result", "damaged"):
         if bad[table]:
             log.error("the store had %d damaged rows of table %s; they are left out", bad[table], table)
 
@@ -104,6 +108,13 @@ def good_rows(connection: sqlite3.Connection, table: str) -> Iterator[tuple[Any,
     # Without an order and a condition, which would trust keys that may be damaged.
     for *values, crc in connection.execute(f"SELECT * FROM {table}"):
         yield tuple(values) if checksum(values) == crc else None
+
+
+def _complete(connection: sqlite3.Connection) -> None:
+    """Make the tables that a store of an earlier program lacks."""
+    there = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    for table in TABLES.keys() - there:
+        connection.execute(TABLES[table])
 
 
 def _count_bad(connection: sqlite3.Connection, table: str) -> int:

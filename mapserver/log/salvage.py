@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.integrity import checksum
+from mapweave.storage.database_reader import reading
 from mapweave.wire.codec import decode_body
 
 
@@ -26,35 +25,28 @@ class Salvage:
         changes: how many these are.
         damaged: rows with wrong checksums.
         whole: whether all pages could be read.
+        constraints: the manual constraints that are good, encoded, in order.
+        annotations: the annotations that are good, likewise.
+        results: the server's own results that are good, by name.
     """
 
     maps: dict[MapId, HybridMap]
     changes: int
     damaged: int
     whole: bool
+    constraints: tuple[bytes, ...]
+    annotations: tuple[bytes, ...]
+    results: dict[str, bytes]
 
 
 def salvage(path: Path) -> Salvage:
     """Read all undamaged changes; the file is not modified.
 
     Raises:
-        InvalidFile: nothing in it can be read.
+        InvalidFile: nothing in it can be read, or a server uses it.
     """
-    if not path.is_file():
-        raise InvalidFile(f"{path}: no such file")
-    with tempfile.TemporaryDirectory() as folder:
-        # A copy, with what was not yet put into the file itself: SQLite writes into what it reads.
-        copy = Path(folder) / "store"
-        shutil.copyfile(path, copy)
-        beside = path.with_name(path.name + "-wal")
-        if beside.is_file():
-            shutil.copyfile(beside, copy.with_name("store-wal"))
-        connection = sqlite3.connect(copy)
-        connection.text_factory = lambda data: data.decode("utf-8", "replace")
-        try:
-            return _read(connection, path)
-        finally:
-            connection.close()
+    with reading(path, "map store") as connection:
+        return _read(connection, path)
 
 
 def _read(connection: sqlite3.Connection, path: Path) -> Salvage:
@@ -78,7 +70,28 @@ def _read(connection: sqlite3.Connection, path: Path) -> Salvage:
     maps: dict[MapId, HybridMap] = {}
     for (map_id, _), body in sorted(good.items(), key=lambda item: item[0]):
         maps.setdefault(map_id, HybridMap()).apply(body)
-    return Salvage(maps, len(good), damaged, not error)
+    constraints, constraints_whole = _good(connection, "manual_constraint")
+    annotations, annotations_whole = _good(connection, "annotation")
+    results, results_whole = _good(connection, "result")
+    return Salvage(
+        maps, len(good), damaged, not error and constraints_whole and annotations_whole and results_whole,
+        tuple(bytes(body) for _, body in constraints), tuple(bytes(body) for _, body in annotations),
+        {str(name): bytes(value) for name, value in results},
+    )  # fmt: skip
+
+
+def _good(connection: sqlite3.Connection, table: str) -> tuple[list[list[Any]], bool]:
+    """Undamaged rows of a table, and whether all could be read; none of one that an older program lacked."""
+    rows: list[list[Any]] = []
+    try:
+        if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = ?", (table,)).fetchone():
+            return rows, True
+        for *values, crc in connection.execute(f"SELECT * FROM {table} ORDER BY 1"):
+            if checksum(values) == crc:
+                rows.append(values)
+    except sqlite3.Error:
+        return rows, False
+    return rows, True
 
 
 def _keep(good: dict[tuple[MapId, int], ChangeBody], values: list[Any]) -> bool:

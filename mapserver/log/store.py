@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.node import MapId, NodeId
@@ -26,6 +27,8 @@ APPLICATION_ID = 0x4D575354
 VERSION = 2
 ID = "store id"
 """Among the results."""
+HISTORY = "history"
+"""Among the results, too: see mapweave.mapserver.map_history."""
 READ_AT_ONCE = 256
 ADVICE = (
     "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: robots send "
@@ -220,7 +223,7 @@ class Store:
 
     def constraints(self) -> list[bytes]:
         """The manual constraints, in order."""
-        return [bytes(body) for (body,) in self._read("SELECT body FROM manual_constraint ORDER BY number")]
+        return self._record("manual_constraint")
 
     def add_constraint(self, body: bytes) -> None:
         """Add a manual constraint.
@@ -229,13 +232,15 @@ class Store:
             InvalidValue: there are too many.
             InvalidFile: the disk does not take it.
         """
-        with self._lock, self._database.transaction() as rows:
-            count, newest = rows.execute(
-                "SELECT count(*), coalesce(max(number), 0) FROM manual_constraint"
-            ).fetchone()
-            if count >= MAX_CONSTRAINTS:
-                raise InvalidValue(f"the record of manual constraints is full: {MAX_CONSTRAINTS}")
-            insert(rows, "manual_constraint", (newest + 1, body))
+        self._add_to_record("manual_constraint", body, MAX_CONSTRAINTS)
+
+    def annotations(self) -> list[bytes]:
+        """The annotations, in order."""
+        return self._record("annotation")
+
+    def add_annotation(self, body: bytes) -> None:
+        """Add an annotation; see `add_constraint`."""
+        self._add_to_record("annotation", body, MAX_ANNOTATIONS)
 
     def put_result(self, name: str, value: bytes) -> None:
         """Store another result of the server.
@@ -255,6 +260,16 @@ class Store:
         """Close the file. Idempotent."""
         with self._lock:
             self._database.close()
+
+    def _record(self, table: str) -> list[bytes]:
+        return [bytes(body) for (body,) in self._read(f"SELECT body FROM {table} ORDER BY number")]
+
+    def _add_to_record(self, table: str, body: bytes, most: int) -> None:
+        with self._lock, self._database.transaction() as rows:
+            count, newest = rows.execute(f"SELECT count(*), coalesce(max(number), 0) FROM {table}").fetchone()
+            if count >= most:
+                raise InvalidValue(f"the record of {table.replace('_', ' ')}s is full: {most}")
+            insert(rows, table, (newest + 1, body))
 
     def _take(
         self, rows: Any, map_id: MapId, entry: Entry, changes: list[Change], refusals: list[Refusal]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, Node, NodeId
@@ -24,6 +25,7 @@ from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap, WrongGeometry
 from mapweave.merge.pose_graph.verdicts import MapPair, Verdict, Verdicts
+from mapweave.merge.retired_nodes import retired_nodes
 from mapweave.merge.settings import MergeSettings
 from mapweave.registration.recognition import RecognitionSettings
 
@@ -150,9 +152,9 @@ class Merger:
         changed = {*constraints.in_force} ^ {*self._constraints.in_force}
         # A retired map is harmless, and is no longer set apart.
         self._isolation.release(
-            constraint.retires for constraint in changed if constraint.retires is not None
+            constraint.about.map for constraint in changed if isinstance(constraint.about, RetiredMap)
         )
-        if self._constraints.retired.keys() - constraints.retired.keys():
+        if any(not isinstance(c.about, Apart | Linked) for c in changed - {*constraints.in_force}):
             self.alike.forget()
         self._constraints = constraints
         self._stale |= self._verdicts.at(self.maps.keys())
@@ -223,6 +225,9 @@ class Merger:
     def _find_wrong_geometry(self) -> None:
         """Maps that contradict others that agree are not merged."""
         self._stale |= self._verdicts.at(self._changed)
+        # What a retired area holds only the merge says; the robot's way by it is no less true.
+        nodes = retired_nodes(self._kept, self._constraints, ())
+        self._constraints = self._constraints.with_nodes(nodes)
         before, left_out = self._wrong, {*self._constraints.retired, *self._isolation.reasons}
         self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, left_out)
         self._stale = set()

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from mapweave.hybridmap.node import Node, NodeId
-from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, Whereabouts
+from mapweave.hybridmap.pose import PoseGaussian, wrap_angle
+from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, SimilarPlace, Whereabouts
 from mapweave.mapserver.relocalization.aliased_landmarks import between
 from mapweave.mapserver.relocalization.calibration import probabilities
-from mapweave.mapserver.relocalization.place_hypotheses import PlaceHypothesis, supported
+from mapweave.mapserver.relocalization.place_hypotheses import ALONE, NodeMatch, PlaceHypothesis, supported
 from mapweave.mapserver.relocalization.verdict import Outcome, Verdict
 from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.merge.pose_graph.merged_map import MergedMap
+
+MOST_SIMILAR = 3
+"""Places that are named if none is recognised."""
 
 
 def answer_of(
@@ -26,8 +30,10 @@ def answer_of(
         least_features: that a view needs.
     """
     reason = _reason(verdict, merged, least_features)
-    if verdict.outcome not in (Outcome.FOUND, Outcome.AMBIGUOUS) and not verdict.confirmable:
-        return RelocalizeAnswer(Certainty.UNKNOWN, (), reason)
+    known = verdict.outcome in (Outcome.FOUND, Outcome.AMBIGUOUS)
+    similar = () if known else similar_places(verdict, least_features)
+    if not known and not verdict.confirmable:
+        return RelocalizeAnswer(Certainty.UNKNOWN, (), reason, similar)
     chances = probabilities(supported(verdict.places))
     candidates = tuple(
         _whereabouts(place, chance, merged, node_of)
@@ -37,7 +43,51 @@ def answer_of(
     if verdict.outcome is Outcome.FOUND:
         # The distance from a photograph is unknown.
         certainty = Certainty.FOUND if candidates[0].distance_known else Certainty.PLACE
-    return RelocalizeAnswer(certainty, candidates, reason)
+    return RelocalizeAnswer(certainty, candidates, reason, similar)
+
+
+def similar_places(verdict: Verdict, least_features: int) -> tuple[SimilarPlace, ...]:
+    """What came nearest to being recognised, and what was missing: places with most landmarks first.
+
+    Args:
+        verdict: that no place is certain.
+        least_features: landmarks that must agree in any case.
+    """
+    weak = [
+        SimilarPlace(
+            match.node,
+            match.recognition.matches,
+            match.recognition.inliers,
+            ALONE,
+            _weakness(match),
+            _turn(match.recognition.node_from_robot),
+        )
+        for match in verdict.registration.matches
+    ]
+    refused = [
+        SimilarPlace(
+            node,
+            refusal.matches,
+            refusal.inliers,
+            least_features,
+            refusal.reason,
+            _turn(refusal.node_from_robot),
+        )
+        for node, refusal in verdict.registration.refusals
+    ]
+    ranked = sorted(refused, key=lambda one: (-one.inliers, -one.matches, one.node))
+    return tuple([*weak, *ranked][:MOST_SIMILAR])
+
+
+def _weakness(match: NodeMatch) -> str:
+    if match.lonely:
+        return "all landmarks that agree are on one thing, and nothing of what should be around it is seen"
+    agree = f"{match.recognition.inliers} landmarks agree"
+    return f"{agree}; {ALONE} are needed, or a second node that confirms it"
+
+
+def _turn(node_from_robot: PoseGaussian | None) -> float | None:
+    return None if node_from_robot is None else wrap_angle(-node_from_robot.mean.heading)
 
 
 def _whereabouts(

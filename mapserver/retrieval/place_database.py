@@ -44,14 +44,18 @@ class PlaceDatabase:
     One thread, the merging one, changes it, but for `announce`; any thread may ask.
     """
 
-    def __init__(self, store: Store | None = None, path: Path | None = None) -> None:
+    def __init__(
+        self, store: Store | None = None, path: Path | None = None, others: Collection[NodeId] = ()
+    ) -> None:
         """Begin with the saved index, as far as it agrees with the store.
 
         Args:
             store: has the nodes; None: start empty, and never save.
             path: of the store's file; the index is next to it.
+            others: nodes that come at the start from elsewhere; the saved index may have them, too.
         """
         self._store = store
+        self._others = frozenset(others)
         self._path = None if path is None else path.with_name(path.name + SUFFIX)
         self._index = self._restored()
         self._saved = self._index.version
@@ -171,7 +175,7 @@ class PlaceDatabase:
             if logs:
                 log.info("the place index is built again: %s", error)
             return PlaceIndex()
-        removed = index.retain(self._store.present())
+        removed = index.retain(self._store.present() | self._others)
         log.info(
             "the place index of %d nodes is as it was saved; %d are gone; %.1f s",
             len(index), removed, time.monotonic() - began,

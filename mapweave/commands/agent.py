@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     if resume is not None and not (arguments.data / f"{name}.sqlite").exists():
         raise InvalidValue(f"{arguments.data}: there is no journal of {name} with a map to resume")
     settings = settings_of(arguments)
-    network = network_of(arguments, settings)
+    network = network_of(arguments, settings, name)
     stop = stop_on_signals()
     bus, keys = connect(network)
     body, claim = bus, None
@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         warn_without_router(bus, name)
         if arguments.body:
-            body, _ = connect(replace(network, endpoints=(arguments.body,)))
+            body, _ = connect(replace(network, endpoints=(arguments.body,), keys=""))
         if body.wait_connected(SOON):
             claim = Claim(body, keys, name)
         robot, synchronization = open_robot(

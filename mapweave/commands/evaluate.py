@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 from mapweave.commands.replay import add_recording, options_of
 
 
@@ -35,6 +36,14 @@ def add_to(commands: Any) -> None:
     )
     relocalize.add_argument(
         "--focal", type=float, metavar="PX", help="focal length for photographs without a camera.toml"
+    )
+    relocalize.add_argument(
+        "--map", type=Path, metavar="FILE",
+        help=f"ask this map instead of mapping a pass: {SOURCES}; truth.csv, if it is of the same clock, "
+        "tells where its nodes are",
+    )  # fmt: skip
+    relocalize.add_argument(
+        "--robot", metavar="NAME", help="with --map: one of the robots in the recording's splits.toml asks"
     )
     relocalize.add_argument("--out", type=Path, metavar="DIR", help="write each answer to a table there")
     relocalize.add_argument("--json", action="store_true", help="print one JSON object at the end")
@@ -130,16 +139,20 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     from mapweave.commands.network import settings_of
-    from mapweave.evaluation.relocalization import evaluate_relocalization
+    from mapweave.evaluation.relocalization import evaluate_map, evaluate_relocalization
     from mapweave.output_folder import check_output
 
     if arguments.out is not None:
         check_output(arguments.out)
     pipeline = settings_of(arguments).agent
     console = Console(stderr=True)
-    examination = evaluate_relocalization(
-        arguments.folder, arguments.camera, arguments.focal, pipeline, console
-    )
+    if arguments.map is not None:
+        merged = merged_with_progress(opened(arguments.map), settings_of(arguments).merge)
+        examination = evaluate_map(arguments.folder, arguments.robot, merged, console)
+    else:
+        examination = evaluate_relocalization(
+            arguments.folder, arguments.camera, arguments.focal, pipeline, console
+        )
     report = examination.report()
     if arguments.out is not None:
         for path in examination.write(arguments.out):

@@ -8,25 +8,31 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.commands.map_input import opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
-    from mapweave.hybridmap.manual_constraint import Ends, ManualConstraint
+    from mapweave.hybridmap.constraint_subject import Subject
+    from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 
 
-def add_constraint_options(parser: argparse.ArgumentParser) -> None:
+def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -> None:
     """Declare the options of every manual constraint."""
     parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
     parser.add_argument("--by", metavar="NAME", help="your name (default: the login name)")
-    parser.add_argument("--undo", action="store_true", help="take it back")
+    if undo:
+        parser.add_argument("--undo", action="store_true", help="take it back")
+    parser.add_argument("--check", action="store_true", help="only say what it would do; change nothing")
     parser.add_argument("--map", type=Path, metavar="FILE", help="in this map file; no server is asked")
     parser.add_argument("-o", "--out", type=Path, metavar="OUT", help="with --map: write there instead")
     parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
     add_network(parser)
 
 
-def constrain(arguments: argparse.Namespace, ends: Ends) -> None:
+def constrain(arguments: argparse.Namespace, about: Subject) -> None:
     """Set the constraint, and print its effect; afterwards `arguments.map` is the file that holds it.
+
+    With `--check` only print.
 
     Raises:
         MapweaveError: the constraint has no effect, or there is no place to keep it.
@@ -37,13 +43,27 @@ def constrain(arguments: argparse.Namespace, ends: Ends) -> None:
     if arguments.out is not None and arguments.map is None:
         raise InvalidValue("--out goes with --map: a server keeps its own record")
     constraint = ManualConstraint(
-        ends, not arguments.undo, arguments.by or _login(), time.time_ns(), arguments.because
+        about, not arguments.undo, arguments.by or _login(), time.time_ns(), arguments.because
     )
     if arguments.map is None:
         _send_to_server(arguments, constraint)
     else:
         _rewrite(arguments, constraint)
-        arguments.map = arguments.out or arguments.map
+        arguments.map = arguments.map if arguments.check else arguments.out or arguments.map
+
+
+def constraints_of(arguments: argparse.Namespace) -> ManualConstraints:
+    """The record of a map file or of a server; the first is number 1."""
+    from mapweave.commands.map_ends import ask
+    from mapweave.hybridmap.manual_constraint import ConstraintList, ManualConstraints
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.messages import decode
+
+    if arguments.map is not None:
+        return ManualConstraints(opened(arguments.map).content.constraints)
+    return ManualConstraints(
+        decode(ask(arguments, Keys.any_constraints, b"")[0].payload, ConstraintList).made
+    )
 
 
 def _login() -> str:
@@ -55,13 +75,16 @@ def _login() -> str:
 
 def _send_to_server(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.commands.map_ends import ask
+    from mapweave.hybridmap.manual_constraint import ConstraintRequest
     from mapweave.wire.keys import Keys
     from mapweave.wire.log_messages import decode_record
     from mapweave.wire.messages import encode
 
-    for reply in ask(arguments, Keys.any_constrain, encode(constraint)):
+    request = ConstraintRequest(constraint, arguments.check)
+    for reply in ask(arguments, Keys.any_constrain, encode(request)):
         print(decode_record(reply.payload)["said"])
-    _settled(arguments)
+    if not arguments.check:
+        _settled(arguments)
 
 
 def _settled(arguments: argparse.Namespace) -> None:
@@ -83,22 +106,34 @@ def _settled(arguments: argparse.Namespace) -> None:
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.commands.map_merge import merged_with_progress
     from mapweave.commands.network import settings_of
-    from mapweave.hybridmap.manual_constraint import ManualConstraints
+    from mapweave.hybridmap.errors import InvalidFile
+    from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
     from mapweave.mapserver.map_files import map_file_of, merged_of
     from mapweave.mapserver.map_history import between
-    from mapweave.merge.manual_constraints import check_manual_constraint
+    from mapweave.merge.constraint_checks import check_manual_constraint
     from mapweave.offline_merge import parts_of
+    from mapweave.opened_map import MapSource, source_of
     from mapweave.storage.atomic_file import check_place
     from mapweave.storage.map_file import read_map_file, write_map_file
 
     check_place(arguments.out or arguments.map)
     settings = settings_of(arguments).merge
+    source = source_of(arguments.map)
+    if source is not MapSource.FILE:
+        raise InvalidFile(
+            f"{arguments.map}: is a {source} and is not changed; make a map file of it with "
+            f"`mapweave map merge {arguments.map} -o FILE`, or ask the running server without --map"
+        )
     content = read_map_file(arguments.map, "merged")
     before = merged_of(content, settings)
-    check_manual_constraint(before, ManualConstraints(content.constraints), constraint)
+    earlier = ManualConstraints(content.constraints)
+    constraint, effects = check_manual_constraint(before, earlier, constraint, settings=settings)
+    print(f"{event_words(constraint)}{f'; {effects}' if effects else ''}")
+    if arguments.check:
+        return
     parts = parts_of({arguments.map: content})
     merged = merged_with_progress(parts.maps, parts.constraints + ManualConstraints([constraint]), settings)
     out = arguments.out or arguments.map
     history = (*parts.history, *between(before, merged, constraint.stamp_ns))
-    write_map_file(out, map_file_of(merged, history))
+    write_map_file(out, map_file_of(merged, history, parts.annotations))
     print(f"{out}: {merged.summary()}")

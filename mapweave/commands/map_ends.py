@@ -6,13 +6,19 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from mapweave.commands.network import connect, network_of, settings_of
+from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
-from mapweave.hybridmap.manual_constraint import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode, encode
+
+if TYPE_CHECKING:
+    from mapweave.mapserver.routes import Router
 
 
 def ends_of(words: list[str]) -> Ends:
@@ -35,6 +41,44 @@ def _patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Reply
         if pause <= 0.0 or time.monotonic() + pause > end:
             return replies
         time.sleep(pause)
+
+
+def resolved(arguments: argparse.Namespace, words: list[str], router: Router | None = None) -> list[str]:
+    """Words with nodes in the place of named places and positions; nodes and maps as they are.
+
+    Args:
+        arguments: of the command line; with `map`, of this file, else of a running server.
+        words: as people write them.
+        router: of the map of `map`, if it is there already.
+
+    Raises:
+        MapweaveError: a word is none of these, or no server answers.
+    """
+    asked = [word for word in words if not _is_end(word)]
+    if not asked:
+        return words
+    request = ResolveRequest(tuple(asked))
+    if arguments.map is None:
+        answer = decode(ask(arguments, Keys.any_resolve, encode(request))[0].payload, ResolveAnswer)
+    else:
+        from mapweave.commands.map_input import router_of
+        from mapweave.mapserver.places import Places
+
+        router = router or router_of(arguments)
+        answer = Places(router, router.annotations).answer(request)
+    for word, one in zip(asked, answer.found, strict=True):
+        if one.note:
+            print(f"mapweave: {word}: {one.note}", file=sys.stderr)
+    nodes = {word: str(one.node) for word, one in zip(asked, answer.found, strict=True)}
+    return [nodes.get(word, word) for word in words]
+
+
+def _is_end(word: str) -> bool:
+    try:
+        read_end(word)
+    except InvalidValue:
+        return False
+    return True
 
 
 def map_of(word: str) -> MapId:

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
@@ -23,10 +24,10 @@ def add_to(actions: Any) -> None:
         help="why two nodes or two maps are linked, or are not",
         description="Explain why two nodes (r0.1.17 r1.1.5) are linked or not, or why two maps (r0.1 r1.1) "
         "are one or are not, with every number behind it; without ends, of each two maps. A running server "
-        "is asked, or a map file.",
+        "is asked, or a map file. A named place may be given instead of a node.",
     )
     parser.add_argument("ends", nargs="*", metavar="NODE|MAP", help="two nodes or two maps")
-    parser.add_argument("--map", type=Path, metavar="FILE", help="explain this map file; no server is asked")
+    parser.add_argument("--map", type=Path, metavar="FILE", help=f"explain {SOURCES}; no server is asked")
     parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the landmarks of the two nodes")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
@@ -36,17 +37,17 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print, draw."""
-    from mapweave.commands.map_ends import ends_of
+    from mapweave.commands.map_ends import ends_of, resolved
     from mapweave.explanation_text import maps_words, pair_words
     from mapweave.extras import need
+    from mapweave.hybridmap.constraint_subject import EXAMPLE
     from mapweave.hybridmap.errors import InvalidValue
-    from mapweave.hybridmap.manual_constraint import EXAMPLE
     from mapweave.hybridmap.node import MapId, NodeId
     from mapweave.mapserver.http.json_values import json_values
 
     if arguments.draw is not None:
         need("viz")
-    ends = ends_of(arguments.ends) if arguments.ends else None
+    ends = ends_of(resolved(arguments, arguments.ends)) if arguments.ends else None
     first, second = ends or (None, None)
     if isinstance(first, NodeId) and isinstance(second, NodeId):
         pair = explained_nodes(arguments, first, second)
@@ -107,8 +108,6 @@ def explained_maps(arguments: argparse.Namespace, ends: tuple[MapId, MapId] | No
 def _merged(arguments: argparse.Namespace) -> tuple[MergedMap, MergeSettings]:
     """The merged map of a file, and the settings with which it is explained."""
     from mapweave.commands.network import settings_of
-    from mapweave.mapserver.map_files import merged_of
-    from mapweave.storage.map_file import read_map_file
 
     settings = settings_of(arguments).merge
-    return merged_of(read_map_file(arguments.map), settings), settings
+    return merged_with_progress(opened(arguments.map), settings), settings

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+
 FORMATS = ("g2o", "tum", "graphml", "geojson")
 
 
@@ -15,11 +17,11 @@ def add_to(actions: Any) -> None:
     parser: argparse.ArgumentParser = actions.add_parser(
         "export",
         help="write a map for others' tools",
-        description="Write one component of a map file: its pose graph (g2o), each robot's places over time "
+        description="Write one component of a map: its pose graph (g2o), each robot's places over time "
         "(tum: a file, or a folder if there are several robots), places and edges (graphml), or a route "
         "graph that Nav2's route server loads (geojson).",
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="a .mapweave file")
+    parser.add_argument("file", type=Path, metavar="FILE", help=SOURCES)
     parser.add_argument("--to", choices=FORMATS, required=True, help="format")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder (tum)")
     parser.add_argument(
@@ -36,10 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Write, and print what was written and what was left out."""
     from mapweave.formats.export import FORMATS as WRITERS
     from mapweave.formats.map_part import MapPart
-    from mapweave.mapserver.map_files import merged_of
-    from mapweave.storage.map_file import read_map_file
 
-    merged = merged_of(read_map_file(arguments.file))
+    merged = merged_with_progress(opened(arguments.file))
     part = MapPart(merged, arguments.component)
     for path in WRITERS[arguments.to](part, arguments.out):
         print(path)

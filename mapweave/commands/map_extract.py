@@ -1,4 +1,4 @@
-"""`mapweave map extract`: the maps of a journal or a store as map files."""
+"""`mapweave map extract`: the robots' own maps of a journal, store or map file as map files."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.map_input import SOURCES
+
 
 def add_to(actions: Any) -> None:
     """Declare the action."""
     parser: argparse.ArgumentParser = actions.add_parser(
         "extract",
-        help="write every map of an agent's journal or a server's store into a map file",
-        description="Write every map that an agent's journal (NAME.sqlite) or a server's store holds into a "
-        "map file of its own, for example r0.3.mapweave. The agent or server must not be running. A file "
-        "that is there already is never written over.",
+        help="write every robot's own map of a journal, store or map file into a map file",
+        description="Write every map that an agent's journal (NAME.sqlite), a server's store or a merged map "
+        "file holds into a map file of its own, for example r0.3.mapweave. The agent or server must not be "
+        "running. A file that is there already is never written over.",
     )
-    parser.add_argument("source", type=Path, metavar="JOURNAL|STORE", help="an agent's or a server's .sqlite")
+    parser.add_argument("source", type=Path, metavar="FILE", help=SOURCES)
     parser.add_argument(
         "-o", "--out", type=Path, default=Path(), metavar="DIR", help="folder for the files (default: here)"
     )

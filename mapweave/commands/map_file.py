@@ -12,11 +12,13 @@ from mapweave.commands import (
     map_fetch,
     map_history,
     map_import,
+    map_link,
     map_merge,
     map_photographs,
     map_retire,
     map_route,
     map_show,
+    map_undo,
     map_unmerge,
 )
 
@@ -28,7 +30,7 @@ def add_to(commands: Any) -> None:
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (
-        map_show, map_explain, map_route, map_history, map_unmerge, map_retire,
+        map_show, map_explain, map_route, map_history, map_link, map_unmerge, map_retire, map_undo,
         map_merge, map_fetch, map_export, map_extract, map_import, map_photographs,
     ):  # fmt: skip
         action.add_to(actions)

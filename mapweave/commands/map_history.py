@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.map_input import SOURCES, opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
@@ -21,9 +22,10 @@ def add_to(actions: Any) -> None:
         description="List the history of the maps that a running server keeps, oldest first: which became "
         "one, which came apart and what took their links away, which are kept apart since two robots cannot "
         "have been where their links put them, and constraints. The server keeps the newest 500 on its "
-        "disk, and every constraint; a map file (--map) has the history until it was written.",
+        "disk, and every constraint; a map file (--map) has the history until it was "
+        "written.",
     )
-    parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
+    parser.add_argument("--map", type=Path, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
     parser.add_argument("--json", action="store_true", help="print one JSON object, with all")
     parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
@@ -46,20 +48,24 @@ def run(arguments: argparse.Namespace) -> int:
     left_out = len(listed) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
     lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in listed[-arguments.most :]]
-    print("\n".join(lines) if lines else "no joins, splits or manual constraints yet")
+    print("\n".join(lines) if lines else "no joins, splits, manual constraints or annotations yet")
     return 0
 
 
 def _history(arguments: argparse.Namespace) -> History:
     from mapweave.commands.map_ends import ask
+    from mapweave.hybridmap.annotation import Annotations
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.map_event import History
     from mapweave.mapserver.constraint_history import with_constraints
-    from mapweave.storage.map_file import read_map_file
     from mapweave.wire.keys import Keys
     from mapweave.wire.messages import decode
 
     if arguments.map is None:
         return decode(ask(arguments, Keys.any_history, b"")[0].payload, History)
-    content = read_map_file(arguments.map)
-    return History(with_constraints(content.history, ManualConstraints(content.constraints)))
+    content = opened(arguments.map).content
+    return History(
+        with_constraints(
+            content.history, ManualConstraints(content.constraints), Annotations(content.annotations)
+        )
+    )

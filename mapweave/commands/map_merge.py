@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.map_input import SOURCES, opened
+
 if TYPE_CHECKING:
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
@@ -21,10 +23,11 @@ def add_to(actions: Any) -> None:
         "merge",
         help="merge map files without a server",
         description="Merge map files as the map server does: robots' own maps, or merged ones, which are "
-        "taken apart and merged again. Of an older and a newer file of one map the newer counts. Manual "
-        "constraints in any of them hold. The result does not depend on the order of the files.",
+        "taken apart and merged again; stores and journals are read alike. Of an older and a newer file of "
+        "one map the newer counts. Manual constraints in any of them hold. The result does not depend on the "
+        "order of the files.",
     )
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="a .mapweave file")
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help=SOURCES)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the merged map's file")
     parser.add_argument("--json", action="store_true", help="print the outcome as one JSON object")
     parser.add_argument(
@@ -41,13 +44,13 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.merge.explanation.map_explanation import explain_fleet
     from mapweave.offline_merge import parts_of
     from mapweave.storage.atomic_file import check_place
-    from mapweave.storage.map_file import read_map_file, write_map_file
+    from mapweave.storage.map_file import write_map_file
 
     check_place(arguments.out)
     settings = settings_of(arguments).merge
-    parts = parts_of({path: read_map_file(path) for path in arguments.files})
+    parts = parts_of({path: opened(path).content for path in arguments.files})
     merged = merged_with_progress(parts.maps, parts.constraints, settings)
-    write_map_file(arguments.out, map_file_of(merged, parts.history))
+    write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
     if arguments.json:
@@ -75,17 +78,8 @@ def merged_with_progress(
     maps: dict[MapId, HybridMap], constraints: ManualConstraints, settings: MergeSettings | None = None
 ) -> MergedMap:
     """Merge, with a bar on stderr for people."""
-    from rich.console import Console
-    from rich.progress import Progress
-
+    from mapweave.commands.map_input import merge_progress
     from mapweave.offline_merge import merge_parts
 
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("reading nodes")
-
-        def report(done: int, of: int) -> None:
-            words = "reading nodes" if done < of else "comparing and joining"
-            bar.update(task, description=words, completed=done, total=of if done < of else None)
-
+    with merge_progress() as report:
         return merge_parts(maps, constraints, report, settings)

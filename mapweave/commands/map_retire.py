@@ -1,33 +1,59 @@
-"""`mapweave map retire`: a map takes no part in anything any more; or does again."""
+"""`mapweave map retire`: maps, nodes, areas or times take no part in anything any more; or do again."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_constraint import add_constraint_options, constrain
+
+if TYPE_CHECKING:
+    from mapweave.hybridmap.constraint_subject import Subject
 
 
 def add_to(actions: Any) -> None:
     """Declare the action."""
     parser: argparse.ArgumentParser = actions.add_parser(
         "retire",
-        help="retire a map: it takes no part in the merge, in routes and in answers",
-        description="Retire a map (r0.1): it takes no part in the merge any more, no route leads through it, "
+        help="retire a map, nodes, an area or a time window: they take no part in anything",
+        description="Retire a map (r0.1), some nodes (r0.1.17 r0.1.18), an area (--area), or what a map has "
+        "of a time (r0.1 --from --to): it takes no part in the merge any more, no route leads through it, "
         "and no view is recognised by it. Nothing is deleted: it is retired until that is taken back with "
-        "--undo, also when its robot maps on and the server starts again. Who did so, when and why is shown "
-        "by `mapweave map explain`. What robots map again need not be retired: newer nodes replace the "
-        "older ones by themselves.",
+        "--undo or `mapweave map undo`, also when robots map on and the server starts again; nodes that come "
+        "into an area or a time window later are retired too. A robot's own way keeps tying what lies before "
+        "and behind a retired node; --check says beforehand whether a map falls into pieces. What robots map "
+        "again need not be retired: newer nodes replace the older ones by themselves.",
     )
-    parser.add_argument("which", metavar="MAP", help="the map, as r0.1: a robot and its epoch")
+    parser.add_argument("which", nargs="*", metavar="MAP|NODE", help="one map, as r0.1, or nodes, as r0.1.17")
+    parser.add_argument(
+        "--area", nargs=2, metavar=("NODE", "CORNERS"),
+        help='what lies in a polygon in the frame of a node, m: --area r0.1.17 "0,-1 2,-1 2,1 0,1"',
+    )  # fmt: skip
+    parser.add_argument("--from", dest="begin", default="", metavar="TIME",
+                        help="nodes of the map from then on: 2026-03-01T12:00 (UTC), or ns")  # fmt: skip
+    parser.add_argument("--to", dest="end", default="", metavar="TIME", help="until then")
     add_constraint_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Set the constraint, and print its effect."""
-    from mapweave.commands.map_ends import map_of
-
-    which = map_of(arguments.which)
-    constrain(arguments, (which, which))
+    constrain(arguments, _subject(arguments))
     return 0
+
+
+def _subject(arguments: argparse.Namespace) -> Subject:
+    from mapweave.commands.map_ends import map_of, node_of
+    from mapweave.hybridmap.area import Area, read_corner
+    from mapweave.hybridmap.constraint_subject import RetiredArea, read_retired, read_window
+    from mapweave.hybridmap.errors import InvalidValue
+
+    in_time = bool(arguments.begin or arguments.end)
+    if (arguments.area is not None) == bool(arguments.which) or (in_time and len(arguments.which) != 1):
+        raise InvalidValue("give a map or nodes, or --area; --from and --to go with one map")
+    if arguments.area is not None:
+        anchor, corners = arguments.area
+        return RetiredArea(Area(node_of(anchor), tuple(map(read_corner, corners.split()))))
+    if in_time:
+        return read_window(map_of(arguments.which[0]), arguments.begin, arguments.end)
+    return read_retired(arguments.which)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.map_input import SOURCES, router_of
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import RouteExplanation
     from mapweave.hybridmap.node import NodeId
+    from mapweave.mapserver.routes import Router
+    from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
 def add_to(actions: Any) -> None:
@@ -20,18 +24,21 @@ def add_to(actions: Any) -> None:
     parser: argparse.ArgumentParser = actions.add_parser(
         "route",
         help="the way from node to node, and why it leads so, or why there is none",
-        description="Explain the route from one node to another (r0.1.17 r1.1.5), step by step; "
-        "why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
+        description="Explain the route from one node or named place to another (r0.1.17 kitchen), step by "
+        "step; why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
         "blocked, or which maps would have to be one. A running server is asked, or a map file. "
         "Exit status 0: there is a way; 2: there is none; 1: could not ask.",
     )
-    parser.add_argument("start", metavar="START", help="a node")
+    parser.add_argument("start", metavar="START", help="a node, a named place, or a position")
     parser.add_argument("goal", metavar="GOAL", help="another one")
     parser.add_argument(
         "--blocked", nargs=2, action="append", default=[], metavar="NODE",
         help="as if a robot could not get through between these two; may be given again",
     )  # fmt: skip
-    parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
+    parser.add_argument(
+        "--via", action="append", default=[], metavar="PLACE", help="pass this first; may be given again"
+    )
+    parser.add_argument("--map", type=Path, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
@@ -41,19 +48,25 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapweave.commands.map_ends import node_of
+    from mapweave.commands.map_ends import node_of, resolved
     from mapweave.explanation_text import route_words
     from mapweave.extras import need
     from mapweave.mapserver.http.json_values import json_values
 
     if arguments.draw is not None:
         need("viz")
-    start, goal = node_of(arguments.start), node_of(arguments.goal)
-    blocked = tuple((node_of(a), node_of(b)) for a, b in arguments.blocked)
-    explanation = explained_route(arguments, start, goal, blocked)
+    stops = [arguments.start, *arguments.via, arguments.goal]
+    words = [*stops, *(word for pair in arguments.blocked for word in pair)]
+    router = None if arguments.map is None else router_of(arguments)
+    nodes = list(map(node_of, resolved(arguments, words, router)))
+    start, goal, rest = nodes[0], nodes[len(stops) - 1], nodes[len(stops) :]
+    blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
+    if arguments.via:
+        return _run_via(arguments, router, nodes[: len(stops)], blocked)
+    explanation = explained_route(arguments, router, start, goal, blocked)
     values, lines = json_values(explanation), route_words(explanation)
     if arguments.draw is not None and explanation.found:
-        draw_route(arguments, explanation)
+        draw_route(arguments, None if router is None else router.merged, explanation)
         values["picture"] = str(arguments.draw)
         lines.append(f"  picture   {arguments.draw}")
     print(json.dumps(values) if arguments.json else "\n".join(lines))
@@ -62,20 +75,45 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if explanation.found else 2
 
 
-def draw_route(arguments: argparse.Namespace, explanation: RouteExplanation) -> None:
+def _run_via(
+    arguments: argparse.Namespace,
+    router: Router | None,
+    stops: list[NodeId],
+    blocked: tuple[tuple[NodeId, NodeId], ...],
+) -> int:
+    """Explain the way from stop to stop."""
+    from mapweave.explanation_text import route_words
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.http.json_values import json_values
+
+    if arguments.draw is not None:
+        raise InvalidValue("--draw and --via do not go together: draw the way from one place to the next")
+    legs = [explained_route(arguments, router, a, b, blocked) for a, b in pairwise(stops)]
+    found = all(leg.found for leg in legs)
+    if arguments.json:
+        print(json.dumps({"found": found, "legs": [json_values(leg) for leg in legs]}))
+    else:
+        print("\n".join(line for leg in legs for line in route_words(leg)))
+    return 0 if found else 2
+
+
+def draw_route(
+    arguments: argparse.Namespace, merged: MergedMap | None, explanation: RouteExplanation
+) -> None:
     """Draw a way on the part of the map through which it leads."""
     import numpy as np
 
     from mapweave.commands.map_ends import ask
     from mapweave.drawing.map_picture import Drive, MapPicture, draw_map
     from mapweave.hybridmap.hybrid_map import HybridMap
-    from mapweave.storage.map_file import read_map_file, unpack_map_file
+    from mapweave.mapserver.map_files import map_file_of
+    from mapweave.storage.map_file import unpack_map_file
     from mapweave.wire.keys import Keys
 
-    if arguments.map is None:
+    if merged is None:
         content = unpack_map_file(ask(arguments, Keys.any_server_map, b"")[0].payload)
     else:
-        content = read_map_file(arguments.map, "merged")
+        content = map_file_of(merged)
     part, _ = content.poses[explanation.start]
     poses = {node: p.mean for node, (number, p) in content.poses.items() if number == part}
     way = [poses[node] for node in (explanation.start, *(hop.b for hop in explanation.hops))]
@@ -87,25 +125,23 @@ def draw_route(arguments: argparse.Namespace, explanation: RouteExplanation) -> 
 
 
 def explained_route(
-    arguments: argparse.Namespace, start: NodeId, goal: NodeId, blocked: tuple[tuple[NodeId, NodeId], ...]
+    arguments: argparse.Namespace,
+    router: Router | None,
+    start: NodeId,
+    goal: NodeId,
+    blocked: tuple[tuple[NodeId, NodeId], ...],
 ) -> RouteExplanation:
-    """A route through a map file, or through what a server has."""
+    """A route through an opened map, or through what a server has."""
     from mapweave.commands.map_ends import ask
     from mapweave.hybridmap.explanation import RouteExplanation
     from mapweave.hybridmap.query import ExplainRequest
     from mapweave.wire.keys import Keys
     from mapweave.wire.messages import decode, encode
 
-    if arguments.map is None:
+    if router is None:
         request = ExplainRequest((start, goal), True, blocked)
         replies = ask(arguments, Keys.any_explain, encode(request))
         return decode(replies[0].payload, RouteExplanation)
-    from mapweave.commands.network import settings_of
-    from mapweave.mapserver.map_files import merged_of
     from mapweave.mapserver.route_explaining import explain_route
-    from mapweave.mapserver.routes import Router
-    from mapweave.storage.map_file import read_map_file
 
-    settings = settings_of(arguments).merge
-    router = Router(merged_of(read_map_file(arguments.map), settings))
     return explain_route(router, start, goal, blocked)

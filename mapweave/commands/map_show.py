@@ -1,22 +1,27 @@
-"""`mapweave map show`: what is in a map file."""
+"""`mapweave map show`: what is in a map."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
+
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 
 
 def add_to(actions: Any) -> None:
     """Declare the action."""
     show: argparse.ArgumentParser = actions.add_parser(
         "show",
-        help="summary and picture of a map file",
-        description="Check a map file, print a summary and draw a picture of it next to it.",
+        help="summary and picture of a map",
+        description="Check a map, print a summary and draw a picture of it next to it. The content hash is "
+        "the same for the same map, whatever file it is in. A robot's own map is drawn with its loop "
+        "closures applied; a store, and a journal of several maps, is merged first.",
     )
-    show.add_argument("file", type=Path, help="a .mapweave file")
+    show.add_argument("file", type=Path, help=SOURCES)
     show.add_argument("--out", type=Path, metavar="PNG", help="picture (default: next to the file, as .png)")
     show.add_argument(
         "--component", type=int, default=0, metavar="N",
@@ -37,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.node import EdgeKind
-    from mapweave.storage.map_file import read_map_file
+    from mapweave.mapserver.content_hash import content_hash
 
     if not arguments.no_picture:
         try:
@@ -48,19 +53,25 @@ def run(arguments: argparse.Namespace) -> int:
             # The summary is what most want to know: it needs nothing.
             print(f"mapweave: the picture {missing}", file=sys.stderr)
             arguments.no_picture = True
-    content = read_map_file(arguments.file)
+    source = opened(arguments.file)
+    content, placed = source.content, source.content.poses
     hybrid = HybridMap(content.changes)
-    if content.poses:
-        # Components have frames of their own; only one can be drawn without pretending.
-        sizes: dict[int, int] = {}
-        for component, _ in content.poses.values():
-            sizes[component] = sizes.get(component, 0) + 1
-        poses = {n: p.mean for n, (c, p) in content.poses.items() if c == arguments.component}
-    else:
-        sizes = {k: len(nodes) for k, nodes in enumerate(hybrid.components())}
-        poses = {n.id: n.map_from_robot.mean for n in hybrid.nodes.values()}
-        # A robot's own map has one frame, even if it is not connected.
-        arguments.component = 0
+    if content.kind == "agent":
+        try:
+            need("server")
+        except MissingExtra as missing:
+            print(
+                f"mapweave: poses are as the robot drove: to apply loop closures {missing}", file=sys.stderr
+            )
+            parts = enumerate(hybrid.components())
+            placed = {n: (k, hybrid.nodes[n].map_from_robot) for k, part in parts for n in part}
+        else:
+            merged = merged_with_progress(source)
+            content, placed = source.file(merged), merged.poses
+            hybrid = HybridMap(content.changes)
+    # Components have frames of their own; only one can be drawn without pretending.
+    sizes = Counter(component for component, _ in placed.values())
+    poses = {n: p.mean for n, (c, p) in placed.items() if c == arguments.component}
     if arguments.component not in sizes and sizes:
         choices = "one, 0" if len(sizes) == 1 else f"0 to {len(sizes) - 1}"
         raise InvalidValue(f"the map has no component {arguments.component}; it has {choices}")
@@ -70,8 +81,10 @@ def run(arguments: argparse.Namespace) -> int:
         kinds[str(edge.kind)] = kinds.get(str(edge.kind), 0) + 1
     summary = {
         "file": str(arguments.file),
+        "source": str(source.source),
         "kind": content.kind,
         "title": content.title,
+        "content_hash": content_hash(content),
         "bytes": arguments.file.stat().st_size,
         "maps": sorted({str(n.map) for n in hybrid.nodes}),
         "nodes": len(hybrid.nodes),

@@ -25,16 +25,17 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Set the constraint, and print its effect."""
-    from mapweave.commands.map_ends import ends_of
+    from mapweave.commands.map_ends import ends_of, resolved
     from mapweave.commands.map_explain import explained_maps
+    from mapweave.hybridmap.constraint_subject import Apart
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.node import MapId
 
-    ends = ends_of(arguments.ends)
+    ends = ends_of(resolved(arguments, arguments.ends))
     first, second = (MapId(end[0], end[1]) for end in ends)
     if ends[0] == ends[1]:
         raise InvalidValue(f"{ends[0]} twice: give two different nodes or two different maps")
-    constrain(arguments, ends)
+    constrain(arguments, Apart(ends))
     if first != second:
         for explanation in explained_maps(arguments, (first, second)).maps:
             print(explanation.reason)

@@ -28,14 +28,26 @@ def add_to(commands: Any) -> None:
         "go",
         help="send a robot to a node, a position or home",
         description="Send a robot to a place of the merged map, where it parks: `mapweave go r0 r1.1.17` to "
-        "a node, `mapweave go r0 3.1,-2.0` to the node nearest to a position (m, in the frame of the robot's "
-        "component), `mapweave go r0 home` to the first node of its map. A goal that does not exist is "
-        f"refused; one that cannot be reached is given up, with the reason. {STATUS}",
+        "a node, `mapweave go r0 kitchen` to a named place "
+        "(`mapweave place`), `mapweave go r0 3.1,-2.0` to the node nearest to a position (m, in the "
+        "frame of the robot's component), `mapweave go r0 home` to the first node of its map. A "
+        "goal that does not exist is refused; one that cannot be reached is given up, with the reason. "
+        f"{STATUS}",
     )
     go.add_argument("robot", help="the robot's name, for example r0")
-    go.add_argument("goal", metavar="GOAL", help="a node (r0.1.17), a position (3.1,-2.0) or home")
+    go.add_argument(
+        "goal", metavar="GOAL", help="a node (r0.1.17), a named place, a position (3.1,-2.0) or home"
+    )
+    go.add_argument(
+        "--via", action="append", default=[], metavar="PLACE",
+        help="pass this first: a node, a place or a position; may be given again, in the order of the way",
+    )  # fmt: skip
     _add_common(go, 600.0)
-    go.set_defaults(run=lambda arguments: run(arguments, lambda f: f.go(arguments.robot, arguments.goal)))
+    go.set_defaults(
+        run=lambda arguments: run(
+            arguments, lambda f: f.go(arguments.robot, arguments.goal, via=arguments.via)
+        )
+    )
 
     explore: argparse.ArgumentParser = commands.add_parser(
         "explore",
@@ -76,7 +88,7 @@ def fleet_of(arguments: argparse.Namespace) -> Fleet:
     from mapweave.fleet import Fleet
 
     network = network_of(arguments, settings_of(arguments))
-    return Fleet(network.endpoints, network.fleet, getattr(arguments, "by", ""))
+    return Fleet(network.endpoints, network.fleet, getattr(arguments, "by", ""), network.keys)
 
 
 def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -> int:

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from mapweave.identities.key_folder import KeyFolder
     from mapweave.settings import NetworkSettings, Settings
+    from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -28,8 +30,11 @@ def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
         f"--{'listen' if listens else 'connect'}",
         metavar="ENDPOINT",
         dest="endpoint",
-        help=f"Zenoh endpoint to {word} (default: tcp/127.0.0.1:7447)",
+        help=f"Zenoh endpoint to {word} (default: tcp/127.0.0.1:7447, or as the keys say)",
     )
+    what = "folder of `mapweave keys init`" if listens else "key file of `mapweave keys add`"
+    group.add_argument("--keys", metavar="FOLDER" if listens else "FILE", help=what)
+    parser.set_defaults(listens=listens)
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML; the command line overrides it")
 
 
@@ -40,25 +45,95 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     return load_settings(arguments.settings)
 
 
-def network_of(arguments: argparse.Namespace, settings: Settings) -> NetworkSettings:
-    """Where the fleet is: the command line over the settings."""
+def network_of(arguments: argparse.Namespace, settings: Settings, name: str = "") -> NetworkSettings:
+    """Where the fleet is: the command line over the key file over the settings.
+
+    Args:
+        arguments: of the command line.
+        settings: of the settings file.
+        name: of the robot whose key it must be.
+
+    Raises:
+        SettingsError: the key file is missing or damaged, or of another fleet or robot.
+    """
+    from mapweave.hybridmap.errors import SettingsError
+    from mapweave.identities.key_file import read_key_file
     from mapweave.settings import NetworkSettings
 
-    given = settings.network
-    return NetworkSettings(
-        fleet=arguments.fleet or given.fleet,
-        endpoints=(arguments.endpoint,) if arguments.endpoint else given.endpoints,
-        server=given.server,
-    )
+    given, keys = settings.network, arguments.keys or settings.network.keys
+    fleet, endpoints = arguments.fleet or given.fleet, given.endpoints
+    if keys and not arguments.listens:
+        key, default = read_key_file(Path(keys)), NetworkSettings()
+        owner = key.credentials.name
+        if fleet not in (default.fleet, key.fleet):
+            raise SettingsError(f"{keys} is a key of fleet {key.fleet}, not of {fleet}")
+        if name and name != owner:
+            raise SettingsError(f"{keys} is the key of {owner}, not of {name}")
+        fleet, endpoints = key.fleet, key.endpoints if endpoints == default.endpoints else endpoints
+    if arguments.endpoint:
+        endpoints = (arguments.endpoint,)
+    return NetworkSettings(fleet=fleet, endpoints=endpoints, server=given.server, keys=keys)
 
 
 def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
     """A client connection; it opens in the background and survives a router that comes and goes."""
-    from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
-    return ZenohBus(BusSettings(mode="client", endpoints=network.endpoints)), Keys(network.fleet)
+    return ZenohBus(client_settings(network)), Keys(network.fleet)
+
+
+def client_settings(network: NetworkSettings) -> BusSettings:
+    """How a client connects."""
+    from mapweave.identities.key_file import read_key_file
+    from mapweave.wire.bus_settings import BusSettings
+
+    credentials = read_key_file(Path(network.keys)).credentials if network.keys else None
+    return BusSettings(mode="client", endpoints=network.endpoints, credentials=credentials)
+
+
+def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings, KeyFolder | None]:
+    """How a router listens: with the fleet's keys, or on this machine alone.
+
+    Args:
+        network: where to listen, and the folder of the keys.
+        server: name of the map server whose key the router has.
+
+    Raises:
+        SettingsError: there are no keys in the folder, or none of this server.
+    """
+    from mapweave.hybridmap.errors import SettingsError
+    from mapweave.identities.key_folder import KeyFolder
+    from mapweave.settings import NetworkSettings
+    from mapweave.wire.bus_settings import BusSettings
+
+    if not network.keys:
+        return BusSettings(mode="router", listen=network.endpoints, fleet=network.fleet), None
+    folder, default = KeyFolder(Path(network.keys)), NetworkSettings()
+    fleet = folder.catalogue.fleet
+    if network.fleet not in (default.fleet, fleet):
+        raise SettingsError(f"{network.keys} has the keys of fleet {fleet}, not of {network.fleet}")
+    listen = () if network.endpoints == default.endpoints else network.endpoints
+    return folder.router(server, listen), folder
+
+
+def renew_access(bus: ZenohBus, folder: KeyFolder, settings: BusSettings, server: str) -> BusSettings:
+    """Let the router read its keys again if they have changed; robots connect again by themselves.
+
+    Returns:
+        The settings in use.
+    """
+    from mapweave.hybridmap.errors import MapweaveError
+
+    try:
+        if not folder.changed():
+            return settings
+        settings = folder.router(server, settings.listen)
+        bus.reopen(settings)
+        print("the keys have changed: all connect again", flush=True)
+    except MapweaveError as error:
+        print(f"the keys cannot be read again: {error}", file=sys.stderr, flush=True)
+    return settings
 
 
 def warn_without_router(bus: ZenohBus, name: str) -> None:

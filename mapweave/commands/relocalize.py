@@ -1,4 +1,4 @@
-"""`mapweave relocalize`: ask a running server where an image was taken."""
+"""`mapweave relocalize`: where an image was taken, by a running server or by a map."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
 from mapweave.commands.network import add_network, connect, network_of, settings_of
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.node import Node, NodeId
-    from mapweave.hybridmap.query import RelocalizeAnswer
+    from mapweave.hybridmap.query import RelocalizeAnswer, View
     from mapweave.settings import NetworkSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
@@ -24,8 +25,9 @@ def add_to(commands: Any) -> None:
     """Declare the command."""
     parser: argparse.ArgumentParser = commands.add_parser(
         "relocalize",
-        help="ask a running server where an image was taken",
-        description="Extract an image's features and ask the map server where it was taken. "
+        help="where an image was taken",
+        description="Extract an image's features and ask the map server where it was taken; or, with --map, "
+        "answer from a map: `mapweave relocalize --map office.mapweave photo.png`. "
         "Exit status 0: found; 2: unknown, ambiguous, or the place without a pose; 1: could not ask.",
     )
     parser.add_argument("image", type=Path, help="png, jpg, pgm or bmp")
@@ -33,6 +35,7 @@ def add_to(commands: Any) -> None:
         "--camera", type=Path, metavar="FILE",
         help="camera.toml with the intrinsics (default: next to the image or one folder up)",
     )  # fmt: skip
+    parser.add_argument("--map", type=Path, metavar="FILE", help=f"answer from {SOURCES}; no server is asked")
     parser.add_argument(
         "--draw", type=Path, metavar="PNG",
         help="draw the best candidate's landmarks next to the image, joined where they match",
@@ -48,12 +51,11 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.recordings.camera_file import read_camera
     from mapweave.drawing.match_picture import draw_matches
     from mapweave.hybridmap.errors import DeviceError
-    from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
+    from mapweave.hybridmap.query import Certainty
     from mapweave.mapserver.http.json_values import json_values
     from mapweave.storage.image_file import read_grey
     from mapweave.vision.lens import Lens
     from mapweave.vision.sift import Sift
-    from mapweave.wire.messages import decode, encode_view
 
     if not arguments.image.exists():
         raise DeviceError(f"{arguments.image}: no such file")
@@ -69,26 +71,49 @@ def run(arguments: argparse.Namespace) -> int:
     grey = read_grey(arguments.image, camera, str(camera_file))
     lens = Lens(camera, distortion)
     view = Sift(lens).extract(grey).view(camera)
-    network = network_of(arguments, settings_of(arguments))
-    bus, keys = connect(network)
-    node: Node | None = None
-    try:
-        payload = _ask(bus, network, keys.any_relocalize(), encode_view(view), arguments.timeout)
-        answer = decode(payload, RelocalizeAnswer)
-        if arguments.draw is not None and answer.candidates:
-            node = _node(bus, keys, network, answer.candidates[0].node, arguments.timeout)
-    finally:
-        bus.close()
+    if arguments.map is None:
+        answer, node = _by_server(arguments, view)
+    else:
+        answer, node = _by_map(arguments, view)
     if arguments.json:
         print(json.dumps(json_values(answer)))
     else:
         _print(answer)
-    if node is not None:
+    if arguments.draw is not None and node is not None:
         best = answer.candidates[0].node_from_robot.mean
         draw_matches(arguments.draw, grey, lens, node, view, best)
     elif arguments.draw is not None:
         print(f"{arguments.draw} is not drawn: no place was recognised", file=sys.stderr)
     return 0 if answer.certainty is Certainty.FOUND else 2
+
+
+def _by_server(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer, Node | None]:
+    """The answer of a running server, and the best candidate's node if it is to be drawn."""
+    from mapweave.hybridmap.query import RelocalizeAnswer
+    from mapweave.wire.messages import decode, encode_view
+
+    network = network_of(arguments, settings_of(arguments))
+    bus, keys = connect(network)
+    try:
+        payload = _ask(bus, network, keys.any_relocalize(), encode_view(view), arguments.timeout)
+        answer = decode(payload, RelocalizeAnswer)
+        if arguments.draw is None or not answer.candidates:
+            return answer, None
+        return answer, _node(bus, keys, network, answer.candidates[0].node, arguments.timeout)
+    finally:
+        bus.close()
+
+
+def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer, Node | None]:
+    """The answer of a map, and the best candidate's node."""
+    from mapweave.offline_relocalization import relocalizer_in
+
+    merged = merged_with_progress(opened(arguments.map), settings_of(arguments).merge)
+    answer = relocalizer_in(merged).answer(view)
+    if not answer.candidates:
+        return answer, None
+    best = answer.candidates[0].node
+    return answer, merged.maps[best.map].nodes[best]
 
 
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
@@ -133,15 +158,20 @@ def _print(answer: RelocalizeAnswer) -> None:
     for place in answer.candidates:
         x, y, heading = place.node_from_robot.mean.vector
         sx, sy, sh = np.sqrt(np.diag(place.node_from_robot.covariance))
+        named = f", {place.place}" if place.place else ""
         if not place.distance_known:
             print(
-                f"  node {place.node}: somewhere near it, {math.degrees(heading):+.1f} deg "
+                f"  node {place.node}{named}: somewhere near it, {math.degrees(heading):+.1f} deg "
                 f"(sigma {math.degrees(sh):.1f} deg), {place.inliers} landmarks agree, "
                 f"probability {place.probability:.3f}"
             )
             continue
         print(
-            f"  node {place.node}: {x:+.3f} m ahead, {y:+.3f} m left, {math.degrees(heading):+.1f} deg "
-            f"(sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
+            f"  node {place.node}{named}: {x:+.3f} m ahead, {y:+.3f} m left, "
+            f"{math.degrees(heading):+.1f} deg (sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
             f"{place.inliers} landmarks agree, probability {place.probability:.3f}"
         )
+    for near in answer.similar:
+        side = "left" if (near.turn or 0.0) > 0.0 else "right"
+        turn = "" if near.turn is None else f"; turn {abs(math.degrees(near.turn)):.0f} deg {side}"
+        print(f"  looks like {near.node}: {near.lacks}{turn}")

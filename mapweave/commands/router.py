@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
+from mapweave.commands.network import (
+    add_network,
+    network_of,
+    renew_access,
+    router_settings,
+    settings_of,
+    stop_on_signals,
+)
 
 
 def add_to(commands: Any) -> None:
@@ -23,15 +30,17 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Route until stopped."""
-    from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.zenoh_bus import ZenohBus
 
     network = network_of(arguments, settings_of(arguments))
+    settings, keys = router_settings(network, network.server)
     stop = stop_on_signals()
-    bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
+    bus = ZenohBus(settings)
     try:
-        print(f"router listens at {', '.join(network.endpoints)}", flush=True)
-        stop.wait()
+        print(f"router listens at {', '.join(settings.listen)}", flush=True)
+        while not stop.wait(1.0):
+            if keys is not None:
+                settings = renew_access(bus, keys, settings, network.server)
     finally:
         bus.close()
     return 0

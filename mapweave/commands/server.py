@@ -8,7 +8,15 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
+from mapweave.commands.map_input import SOURCES, opened
+from mapweave.commands.network import (
+    add_network,
+    network_of,
+    renew_access,
+    router_settings,
+    settings_of,
+    stop_on_signals,
+)
 
 LARGE = 20_000_000
 """Bytes of a store whose reading is announced, since it takes long."""
@@ -26,6 +34,11 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
     parser.add_argument("--data", type=Path, default=Path("out/server"), help="folder for the store")
+    parser.add_argument(
+        "--map", type=Path, metavar="FILE",
+        help=f"a map that is there from the start, beside the store, and that robots join: {SOURCES}; it is "
+        "read at each start and never changed",
+    )  # fmt: skip
     parser.add_argument(
         "--lockstep", action="store_true", help="answer only what is merged already: repeatable simulation"
     )
@@ -45,26 +58,29 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until stopped."""
     from mapweave.hybridmap.node import check_name
+    from mapweave.mapserver.base_map import BaseMap
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
-    from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
     logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
-    logging.getLogger("mapweave.mapserver").setLevel(logging.INFO)
+    for part in ("mapweave.mapserver", "mapweave.wire"):
+        logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
-    name, keys = check_name(arguments.name or network.server), Keys(network.fleet)
+    name = check_name(arguments.name or network.server)
+    router, folder = router_settings(network, name)
+    keys = Keys(router.fleet)
     address = None
     if arguments.http is not None:
         from mapweave.mapserver.http.web import Web, parse_address
 
         address = parse_address(arguments.http)
     stop = stop_on_signals()
-    bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
+    bus = ZenohBus(router)
     try:
         how = ServerSettings(settings.admission_control, settings.merge)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
@@ -72,10 +88,15 @@ def run(arguments: argparse.Namespace) -> int:
             path = arguments.data / f"{name}.sqlite"
             if path.exists() and path.stat().st_size > LARGE:
                 print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
-            server = MapServer(bus, keys, path, name, how, schedule)
+            base = None
+            if arguments.map is not None:
+                base = BaseMap.of(str(arguments.map), opened(arguments.map).content)
+            server = MapServer(bus, keys, path, name, how, schedule, base)
+            if base is not None:
+                print(f"with {base}", flush=True)
             stack.enter_context(server)
-            where = ", ".join(network.endpoints)
-            print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
+            where = ", ".join(router.listen)
+            print(f"map server {name} of fleet {keys.fleet} listens at {where}", flush=True)
             if address is not None:
                 stack.enter_context(Web(address, server, commands=arguments.http_commands))
                 print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
@@ -83,6 +104,8 @@ def run(arguments: argparse.Namespace) -> int:
             manager.ready()
             while not stop.wait(1.0):
                 manager.alive()
+                if folder is not None:
+                    router = renew_access(bus, folder, router, name)
                 now = server.summary()
                 if now != last_line:
                     print(now, flush=True)

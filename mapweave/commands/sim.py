@@ -10,6 +10,7 @@ from typing import Any
 
 from mapweave.commands.network import (
     add_network,
+    client_settings,
     network_of,
     settings_of,
     stop_on_signals,
@@ -207,7 +208,7 @@ def run_serve(arguments: argparse.Namespace) -> int:
     if arguments.listen:
         bus = ZenohBus(BusSettings(mode="router", listen=(arguments.listen,)))
     else:
-        bus = ZenohBus(BusSettings(mode="client", endpoints=network.endpoints))
+        bus = ZenohBus(client_settings(network))
         warn_without_router(bus, "the simulator")
     try:
         run_sim(bus, network.fleet, scenario.world(seed), scenario.robots, seed, stop, arguments.held)

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mapweave.doctor.finding import Finding, good, warning, wrong
@@ -22,6 +23,7 @@ PATIENCE = 3.0
 
 def examine(network: NetworkSettings) -> Iterator[Finding]:
     """Knock at each endpoint, then ask the map server how it is."""
+    from mapweave.identities.key_file import read_key_file
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -32,12 +34,14 @@ def examine(network: NetworkSettings) -> Iterator[Finding]:
             "start `mapweave server` or `mapweave router` there, or give --connect; --offline skips it",
         )  # fmt: skip
         return
-    bus = ZenohBus(BusSettings(endpoints=network.endpoints))
+    credentials = read_key_file(Path(network.keys)).credentials if network.keys else None
+    bus = ZenohBus(BusSettings(endpoints=network.endpoints, credentials=credentials))
     try:
         if not bus.wait_connected(PATIENCE):
             yield wrong(
-                SUBJECT, f"something listens at {', '.join(network.endpoints)} that is no Zenoh router",
-                "give the endpoint of `mapweave server` with --connect",
+                SUBJECT, f"something listens at {', '.join(network.endpoints)} that is no Zenoh router"
+                + (", or it refuses this key" if network.keys else ""),
+                "give the endpoint of `mapweave server` with --connect, and the robot's key file with --keys",
             )  # fmt: skip
             return
         yield _answer(bus, network)

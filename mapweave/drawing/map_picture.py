@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mapweave.drawing.names import Name, draw_names
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.floorplan import FloorPlan
@@ -19,6 +20,14 @@ from mapweave.storage.atomic_file import write_whole
 
 WIDTH = 12.0
 """Of a picture, inches."""
+MOST_ARROWS = 600
+"""Nodes with arrows: where there are more they would hide each other."""
+ARROW = 1.0 / 42.0
+"""Length of an arrow as a share of the picture's width."""
+ALONG = 16
+"""Points along an edge that names keep clear of."""
+MOST_NODES = 150
+"""Nodes whose names are tried: more cannot be told apart in a picture of this width."""
 _PARTS = re.compile(r"[0-9]+|[^0-9]+")
 COLOURS = (
     "#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0", "#b8860b", "#555555",
@@ -81,6 +90,7 @@ class MapPicture:
         landmarks: (N, 2) m, points that nodes see.
         starts: where each robot began.
         false: links that are known to be false; they are highlighted.
+        places: positions of named places, m.
     """
 
     title: str
@@ -91,6 +101,7 @@ class MapPicture:
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
     starts: Mapping[str, Pose2] = field(default_factory=dict)
     false: frozenset[EdgeId] = frozenset()
+    places: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def outline_of(plan: FloorPlan) -> Outline:
@@ -113,6 +124,25 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     figure = Figure(figsize=(WIDTH, _height(picture)), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
+    draw_on(axes, picture)
+    if axes.get_legend_handles_labels()[0]:
+        # Below the plan, wherever that ends: the layout makes room for it.
+        figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = io.BytesIO()
+    figure.draw_without_rendering()
+    draw_names(axes, _names(picture), _marks(picture))
+    figure.savefig(image, format="png")
+    write_whole(path, image.getvalue())
+
+
+def draw_on(axes: Any, picture: MapPicture) -> None:
+    """Draw into a picture of one's own.
+
+    Args:
+        axes: of matplotlib.
+        picture: what to draw.
+    """
     _draw_outline(axes, picture.outline)
     if len(picture.landmarks):
         axes.plot(*picture.landmarks.T, ".", color="#999999", markersize=1.2, zorder=1, alpha=0.6)
@@ -121,26 +151,81 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     _draw_nodes(axes, picture, colours)
     _draw_starts(axes, picture.starts, colours)
     _draw_drives(axes, picture.drives)
+    for x, y in picture.places.values():
+        axes.plot(x, y, "D", color="#222222", markersize=6, markeredgecolor="white", zorder=6)
     axes.set_aspect("equal")
+    left, right, bottom, top = bounds_of(picture)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
     _draw_scale(axes)
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     axes.set_title(picture.title)
-    if axes.get_legend_handles_labels()[0]:
-        # Below the plan, wherever that ends: the layout makes room for it.
-        figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image = io.BytesIO()
-    figure.savefig(image, format="png")
-    write_whole(path, image.getvalue())
+
+
+def bounds_of(picture: MapPicture) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top, m: all but landmarks that lie far from the others.
+
+    Depths of some landmarks are wrong by far. Those beyond the middle nine tenths by more than a quarter of
+    these do not widen the picture: landmarks that are evenly spread all stay in.
+    """
+    shown = [corners for _, corners in picture.outline.rooms] + list(picture.outline.solids)
+    shown += [drive.positions for drive in picture.drives]
+    poses = [*picture.poses.values(), *picture.starts.values()]
+    shown.append(np.array([[pose.x, pose.y] for pose in poses]).reshape(-1, 2))
+    shown.append(np.array([*picture.places.values()]).reshape(-1, 2))
+    if len(picture.landmarks):
+        low, high = np.percentile(picture.landmarks, [5, 95], axis=0)
+        more = 0.25 * (high - low)
+        shown.append(np.clip([low - more, high + more], picture.landmarks.min(0), picture.landmarks.max(0)))
+    points = np.concatenate(shown)
+    if not len(points):
+        return -1.0, 1.0, -1.0, 1.0
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = max(0.04 * float((high - low).max()), 0.3)
+    (left, bottom), (right, top) = (low - margin).tolist(), (high + margin).tolist()
+    return left, right, bottom, top
+
+
+def _names(picture: MapPicture) -> list[Name]:
+    """What is written, most important first: places, robots, then nodes, evenly spread."""
+    names = [Name(name, x, y, "#222222", 11, True) for name, (x, y) in picture.places.items()]
+    colours = colours_of([*(n.agent for n in picture.poses), *picture.starts])
+    nodes = sorted(picture.poses)
+    begun = {node.agent: picture.poses[node] for node in reversed(nodes)} | dict(picture.starts)
+    for robot, pose in sorted(begun.items()):
+        names.append(Name(robot, pose.x, pose.y, colours[robot], 11, True))
+    # Every second node, then those half-way between, and so on: wherever it ends, it is even.
+    digits = max(len(nodes) - 1, 1).bit_length()
+    order = sorted(range(len(nodes)), key=lambda k: f"{k:0{digits}b}"[::-1])
+    for node in (nodes[k] for k in order[:MOST_NODES]):
+        pose = picture.poses[node]
+        names.append(Name(str(node), pose.x, pose.y, colours[node.agent], 6.5))
+    return names
+
+
+def _marks(picture: MapPicture) -> Array:
+    """Points that names keep clear of: nodes, where they look, and along edges; (N, 2) m."""
+    left, right, _, _ = bounds_of(picture)
+    points = np.array([pose.vector for pose in picture.poses.values()]).reshape(-1, 3)
+    ahead = (right - left) * ARROW * np.stack([np.cos(points[:, 2]), np.sin(points[:, 2])], axis=1)
+    known = [edge for edge in picture.edges if edge.a in picture.poses and edge.b in picture.poses]
+    ends = np.array(
+        [[(pose.x, pose.y) for pose in (picture.poses[e.a], picture.poses[e.b])] for e in known]
+    ).reshape(-1, 2, 2)
+    along = np.linspace(0.0, 1.0, ALONG)[:, None, None]
+    return np.concatenate(
+        [
+            points[:, :2],
+            *(points[:, :2] + share * ahead for share in (0.5, 1.0) if not _crowded(picture)),
+            ((1.0 - along) * ends[:, 0] + along * ends[:, 1]).reshape(-1, 2),
+        ]
+    )
 
 
 def _height(picture: MapPicture) -> float:
-    """Of the figure, inches: as the building needs it, within reason."""
-    shown = [corners for _, corners in picture.outline.rooms] + list(picture.outline.solids)
-    shown.append(np.array([[p.x, p.y] for p in picture.poses.values()]).reshape(-1, 2))
-    points = np.concatenate(shown)
-    width, height = np.ptp(points, axis=0) if len(points) else (1.0, 1.0)
+    """Of the figure, inches: as the map needs it, within reason."""
+    left, right, bottom, top = bounds_of(picture)
+    width, height = right - left, top - bottom
     legend = 0.25 * math.ceil((len(picture.starts) + 6) / 6)
     return float(np.clip(0.92 * WIDTH * height / max(width, 1e-6), 4.5, 12.0) + 1.0 + legend)
 
@@ -169,37 +254,49 @@ def _draw_scale(axes: Any) -> None:
 
 
 def _draw_edges(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> None:
-    labelled = set()
+    from matplotlib.collections import LineCollection
+
+    segments: dict[tuple[str, str, float, float, float, str], list[tuple[tuple[float, float], ...]]] = {}
     for edge in picture.edges:
         if edge.a not in picture.poses or edge.b not in picture.poses:
             continue
         a, b = picture.poses[edge.a], picture.poses[edge.b]
         if edge.id in picture.false:
-            label, colour, width, alpha, order, style = "false link", "#000000", 2.2, 1.0, 4.5, ":"
+            style = "false link", "#000000", 2.2, 1.0, 4.5, ":"
         elif edge.kind is EdgeKind.MERGED:
-            label, colour, width, alpha, order, style = "link between maps", "#e6007e", 1.6, 0.9, 4.0, "-"
+            style = "link between maps", "#e6007e", 1.6, 0.9, 4.0, "-"
         elif edge.kind is EdgeKind.LOOP:
-            label, colour, width, alpha, order, style = "loop within a map", "#7a7a7a", 1.0, 0.6, 2.0, "-"
+            style = "loop within a map", "#7a7a7a", 1.0, 0.6, 2.0, "-"
         else:
-            label, colour, width, alpha, order, style = "", colours[edge.a.agent], 1.0, 0.6, 2.0, "-"
-        axes.plot(
-            [a.x, b.x], [a.y, b.y], style, color=colour, linewidth=width, alpha=alpha, zorder=order,
-            label=None if label in labelled else label or None,
+            style = "", colours[edge.a.agent], 1.0, 0.6, 2.0, "-"
+        segments.setdefault(style, []).append(((a.x, a.y), (b.x, b.y)))
+    for (label, colour, width, alpha, order, dashes), lines in segments.items():
+        axes.add_collection(
+            LineCollection(
+                lines, colors=colour, linewidths=width, alpha=alpha, zorder=order, linestyles=dashes,
+                label=label or None,
+            )
         )  # fmt: skip
-        labelled.add(label)
+
+
+def _crowded(picture: MapPicture) -> bool:
+    return len(picture.poses) > MOST_ARROWS
 
 
 def _draw_nodes(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> None:
+    crowded = _crowded(picture)
     for agent, colour in colours.items():
         own = np.array([p.vector for n, p in picture.poses.items() if n.agent == agent])
         if not len(own):
             continue
-        axes.quiver(
-            own[:, 0], own[:, 1], np.cos(own[:, 2]), np.sin(own[:, 2]), color=colour,
-            angles=np.degrees(own[:, 2]), scale=42, width=0.0022, headwidth=4, zorder=3,
-        )  # fmt: skip
+        if not crowded:
+            axes.quiver(
+                own[:, 0], own[:, 1], np.cos(own[:, 2]), np.sin(own[:, 2]), color=colour,
+                angles=np.degrees(own[:, 2]), scale=1.0 / ARROW, width=0.0022, headwidth=4, zorder=3,
+            )  # fmt: skip
         label = f"{agent}: {len(own)} nodes"
-        axes.plot(own[:, 0], own[:, 1], "o", color=colour, markersize=4, zorder=3, label=label)
+        size = 2 if crowded else 4
+        axes.plot(own[:, 0], own[:, 1], "o", color=colour, markersize=size, zorder=3, label=label)
 
 
 def _draw_starts(axes: Any, starts: Mapping[str, Pose2], colours: Mapping[str, str]) -> None:

@@ -1,25 +1,26 @@
-"""A drive with odometry: one robot of its splits.toml maps as it does when carried, the others ask."""
+"""A drive with odometry whose robots ask a map: that which another robot makes when carried along, or any."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
-from mapweave.agent.observation import RobotDescription
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.asking_again import Asked, Trial, trials_of
 from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import LEVELS, SURE, Verdict
 from mapweave.hybridmap.change import Change
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.hybridmap.query import Whereabouts
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.offline_relocalization import relocalizer_in
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
@@ -32,16 +33,32 @@ NEAR = (LEVELS[-1][0], math.degrees(TURN))
 
 
 class DriveMap:
-    """What the mapping robot has left behind, and the places where it was.
+    """A map, and the places where its robots were.
 
     Attributes:
-        description: of the robot.
-        nodes: how many were made.
-        covered: truth of all its images.
+        nodes: how many the map has.
+        covered: truth of the places that were mapped.
         trials: of the robots that have asked to their end.
     """
 
-    def __init__(self, robot: Replay, truth: Truth, settings: AgentSettings, ticks: Iterable[int]) -> None:
+    def __init__(
+        self, nodes: Mapping[NodeId, Node], relocalizer: Relocalizer, covered: list[Pose2], truth: Truth
+    ) -> None:
+        """Take a map.
+
+        Args:
+            nodes: of the map.
+            relocalizer: answers by it.
+            covered: see the class.
+            truth: for scoring alone.
+        """
+        self.nodes, self.covered = len(nodes), covered
+        self.trials: list[Trial] = []
+        self._stamps = {node.id: node.stamp_ns for node in nodes.values()}
+        self._relocalizer, self._truth = relocalizer, truth
+
+    @staticmethod
+    def of_pass(robot: Replay, truth: Truth, settings: AgentSettings, ticks: Iterable[int]) -> DriveMap:
         """Map.
 
         Args:
@@ -50,35 +67,44 @@ class DriveMap:
             settings: of the pipeline.
             ticks: as many numbers as there are images; going through them shows progress.
         """
-        self.description: RobotDescription = robot.describe()
-        self.covered: list[Pose2] = []
-        self.trials: list[Trial] = []
+        covered = []
         map_id = MapId("map", 1)
-        pipeline = Pipeline(map_id, self.description, settings)
+        pipeline = Pipeline(map_id, robot.describe(), settings)
         pipeline.set_mission(Carried())
         merger, sequence = Merger(), 0
         for _, observation in zip(ticks, iter(robot.sense, None), strict=False):
             assert observation is not None, "the recording ends the loop"
             if (pose := truth.at(observation.stamp_ns)) is not None:
-                self.covered.append(pose)
+                covered.append(pose)
             for change in pipeline.step(observation, ()).changes:
                 sequence += 1
                 merger.on_change(Change(map_id, sequence, observation.stamp_ns, change))
         merged = merger.merged()
-        self.nodes = len(merged.poses)
-        self._truth = truth
-        self._merger = merger
-        self._relocalizer = Relocalizer(merger.places, merger.node, merged)
-        self._sift = Sift(Lens(self.description.camera, self.description.distortion))
+        relocalizer = Relocalizer(merger.places, merger.node, merged)
+        return DriveMap(merged.maps[map_id].nodes if merged.maps else {}, relocalizer, covered, truth)
+
+    @staticmethod
+    def of_map(merged: MergedMap, truth: Truth) -> DriveMap:
+        """Take a map that is there. Where its nodes truly are follows from their stamps.
+
+        Args:
+            merged: the map.
+            truth: of the same clock as the nodes' stamps, for scoring alone.
+        """
+        nodes = {node.id: node for one in merged.maps.values() for node in one.nodes.values()}
+        covered = [pose for node in nodes.values() if (pose := truth.at(node.stamp_ns)) is not None]
+        return DriveMap(nodes, relocalizer_in(merged), covered, truth)
 
     def questions(self, robot: Replay) -> Iterator[Verdict]:
         """Ask where each image of another pass was taken; at the end `trials` has what robots make of it."""
+        description = robot.describe()
+        sift = Sift(Lens(description.camera, description.distortion))
         asked, true_poses = list[Asked](), list[Pose2 | None]()
         odom_from_robot, way, turned = Pose2(), 0.0, 0.0
         while (observation := robot.sense()) is not None:
             assert observation.image is not None, "a recording has all its images"
             began = time.perf_counter()
-            view = self._sift.extract(observation.image).view(self.description.camera)
+            view = sift.extract(observation.image).view(description.camera)
             extracted = time.perf_counter()
             answer = self._relocalizer.answer(view)
             done = time.perf_counter()
@@ -122,8 +148,8 @@ class DriveMap:
 
     def _error(self, place: Whereabouts, true: Pose2 | None) -> tuple[float, float]:
         """Of the position, m, and of the heading, degrees; NaN without truth."""
-        node = self._merger.node(place.node)
-        at_node = None if node is None else self._truth.at(node.stamp_ns)
+        stamp_ns = self._stamps.get(place.node)
+        at_node = None if stamp_ns is None else self._truth.at(stamp_ns)
         if true is None or at_node is None:
             return math.nan, math.nan
         answered = at_node @ (place.node_from_robot.mean if place.distance_known else Pose2())

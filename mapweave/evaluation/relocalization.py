@@ -23,6 +23,7 @@ from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import Verdict, figures
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.image_file import read_grey
 from mapweave.vision.lens import NO_DISTORTION, Distortion
 
@@ -107,10 +108,34 @@ def _examine_drive(folder: Path, settings: AgentSettings, console: Console) -> R
     truth = Truth.read(folder / "truth.csv")
     mapping, asking = Replay(folder, names[0]), [Replay(folder, name) for name in names[1:]]
     ticks = track(range(len(mapping)), f"{names[0]} maps", console=console)
-    drive = DriveMap(mapping, truth, settings, ticks)
-    total = sum(map(len, asking))
+    drive = DriveMap.of_pass(mapping, truth, settings, ticks)
+    return _ask(folder, drive, asking, truth, console)
+
+
+def evaluate_map(
+    folder: Path, robot: str | None, merged: MergedMap, console: Console
+) -> RelocalizationEvaluation:
+    """Ask a map that is there where each image of a drive was taken.
+
+    Args:
+        folder: the recording of the drive, with odometry. Its truth.csv tells also where the map's nodes are,
+            by their stamps; without it nothing is scored.
+        robot: one of its splits.toml; None: the whole recording.
+        merged: the map.
+        console: shows progress.
+
+    Raises:
+        DeviceError: the folder lacks what is needed, or a file is wrong.
+    """
+    truth = Truth.read(folder / "truth.csv")
+    return _ask(folder, DriveMap.of_map(merged, truth), [Replay(folder, robot)], truth, console)
+
+
+def _ask(
+    folder: Path, drive: DriveMap, asking: Sequence[Replay], truth: Truth, console: Console
+) -> RelocalizationEvaluation:
     questions = (verdict for robot in asking for verdict in drive.questions(robot))
-    verdicts = list(track(questions, f"{', '.join(names[1:])} ask", total=total, console=console))
+    verdicts = list(track(questions, "asking", total=sum(map(len, asking)), console=console))
     about = {"folder": folder.name, "nodes": drive.nodes, "truth": bool(truth.poses)}
     return RelocalizationEvaluation(about, {"depths": verdicts}, drive.trials)
 

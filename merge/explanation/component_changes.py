@@ -110,19 +110,18 @@ def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> 
     held = [link for link in links if (link.a.map in part) != (link.b.map in part)]
     pairs = {link.pair for link in held}
     reasons = Counter(r.reason for r in after.refused if r.pair in pairs and r.edge is None)
-    retired = after.constraints.retired
-    away = [next((end.map for end in pair if end.map in retired), None) for pair in pairs]
+    away = [next(filter(None, map(after.constraints.retires, pair)), None) for pair in pairs]
     removed = [
         pair
         for pair, which in zip(pairs, away, strict=True)
         if which is None and (pair[0] not in after.poses or pair[1] not in after.poses)
     ]
     reasons_in_words = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
-    for which, count in sorted(Counter(map_id for map_id in away if map_id is not None).items()):
-        reasons_in_words.append(f"{_links(count)} gone, since {reason_of(retired[which])}")
+    whys = Counter(reason_of(constraint) for constraint in away if constraint is not None)
+    reasons_in_words += [f"{_links(count)} gone, since {why}" for why, count in sorted(whys.items())]
     if removed:
         reasons_in_words.append(f"{_links(len(removed))} gone with a node")
-    left = len(pairs) - sum(reasons.values()) - len(removed) - sum(map_id is not None for map_id in away)
+    left = len(pairs) - sum(reasons.values()) - len(removed) - whys.total()
     if left > 0:
         reasons_in_words.append(f"{_links(left)} no longer among the most similar pairs")
     return "; ".join(reasons_in_words) or "a map has fallen into pieces"

@@ -10,6 +10,7 @@ from itertools import combinations
 
 import networkx as nx
 
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import MapsExplanation, NearMiss
 from mapweave.hybridmap.manual_constraint import reason_of
@@ -156,7 +157,7 @@ def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[
     # A map may be in several pieces, so a way over maps is only a hint.
     way = nx.shortest_path(graph, first, second) if first in graph and second in graph else [first, second]
     over = ", ".join(map(str, way[1:-1])) or "each other's pieces"
-    apart = any(set(r.ends) == {first, second} for r in merged.constraints.in_force)
+    apart = merged.constraints.standing(Apart((first, second))) is not None
     more = ", by a manual constraint; to separate them undo the links of that way too" if apart else ""
     return f"{first} and {second} are one map by way of {over}; no link joins the two directly{more}"
 
@@ -175,8 +176,9 @@ def _why_apart(
     nearest: Sequence[NearMiss],
 ) -> str:
     head = f"{first} and {second} are not one map"
-    ends = ((first, second), (first, first), (second, second))
-    constraint = next((r for r in merged.constraints.in_force if r.ends in ends), None)
+    constraints = merged.constraints
+    constraint = constraints.standing(Apart((first, second)))
+    constraint = constraint or constraints.retired.get(first) or constraints.retired.get(second)
     if constraint is not None:
         return f"{head}: {reason_of(constraint)}"
     if refused:

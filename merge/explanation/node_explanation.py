@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import LinkAgreement, Misfit, PairExplanation, Standing
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -62,9 +63,7 @@ def explain_nodes(
         claims=(*claims(merged, first.id, second.id, own), *consequences(merged, link, first.id, second.id)),
         constraints=merged.constraints.about(first.id, second.id),
     )
-    retired = next(
-        (r for m, r in merged.constraints.retired.items() if m in (first.id.map, second.id.map)), None
-    )
+    retired = merged.constraints.retires(first.id) or merged.constraints.retires(second.id)
     if retired is not None:
         return replace(explanation, standing=Standing.UNDONE, reason=reason_of(retired))
     other_links: tuple[LinkAgreement, ...] = ()
@@ -93,6 +92,9 @@ def _verdict(
     """What has become of two nodes, and why, in words."""
     first, second = ends
     if link is not None:
+        by_hand = merged.constraints.links.get(link.pair)
+        if by_hand is not None:
+            return Standing.LINKED, _by_hand_in_words(merged, by_hand)
         count = sum(w.agrees and w.kept for w in other_links)
         return Standing.LINKED, f"{_landmarks(link)}, {_other_links_in_words(count)}"
     constraint = merged.constraints.against(first.id, second.id)
@@ -174,6 +176,15 @@ def _landmarks(link: Link) -> str:
         return f"{link.weight} landmarks agree on one pose"
     inliers = link.weight + link.aliased
     return f"{inliers} landmarks agree on one pose, {link.aliased} of them found at other places too"
+
+
+def _by_hand_in_words(merged: MergedMap, linked: Linked) -> str:
+    constraint = merged.constraints.standing(linked)
+    assert constraint is not None, "it is in force"
+    inliers = int(dict(linked.evidence).get("inliers", 0))
+    support = f"{inliers} landmarks of the images agree on the pose" if inliers else "the pose is a person's"
+    against = merged.contradicted.get((linked.a, linked.b))
+    return f"{reason_of(constraint)}; {support}{f'; {against}' if against else ''}"
 
 
 def _other_links_in_words(count: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import pairwise
 
@@ -21,6 +22,7 @@ from mapweave.merge.settings import ExclusionSettings
 
 Key = tuple[NodeId, NodeId]
 """Names of two fragments, smaller first."""
+Pair = tuple[NodeId, NodeId]
 REACH = 8.0
 """Robots further apart than this neither meet nor see each other, m."""
 
@@ -57,7 +59,7 @@ class Refutation:
         if len(ends.keys() & self._trajectories.keys()) < 2:
             return ""
         graph = ComponentSolver(list(ends.values())).solve(links)[0]
-        return next((clash.reason for _, clash in self._clashes([graph])), "")
+        return next((clash.reason for _, clash in self.clashes([graph])), "")
 
     def key_of(self, link: Link) -> Key:
         """Between which fragments a link is."""
@@ -69,8 +71,9 @@ class Refutation:
         solved: Sequence[PoseGraph],
         kept: Sequence[Link],
         changed: Collection[NodeId] | None = None,
-    ) -> dict[Key, str]:
-        """Groups that must fall, with reasons.
+        certain: Collection[Pair] = (),
+    ) -> tuple[dict[Key, str], dict[Pair, str]]:
+        """Groups that must fall, with reasons; and links by hand that are contradicted and stay.
 
         Where two pieces that clash are joined by links of their own, those are wrong: all other links between
         them agree with these. Where they are joined by way of other pieces, one group on the way is wrong,
@@ -80,22 +83,32 @@ class Refutation:
             solved: the components.
             kept: the links that made them.
             changed: fragments whose robots may collide with others since the last test; None: all.
+            certain: links by hand, which never fall, nor do others between the same two pieces.
         """
-        clashes = dict(self._clashes(solved, changed))
+        clashes = dict(self.clashes(solved, changed))
         if not clashes:
-            return {}
-        weights: dict[Key, int] = {}
+            return {}, {}
+        weights: dict[Key, float] = {}
+        by_hand: dict[Key, list[Pair]] = {}
         for link in kept:
             key = self.key_of(link)
-            weights[key] = weights.get(key, 0) + link.weight
-        direct = {key: clash.reason for key, clash in clashes.items() if key in weights}
+            if link.key in certain:
+                by_hand.setdefault(key, []).append(link.key)
+            weights[key] = weights.get(key, 0) + (math.inf if link.key in certain else link.weight)
+        contradicted = {pair: clash.reason for key, clash in clashes.items() for pair in by_hand.get(key, ())}
+        direct = {key: clash.reason for key, clash in clashes.items() if key in weights.keys() - by_hand}
         if direct:
-            return direct
-        (start, end), clash = min(clashes.items(), key=lambda item: (-item[1].evidence, item[0]))
-        weakest = _weakest_on_the_way(weights, start, end)
-        return {weakest: f"{clash.reason}, and these are the weakest links that join the two"}
+            return direct, contradicted
+        distant = {key: clash for key, clash in clashes.items() if key not in weights}
+        for (start, end), clash in sorted(distant.items(), key=lambda item: (-item[1].evidence, item[0])):
+            weakest = _weakest_on_the_way(weights, start, end)
+            if weakest not in by_hand:
+                words = f"{clash.reason}, and these are the weakest links that join the two"
+                return {weakest: words}, contradicted
+            contradicted |= dict.fromkeys(by_hand[weakest], f"{clash.reason}, and links by hand join the two")
+        return {}, contradicted
 
-    def _clashes(
+    def clashes(
         self, solved: Sequence[PoseGraph], changed: Collection[NodeId] | None = None
     ) -> Iterator[tuple[Key, Collision]]:
         """Pairs of fragments in one component that collide, by the clock with most evidence."""
@@ -140,7 +153,7 @@ def _near(graph: PoseGraph, trajectories: Sequence[RobotTrajectory]) -> Iterator
         yield from ((k, k + 1 + offset) for offset in np.flatnonzero(overlapping).tolist())
 
 
-def _weakest_on_the_way(weights: Mapping[Key, int], start: NodeId, end: NodeId) -> Key:
+def _weakest_on_the_way(weights: Mapping[Key, float], start: NodeId, end: NodeId) -> Key:
     """The weakest pair on the best supported way from one fragment to another."""
     graph: nx.Graph = nx.Graph()
     for (first, second), weight in sorted(weights.items()):

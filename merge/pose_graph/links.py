@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.explanation import ALIASED
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.node import MERGE_AUTHOR, Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.merge.pose_graph.factors import Measurement
 
-MERGE_AUTHOR = "merge"
-"""Takes the agent's place in the ids of edges that the merge makes."""
 LEAST_DISTINCT = 10
 """A link with aliased and fewer other landmarks identifies no place: a recognition needs as many."""
 AGAINST = 2

@@ -95,9 +95,10 @@ def navigator(
     goal: NodeId,
     settings: NavigatorSettings | None = None,
     body: RobotDescription = BODY,
+    via: tuple[NodeId, ...] = (),
 ) -> Navigator:
     every = AgentSettings(navigation=settings or NavigatorSettings())
-    return Navigator(body, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every)  # type: ignore[arg-type]
+    return Navigator(body, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every, via=via)  # type: ignore[arg-type]
 
 
 def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:

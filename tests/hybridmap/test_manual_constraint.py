@@ -2,33 +2,48 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave.hybridmap.area import Area, read_corner
+from mapweave.hybridmap.constraint_subject import (
+    Apart,
+    Linked,
+    RetiredMap,
+    RetiredNodes,
+    read_pose,
+    read_retired,
+    read_window,
+)
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, event_words
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 A, B = NodeId("a", 1, 3), NodeId("b", 1, 5)
+POSE = PoseGaussian(Pose2(1.0, 2.0, 0.5), np.diag([1e-3, 4e-3, 1e-4]))
 
 
-def test_the_ends_are_put_in_order():
-    assert ManualConstraint((B, A), True, "x", 0).ends == (A, B)
-    assert ManualConstraint((B.map, A.map), True, "x", 0).ends == (A.map, B.map)
+def test_what_it_is_about_is_put_in_order() -> None:
+    assert Apart((B, A)).ends == (A, B)
+    assert Apart((B.map, A.map)).ends == (A.map, B.map)
+    assert RetiredNodes((B, A, B)).nodes == (A, B)
+    turned = Linked.of(B, A, POSE.inverse(), np.array([[1, 2]]), {"inliers": 40.0})
+    assert (turned.a, turned.b, turned.shared) == (A, B, ((2, 1),))
+    assert np.allclose(turned.a_from_b.mean.vector, POSE.mean.vector)
+    assert np.allclose(turned.a_from_b.covariance, POSE.covariance)
 
 
-@pytest.mark.parametrize(
-    ("ends", "who", "why"),
-    [((A, A), "x", ""), ((A, B.map), "x", ""), ((A, B), "x\ny", ""), ((A, B), "x", "w" * 301)],
-)
-def test_invalid_constraints_are_refused(ends, who, why):
+@pytest.mark.parametrize(("who", "why"), [("x\ny", ""), ("x", "w" * 301)])
+def test_words_that_are_no_line_are_refused(who: str, why: str) -> None:
     with pytest.raises(InvalidValue):
-        ManualConstraint(ends, True, who, 0, why)
+        ManualConstraint(Apart((A, B)), True, who, 0, why)
 
 
-def test_a_constraint_on_maps_holds_for_all_their_nodes():
-    constraints = ManualConstraints([ManualConstraint((A.map, B.map), True, "anna", 1)])
+def test_a_constraint_on_maps_holds_for_all_their_nodes() -> None:
+    constraints = ManualConstraints([ManualConstraint(Apart((A.map, B.map)), True, "anna", 1)])
     assert (
         constraints.against(A, B)
         is constraints.against(NodeId("b", 1, 99), NodeId("a", 1, 98))
@@ -38,33 +53,89 @@ def test_a_constraint_on_maps_holds_for_all_their_nodes():
     assert constraints.about(B, A) == constraints.about(MapId("b", 1), MapId("a", 1)) == constraints.made
 
 
-ends = st.sampled_from([(A, B), (A, NodeId("b", 1, 7)), (A.map, B.map)])
+subjects = st.sampled_from(
+    [
+        Apart((A, B)),
+        Apart((A, NodeId("b", 1, 7))),
+        Apart((A.map, B.map)),
+        RetiredMap(A.map),
+        RetiredNodes((A, B)),
+        Linked.of(A, B, POSE),
+        Linked(A, B),
+    ]
+)
 
 
-@given(st.lists(st.tuples(ends, st.booleans()), max_size=8), st.integers(0, 8))
-def test_the_last_constraint_counts_in_any_order(made, cut):
+@given(st.lists(st.tuples(subjects, st.booleans()), max_size=8), st.integers(0, 8))
+def test_the_last_constraint_counts_in_any_order(made, cut) -> None:
     """Against a replay into a plain dictionary; and two halves joined are the whole."""
-    constraints = [ManualConstraint(e, apart, "x", k) for k, (e, apart) in enumerate(made)]
+    constraints = [ManualConstraint(about, holds, "x", k) for k, (about, holds) in enumerate(made)]
     last = {}
     for constraint in constraints:
-        last[constraint.ends] = constraint
+        last[constraint.about.key] = constraint
     whole = ManualConstraints(constraints)
-    assert set(whole.in_force) == {r for r in last.values() if r.apart}
+    assert set(whole.in_force) == {c for c in last.values() if c.holds}
     assert (ManualConstraints(constraints[cut:]) + ManualConstraints(constraints[:cut])).made == whole.made
-    assert (whole.against(B, A) is not None) == any(
-        r.apart for r in last.values() if r.ends in ((A, B), (A.map, B.map))
-    )
+    excluding = {Apart((A, B)).key, Apart((A.map, B.map)).key, RetiredMap(A.map).key}
+    excluded = any(c.holds and c.about.key in excluding for c in last.values())
+    assert (whole.against(B, A) is not None) == excluded
+    linked = last.get(Linked(A, B).key)
+    assert ((A, B) in whole.links) == (linked is not None and linked.holds and not excluded)
 
 
-def test_the_same_map_twice_retires_it_and_a_node_twice_is_refused() -> None:
+def test_retired_nodes_are_linked_with_nothing() -> None:
+    retired = ManualConstraint(RetiredNodes((A,)), True, "anna", 10**18, "repainted")
+    constraints = ManualConstraints([retired], {A: retired})
+    assert constraints.retires(A) is constraints.against(B, A) is retired
+    assert constraints.retires(B) is None and constraints.about(A, B) == (retired,)
+    assert constraints.about(A.map, B.map) == (retired,) and not constraints.about(B, NodeId("b", 1, 6))
+    assert event_words(retired) == 'node a.1.3 is retired by anna on 2001-09-09 01:46 UTC: "repainted"'
+
+
+def test_a_retired_map_is_about_all_of_its_nodes() -> None:
     first, second = MapId("r0", 1), MapId("r1", 1)
-    retired = ManualConstraint((first, first), True, "anna", 1)
-    assert retired.retires == first and ManualConstraint((first, second), True, "anna", 1).retires is None
+    retired = ManualConstraint(RetiredMap(first), True, "anna", 1)
     constraints = ManualConstraints([retired])
     assert constraints.retired == {first: retired}
     assert constraints.against(NodeId("r0", 1, 1), NodeId("r1", 1, 1)) is retired
     assert constraints.against(NodeId("r1", 1, 1), NodeId("r1", 1, 2)) is None
     assert constraints.about(first, second) == (retired,)
-    assert not ManualConstraints([retired, ManualConstraint((first, first), False, "bob", 2)]).retired
-    with pytest.raises(InvalidValue, match="two different nodes, or two maps"):
-        ManualConstraint((NodeId("r0", 1, 1), NodeId("r0", 1, 1)), True, "anna", 1)
+    assert not ManualConstraints([retired, ManualConstraint(RetiredMap(first), False, "bob", 2)]).retired
+
+
+metres = st.floats(-20.0, 20.0)
+
+
+points = st.lists(st.tuples(metres, metres), max_size=9)
+
+
+@given(points.filter(lambda some: len(some) > 2), points)
+def test_an_area_contains_what_its_sides_go_round_an_odd_number_of_times(corners, asked) -> None:
+    """Against the angle by which the polygon winds round a point."""
+    try:
+        area = Area(A, tuple(corners))
+    except InvalidValue:
+        return  # On one line.
+    for point in asked:
+        to = np.array(corners) - point
+        cross = to[:, 0] * np.roll(to[:, 1], -1) - to[:, 1] * np.roll(to[:, 0], -1)
+        dot = (to * np.roll(to, -1, axis=0)).sum(axis=1)
+        if (np.abs(cross) < 1e-6).any():
+            continue  # On a side, or beside one.
+        turns = round(float(np.arctan2(cross, dot).sum()) / (2.0 * np.pi))
+        assert area.contains(np.array([point]))[0] == (turns % 2 != 0)
+
+
+def test_subjects_as_people_write_them() -> None:
+    assert read_retired(["a.1"]) == RetiredMap(A.map) and read_retired(["b.1.5", "a.1.3"]).nodes == (A, B)
+    assert read_corner("1.5,-2") == (1.5, -2.0) and read_pose([1, 2, 180]).heading == pytest.approx(np.pi)
+    window = read_window(A.map, "1970-01-01T00:01", "1970-01-01T01:02+01:00")
+    assert (window.begin_ns, window.end_ns) == (60 * 10**9, 120 * 10**9)
+    assert read_window(A.map, "7").begin_ns == 7 and read_window(A.map, end=9).end_ns == 9
+    for wrong in (
+        lambda: read_retired(["a.1", "b.1"]), lambda: read_retired([]), lambda: read_corner("1;2"),
+        lambda: read_pose([1.0, float("nan"), 0.0]), lambda: read_window(A.map, "noon"),
+        lambda: read_window(A.map, 5, 4), lambda: Area(A, ((0.0, 0.0), (1.0, 0.0), (1e5, 1.0))),
+    ):  # fmt: skip
+        with pytest.raises(InvalidValue):
+            wrong()

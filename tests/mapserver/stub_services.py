@@ -9,6 +9,8 @@ from functools import cache
 import cv2
 import numpy as np
 
+from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.explanation import Explanation, FleetExplanation
@@ -48,12 +50,24 @@ class StubServices:
         self.answer = ANSWER
         self.holds: dict[str, Scalar] = {"nodes": 12, "summary": "12 nodes"}
         self.events: tuple[MapEvent, ...] = ()
+        self.map: MergedMap | None = None
+        self.fleet = FleetStatus()
+        self.read_only = False
+
+    def merged(self) -> MergedMap:
+        return self.map or two_maps()
+
+    def robots(self) -> FleetStatus:
+        return self.fleet
 
     def status(self) -> dict[str, Scalar]:
         return self.holds
 
     def history(self) -> tuple[MapEvent, ...]:
         return self.events
+
+    def annotations(self) -> Annotations:
+        return Annotations()
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         done: Future[RelocalizeAnswer] = Future()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -19,7 +20,7 @@ from mapweave.mapserver.merging.merger import Merger
 from synthetic.world import World, room, take_map, take_view
 
 HERE, THERE = MapId("a", 1), MapId("b", 1)
-RETIRED = ManualConstraint((THERE, THERE), True, "anna", 1, "rebuilt")
+RETIRED = ManualConstraint(RetiredMap(THERE), True, "anna", 1, "rebuilt")
 
 
 class Two:
@@ -53,7 +54,7 @@ def test_nothing_is_answered_from_a_retired_map_until_it_is_taken_back(two: Two)
     for constraints, known in (
         ([], True),
         ([RETIRED], False),
-        ([RETIRED, replace(RETIRED, apart=False)], True),
+        ([RETIRED, replace(RETIRED, holds=False)], True),
     ):
         two.merger.constrain(ManualConstraints(constraints))
         answers = two.answers()
@@ -86,7 +87,7 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
         changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
         logs[map_id] = [Change(map_id, number, 0, body) for number, body in enumerate(changes, start=1)]
     views = [take_view(world, Pose2(2.5, 2.0, 0.5 * k), rng)[0] for k in range(12)]
-    merger, retired = Merger(), ManualConstraint((maps[2], maps[2]), True, "anna", 1, "moved")
+    merger, retired = Merger(), ManualConstraint(RetiredMap(maps[2]), True, "anna", 1, "moved")
     for map_id in maps[:2]:
         for change in logs[map_id]:
             merger.on_change(change)
@@ -102,7 +103,7 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     late = take_map(world, MapId("d", 1), [Pose2(2.3, 2.0, 0.6)], rng)[0]
     merger.on_change(Change(MapId("d", 1), 1, 0, NodePut(late[0])))
     certainties(merger, views)
-    merger.constrain(ManualConstraints([retired, replace(retired, apart=False)]))
+    merger.constrain(ManualConstraints([retired, replace(retired, holds=False)]))
     assert certainties(merger, views) == with_it
     alike = merger.alike.of(late[0], merger.places, merger.node, lambda a, b: None)
     assert any(item.other.id.map == maps[2] for item in alike)

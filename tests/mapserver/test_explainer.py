@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import Apart, Ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import (
     FleetExplanation,
@@ -21,7 +22,7 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     Standing,
 )
-from mapweave.hybridmap.manual_constraint import Ends, ManualConstraint
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ExplainRequest, RouteRequest
@@ -29,8 +30,9 @@ from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSett
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.map_files import map_file_of, maps_of, merged_of
+from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.own_maps import maps_of
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
@@ -100,7 +102,8 @@ class Asker:
 
     def constrain(self, ends: Ends, apart: bool = True) -> Reply:
         return self.ask(
-            KEYS.constrain("s0"), encode(ManualConstraint(ends, apart, "anna", 10**18, "two kitchens"))
+            KEYS.constrain("s0"),
+            encode(ConstraintRequest(ManualConstraint(Apart(ends), apart, "anna", 10**18, "two kitchens"))),
         )
 
     def status(self) -> dict[str, object]:
@@ -276,7 +279,7 @@ def test_an_incomplete_merge_is_reported(stored: bytes, path: Path) -> None:
     explainer = Explainer(
         bus, KEYS, "s0", lambda: answers, admission, ConstraintRecord(store),
             lambda constraints: None, lambda: settled,
-        ConsistencySettings(), tuple, tuple,
+        MergeSettings(), tuple, tuple,
     )  # fmt: skip
     pair = merged.links[0].pair
     for request in (*map(ExplainRequest, ((A, B), pair, None)), ExplainRequest(pair, route=True)):
@@ -309,7 +312,7 @@ def test_other_links_use_the_gate_of_the_merge(path: Path) -> None:
 def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = Store(path)
     store.add_constraint(b"rubbish")
-    ConstraintRecord(store).add(ManualConstraint((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
+    ConstraintRecord(store).add(ManualConstraint(Apart((MapId("r0", 1), MapId("r1", 1))), True, "anna", 5))
     assert [constraint.who for constraint in ConstraintRecord(store).constraints.made] == ["anna"]
     assert "a manual constraint cannot be read" in caplog.text
     store.close()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
@@ -27,7 +28,7 @@ from mapweave.wire.packing import pack
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
-APART = ManualConstraints([ManualConstraint((A, B), True, "anna", 10**18, "two kitchens")])
+APART = ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 10**18, "two kitchens")])
 
 
 @pytest.fixture(scope="module")

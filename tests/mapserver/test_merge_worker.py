@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, Node
 from mapweave.hybridmap.pose import Pose2
@@ -36,7 +37,9 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
     worker = MergeWorker(LiveSchedule(), 1.0)
     assert worker.settled
     worker.start()
-    constraints = ManualConstraints([ManualConstraint((MapId("a", 1), MapId("b", 1)), True, "anna", 0)])
+    constraints = ManualConstraints(
+        [ManualConstraint(Apart((MapId("a", 1), MapId("b", 1))), True, "anna", 0)]
+    )
     worker.constrain(constraints)
     assert entered.wait(20)
     assert not worker.settled

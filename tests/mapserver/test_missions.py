@@ -5,14 +5,10 @@ from __future__ import annotations
 import http.client
 import json
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
 
-from mapweave.agent.fleet_client import FleetClient
-from mapweave.agent.mission_control import MissionControl
-from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
@@ -21,57 +17,12 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import mission_relay
 from mapweave.mapserver.http import web as web_module
 from mapweave.mapserver.http.web import Web
-from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import unpack_map_file
-from mapweave.wire.keys import Keys
-from mapweave.wire.memory import MemoryBus, MemoryHub
-from tests.mapserver.conftest import ROBOT, MappedRoom
+from tests.mapserver.conftest import MappedRoom
+from tests.mapserver.house import House
 from tests.waiting import eventually
 
-KEYS = Keys("fleet")
 THERE = NodeId("r0", 1, 3)
-
-
-class House:
-    """A map server with a mapped room, robots that do nothing but say so, and a person."""
-
-    def __init__(self, mapped: MappedRoom) -> None:
-        self.mapped, self.hub = mapped, MemoryHub()
-        self.stack = ExitStack()
-        self.buses: list[MemoryBus] = []
-        self.start_server()
-        self.person = Fleet(fleet="fleet", by="anna", bus=self.bus())
-
-    def bus(self) -> MemoryBus:
-        self.buses.append(MemoryBus(self.hub))
-        return self.buses[-1]
-
-    def start_server(self) -> None:
-        self.server: MapServer = self.stack.enter_context(MapServer(self.bus(), KEYS, self.mapped.path, "s0"))
-        eventually(lambda: self.server.status()["nodes"] == 7)
-
-    def stop_server(self) -> None:
-        self.stack.close()
-
-    def robot(self, name: str = "r0") -> tuple[FleetClient, MissionControl]:
-        control = MissionControl(name)
-        link = FleetClient(self.bus(), KEYS, replace_agent(name), control)
-        link.report(Status("standing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "explore", located=True), 1)
-        eventually(lambda: self.entry(name).status is not None)
-        return link, control
-
-    def entry(self, name: str):
-        entries = {entry.robot: entry for entry in self.person.status().robots}
-        return entries.get(name, type("Nothing", (), {"status": None, "alive": False}))
-
-    def close(self) -> None:
-        self.stop_server()
-        for bus in self.buses:
-            bus.close()
-
-
-def replace_agent(name: str):
-    return ROBOT._replace(agent=name)
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 
 from mapweave.explanation_text import route_words
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.explanation import RouteExplanation
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -170,7 +171,7 @@ def renumbered(change: NodePut | EdgePut, more: int) -> NodePut | EdgePut:
 def test_a_retired_map_is_explained_with_the_persons_name() -> None:
     merger = fleet()
     merger.constrain(
-        ManualConstraints([ManualConstraint((OTHER, OTHER), True, "anna", 10**18, "burnt down")])
+        ManualConstraints([ManualConstraint(RetiredMap(OTHER), True, "anna", 10**18, "burnt down")])
     )
     explanation = explain_route(Router(merger.merged()), nodes_of(ME)[0], nodes_of(OTHER)[0])
     assert not explanation.found and "anna" in explanation.reason and "burnt down" in explanation.reason

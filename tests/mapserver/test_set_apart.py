@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
@@ -232,8 +233,8 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
         assert whereabouts(fleet.where()) == places
         # It was said before.
         assert [event.words for event in fleet.server.history()].count(words) == 1
-        retire = ManualConstraint((BAD, BAD), True, "anna", 10**18, "it is mad")
-        reply = fleet.ask(KEYS.constrain("s0"), encode(retire))
+        retire = ManualConstraint(RetiredMap(BAD), True, "anna", 10**18, "it is mad")
+        reply = fleet.ask(KEYS.constrain("s0"), encode(ConstraintRequest(retire)))
         assert not reply.error
         assert fleet.server.settle(30)
         status = fleet.status()
@@ -241,7 +242,7 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
         assert status["event"] == "map bad.1 is no longer set apart"
         assert whereabouts(fleet.where()) == places
         never = fleet.ask(
-            KEYS.constrain("s0"), encode(ManualConstraint((MapId("x", 9),) * 2, True, "anna", 1))
+            KEYS.constrain("s0"), encode(ConstraintRequest(replace(retire, about=RetiredMap(MapId("x", 9)))))
         )
         assert "there is no map x.9" in never.error
 
@@ -261,7 +262,8 @@ def test_a_map_can_be_retired_when_nothing_can_be_merged(
         with serving(path) as fleet:
             assert not fleet.status()["nodes"]
             reply = fleet.ask(
-                KEYS.constrain("s0"), encode(ManualConstraint((BAD, BAD), True, "anna", 10**18))
+                KEYS.constrain("s0"),
+                encode(ConstraintRequest(ManualConstraint(RetiredMap(BAD), True, "anna", 10**18))),
             )
             assert not reply.error, reply.error
     with serving(path) as fleet:

@@ -22,12 +22,12 @@ pytestmark = pytest.mark.usefixtures("signals", "simulator")
 
 def test_map_files(tmp_path, capfd):
     path = tmp_path / "a.mapweave"
-    assert "cannot be read" in complaint(capfd, "map", "show", path)
-    assert "cannot be read" in complaint(capfd, "map", "show", tmp_path)
+    assert "no such file" in complaint(capfd, "map", "show", path)
+    assert "is a folder" in complaint(capfd, "map", "show", tmp_path)
     path.write_bytes(b"")
-    assert "is not a Mapweave map file" in complaint(capfd, "map", "show", path)
+    assert "is neither a map file" in complaint(capfd, "map", "show", path)
     path.write_text("{}")
-    assert "is not a Mapweave map file" in complaint(capfd, "map", "show", path)
+    assert "is neither a map file" in complaint(capfd, "map", "show", path)
     write_map_file(path, MapFile("agent", "r0.1", ()))
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])

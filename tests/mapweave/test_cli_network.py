@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave.cli import main
 from tests.mapweave.command_line import complaint
 from tests.simulator import needs_simulator
 from tests.waiting import eventually
@@ -45,8 +46,12 @@ def test_a_port_for_people_that_is_taken(capfd, port, closed, tmp_path):
 
 
 def test_an_address_of_another_machine(capfd, tmp_path):
-    output = complaint(capfd, "server", "--listen", "tcp/192.0.2.1:7447", "--data", tmp_path)
-    assert "cannot listen at tcp/192.0.2.1:7447" in output
+    there, data = "tcp/192.0.2.1:7447", tmp_path / "data"
+    assert "mapweave keys init" in complaint(capfd, "server", "--listen", there, "--data", data)
+    keys = tmp_path / "keys"
+    assert main(["keys", "init", "--profile", "lab", "--keys", str(keys)]) == 0
+    output = complaint(capfd, "server", "--keys", keys, "--listen", there, "--data", data)
+    assert f"cannot listen at {there}" in output
 
 
 def test_asking_without_a_server(capfd, recording, closed):

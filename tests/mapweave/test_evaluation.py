@@ -135,6 +135,17 @@ def test_a_drive(drive: Path, capfd, tmp_path: Path) -> None:
     assert [row["certainty"] for row in rows[-3:]] == ["unknown"] * 3
 
 
+def test_a_map_that_is_there_is_asked(drive: Path, capfd, tmp_path: Path) -> None:
+    """The journal of one robot, asked by the other."""
+    arguments = ["replay", str(drive), "--robot", "a", "--offline", "--data", str(tmp_path), "--epoch", "1"]
+    assert main(arguments) == 0
+    capfd.readouterr()
+    values = report(capfd, drive, "--map", tmp_path / "a.sqlite", "--robot", "b")
+    assert (values["queries"], values["expected"]) == (12, 9) and values["nodes"] >= 1
+    assert (values["precision"], values["false_accept"]) == (1.0, 0.0)
+    assert values["recall_at_1"] >= 0.8 and values["error_m_median"] < 0.1
+
+
 @pytest.mark.parametrize(
     ("see", "camera_toml"),
     [

@@ -49,6 +49,12 @@ CASES: list[tuple[str, str, str]] = [
     ("explore", "R0 --connect {closed}", "R0"),
     ("stop", "R0 --connect {closed}", "R0"),
     ("drive", "R0 --connect {closed}", "R0"),
+    ("keys init", "--keys {tmp}/keys", SERVER),
+    ("keys init", "--keys {tmp}/lab --profile lab", "robots find the server at"),
+    ("keys add", "r0 --keys {tmp}/lab", "copy this file"),
+    ("keys list", "--keys {tmp}/lab", "robot"),
+    ("keys bundle", "r0 --keys {tmp}/lab -o {tmp}/r0.key.toml", "the key of r0"),
+    ("keys revoke", "r0 --keys {tmp}/lab", "admitted no more"),
     ("robots", "", "koala"),
     ("doctor", "--offline --data {tmp}", "nothing is wrong"),
     ("find-port", "--list", "tty"),
@@ -66,6 +72,15 @@ CASES: list[tuple[str, str, str]] = [
     ("eval relocalize", "{recording}", SERVER),
     ("eval replay", "{recording} --out {tmp}/replay", "frames"),
     ("eval merge", "{recording}", 'needs the extras "server" and "viz"'),
+    ("open", "{own}", SERVER),
+    ("place list", "--map {merged}", SERVER),
+    ("place add", "kitchen r0.1.1 --map {merged} --out {tmp}/named.mapweave", SERVER),
+    ("place remove", "kitchen --connect {closed}", WITHOUT_SERVER),
+    ("close", "r0.1.1 r0.1.3 --connect {closed}", WITHOUT_SERVER),
+    ("reopen", "kitchen --map {merged}", SERVER),
+    ("prefer", "r0.1.1 r0.1.3 --connect {closed}", WITHOUT_SERVER),
+    ("avoid", "r0.1.1 r0.1.3 --connect {closed}", WITHOUT_SERVER),
+    ("closures", "--map {merged}", SERVER),
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said
     ("map show", "{own} --out {tmp}/own.png", VIZ),
@@ -81,6 +96,10 @@ CASES: list[tuple[str, str, str]] = [
     ("map history", "--map {merged}", "no joins"),
     ("map unmerge", "r0.1 r1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map unmerge", "r0.1 r1.1 --map {merged} --out {tmp}/apart.mapweave", SERVER),
+    ("map link", "{link} --connect {closed} --timeout 0.1", WITHOUT_SERVER),
+    ("map link", "{link} --map {merged} --check", SERVER),
+    ("map undo", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
+    ("map undo", "--map {merged}", "no manual constraint"),
     ("map retire", "r0.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map retire", "r0.1 --map {merged} --out {tmp}/less.mapweave", SERVER),
     ("map merge", "{own} -o {tmp}/out.mapweave", SERVER),
@@ -152,7 +171,8 @@ def test_without_extras_a_command_works_or_names_what_it_needs(filled: dict[str,
 def test_each_extra_is_enough_for_its_commands(filled: dict[str, object]) -> None:
     """With the server's libraries alone every command works that asks for no more."""
     lines = [f"{command} {arguments}".format(**filled) for command, arguments, words in CASES
-             if words == SERVER and "map" in command and command != "map from-photos"]  # fmt: skip
+             if words == SERVER and "map" in command
+             and command not in ("map from-photos", "map link")]  # fmt: skip
     others = [extra for extra in MODULES if extra != "server"]
     for line, (status, out, err) in zip(lines, outcomes(others, lines), strict=True):
         assert status == 0 and out and not err, f"{line}: {status}\n{out}{err}"

@@ -47,12 +47,12 @@ WAY = [*np.arange(0.0, 1.2, 0.02), *np.arange(1.2, 0.0, -0.02)]
 class Body:
     """A camera that a person carries back and forth, as fast as its agent asks."""
 
-    def __init__(self, bus: ZenohBus) -> None:
+    def __init__(self, bus: ZenohBus, robot: str = "r0") -> None:
         walls = PhotoWalls()
         self._images = [walls.render(Pose2(float(x))) for x in WAY]
         self._tick = 0
-        bus.serve(KEYS.robot_describe("r0"), lambda request: request.reply(encode_description(DESCRIPTION)))
-        bus.serve(KEYS.robot_step("r0"), self._step)
+        bus.serve(KEYS.robot_describe(robot), lambda request: request.reply(encode_description(DESCRIPTION)))
+        bus.serve(KEYS.robot_step(robot), self._step)
 
     def _step(self, request: Request) -> None:
         decode_step(request.payload)
@@ -187,7 +187,7 @@ def test_other_files_and_files_in_use_are_named(tmp_path, capfd):
     assert "no such file" in complaint(capfd, "map", "extract", tmp_path / "none")
     other = tmp_path / "other.txt"
     other.write_text("no database at all")
-    assert "other.txt: cannot be read" in complaint(capfd, "map", "extract", other)
+    assert "other.txt: is neither a map file" in complaint(capfd, "map", "extract", other)
     path = tmp_path / "r0.sqlite"
     journal = Journal(path, "r0")
     try:
@@ -196,7 +196,7 @@ def test_other_files_and_files_in_use_are_named(tmp_path, capfd):
         journal.close()
     empty = tmp_path / "empty.sqlite"
     empty.write_bytes(b"")
-    assert "neither an agent's journal nor a server's store" in complaint(capfd, "map", "extract", empty)
+    assert "nor an agent's journal nor a server's store" in complaint(capfd, "map", "extract", empty)
 
 
 def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, capfd):

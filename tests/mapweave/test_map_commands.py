@@ -218,7 +218,7 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     [
         (["explain", "r0.1.1"], "give two nodes or two maps, not 1"),
         (["explain", "r0.1.1", "r1.1"], "are a node and a map"),
-        (["explain", "here", "there"], "'here' is neither a node nor a map"),
+        (["explain", "here", "there"], "'here' is no place of this map"),
         (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
         (
             ["explain", "r0.1.1", "r1.1.2"],
@@ -234,7 +234,13 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
             "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
         ),
         (["unmerge", "r0.1", "r0.1"], "two different maps"),
-        (["retire", "r0.1.1"], "r0.1.1 is a node: give its map, r0.1"),
+        (["retire", "r0.1", "r0.1.1"], "give one map (r0.1), or nodes"),
+        (["retire", "r0.1.99"], "map r0.1 has no node 99"),
+        (["retire", "--area", "r0.1.1", "0,0 1,0"], "3 to 64 corners"),
+        (["retire", "r0.1.1", "--from", "7"], "r0.1.1 is a node: give its map, r0.1"),
+        (["link", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2"),
+        (["link", "r0.1.1", "r2.1.1", "--undo"], "r0.1.1 and r2.1.1 are not linked by hand"),
+        (["undo", "7"], "there is no constraint 7"),
         (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
         (["retire", "r0.1", "--undo"], "map r0.1 is not retired"),
         (["unmerge", "r0.1", "r1.1", "--undo"], "no manual constraint keeps r0.1 and r1.1 apart"),

@@ -5,8 +5,20 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from mapweave.drawing.map_picture import COLOURS, Drive, MapPicture, Outline, draw_map, outline_of
+from mapweave.drawing import map_picture
+from mapweave.drawing.map_picture import (
+    COLOURS,
+    Drive,
+    MapPicture,
+    Outline,
+    bounds_of,
+    draw_map,
+    outline_of,
+)
+from mapweave.drawing.names import CELL, NamePlacement
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.floorplan import FloorPlan, Rectangle
@@ -87,3 +99,68 @@ def test_small_maps_are_drawn_too(tmp_path, nodes):
 def test_ten_robots_have_colours(tmp_path):
     nodes = {NodeId(f"r{k}", 1, 1): Pose2(k, k) for k in range(10)}
     assert drawn(tmp_path, MapPicture("many", nodes, [])).size
+
+
+def overlapping(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+    """Whether two boxes (left, bottom, right, top) have room in common."""
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+MARK = st.tuples(st.floats(0, 400), st.floats(0, 300))
+WORD = st.tuples(MARK, st.floats(5, 90), st.floats(5, 20), st.booleans())
+
+
+@given(st.lists(MARK, min_size=1, max_size=30), st.lists(WORD, min_size=1, max_size=30))
+def test_names_cover_no_other_name_and_marks_only_if_they_must(marks, words):
+    placement = NamePlacement(400, 300)
+    placement.cover(np.array(marks), 4.0)
+    boxes = []
+    for (x, y), width, height, must in words:
+        place = placement.place(x, y, width, height, 4.0, must)
+        if place is None:
+            continue
+        left, bottom = place
+        box = left, bottom, left + width, bottom + height
+        assert left >= 0 and bottom >= 0 and box[2] <= 400 and box[3] <= 300
+        assert not any(overlapping(box, other) for other in boxes)
+        inside = [box[0] < u < box[2] and box[1] < v < box[3] for u, v in marks]
+        assert must or not any(inside)
+        # Beside its mark: no further away than the mark's radius, a gap and a cell.
+        assert max(box[0] - x, x - box[2], box[1] - y, y - box[3]) <= 4.0 + 2.0 + CELL
+        boxes.append(box)
+
+
+def test_places_robots_and_nodes_are_named_without_overlap(tmp_path, monkeypatch):
+    """Read off the figure itself, whose letters another library has laid out."""
+    rng = np.random.default_rng(1)
+    nodes = {NodeId(f"r{k % 3}", 1, k): Pose2(*rng.uniform(0, 12, 2), rng.uniform(-3, 3)) for k in range(120)}
+    places = {"kitchen": (6.0, 6.0), "Ladestation": (6.05, 6.05)}
+    figures = []
+    real = map_picture.draw_names
+    monkeypatch.setattr(
+        map_picture, "draw_names", lambda axes, *more: (figures.append(axes), real(axes, *more))
+    )
+    draw_map(MapPicture("many", nodes, [], places=places), tmp_path / "map.png")
+    (axes,) = figures
+    boxes = {text.get_text(): text.get_window_extent().extents for text in axes.texts if text.get_text()}
+    assert {"r0", "r1", "r2", "kitchen", "Ladestation"} <= boxes.keys()
+    assert len(boxes.keys() & set(map(str, nodes))) > 40
+    named = [boxes[name] for name in boxes if not name.endswith(" m")]
+    # What is drawn has the letters' room, and a pixel of spacing around it.
+    shrunk = [(left + 1, bottom + 1, right - 1, top - 1) for left, bottom, right, top in named]
+    assert not any(overlapping(a, b) for k, a in enumerate(shrunk) for b in shrunk[:k])
+    window = axes.get_window_extent().extents
+    assert all(a[0] >= window[0] and a[1] >= window[1] and a[2] <= window[2] for a in shrunk)
+
+
+def test_one_stray_landmark_does_not_stretch_the_picture_and_all_nodes_are_in_it():
+    landmarks = np.random.default_rng(0).uniform([0, -1], [6, 3], (100, 2))
+    near = bounds_of(MapPicture("", NODES, [], landmarks=landmarks))
+    assert near[0] <= landmarks[:, 0].min() and near[1] >= landmarks[:, 0].max(), "what is spread is all in"
+    far = bounds_of(MapPicture("", NODES, [], landmarks=np.vstack([landmarks, [900.0, -70.0]])))
+    assert far[1] - far[0] < 1.3 * (near[1] - near[0]) and far[3] - far[2] < 1.3 * (near[3] - near[2])
+    # A node is no landmark: far off as it is, it is in the picture.
+    left, right, bottom, top = bounds_of(
+        MapPicture("", {**NODES, NodeId("r2", 1, 1): Pose2(50, -20)}, [], landmarks=landmarks)
+    )
+    assert right > 50 and bottom < -20 and left < 0 and top > 3

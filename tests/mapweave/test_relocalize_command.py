@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import skimage.data
 
+from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.drawing.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
 from mapweave.hybridmap.camera import Camera
@@ -25,6 +26,7 @@ from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.server import MapServer
 from mapweave.mapserver.services import Services
+from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 from mapweave.wire.bus_settings import BusSettings
@@ -115,6 +117,29 @@ def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Pat
     assert main(["relocalize", str(photo), "--connect", served]) == 0
     result = re.search(r"node r0\.1\.1: (\S+) m ahead", capfd.readouterr().out)
     assert result is not None and float(result[1]) == pytest.approx(MOVED.x, abs=0.03)
+
+
+def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path: Path, capfd) -> None:
+    path, drawn = tmp_path / "place.mapweave", tmp_path / "matches.png"
+    write_map_file(path, MapFile("agent", "r0.1", (NodePut(node),)))
+    journal = Journal(tmp_path / "r0.sqlite", "r0")
+    journal.append(journal.open_map(1), [NodePut(node)], 0)
+    journal.close()
+    before = path.read_bytes()
+    answers = []
+    for name in ("place.mapweave", "r0.sqlite"):
+        arguments = ["--map", str(tmp_path / name), "--json", "--draw", str(drawn)]
+        assert main(["relocalize", str(photo), *arguments]) == 0
+        answers.append(json.loads(capfd.readouterr().out))
+    assert answers[0] == answers[1]
+    (place,) = answers[0]["candidates"]
+    assert place["node_from_robot"]["mean"] == pytest.approx([MOVED.x, MOVED.y, MOVED.heading], abs=0.03)
+    assert (np.abs(cv2.imread(str(drawn)).astype(int) - GREEN) < 40).all(axis=2).sum() > 1000
+    assert path.read_bytes() == before
+    cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
+    assert main(["relocalize", str(photo), "--map", str(path)]) == 2
+    assert main(["relocalize", str(photo), "--map", str(photo)]) == 1
+    assert "is neither a map file" in capfd.readouterr().err
 
 
 def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:

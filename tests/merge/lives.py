@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mapweave.hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId
@@ -89,7 +90,7 @@ class Life:
             pair = known[int(rng.integers(len(known)))]
             ends = pair if rng.random() < 0.7 or pair[0].map == pair[1].map else (pair[0].map, pair[1].map)
             self.number += 1
-            constraint = ManualConstraint(ends, bool(rng.random() < 0.6), "anna", self.number)
+            constraint = ManualConstraint(Apart(ends), bool(rng.random() < 0.6), "anna", self.number)
             self.constraints = self.constraints + ManualConstraints([constraint])
 
     def _loop(self) -> None:

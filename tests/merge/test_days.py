@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart, RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
@@ -91,14 +92,16 @@ def test_constraints_apply_to_standing_decisions() -> None:
     daily = Daily(5)
     merged = daily.live(6)
     pair = merged.links[len(merged.links) // 2].pair
-    daily.constraints = ManualConstraints([ManualConstraint(pair, True, "anna", 1)])
+    daily.constraints = ManualConstraints([ManualConstraint(Apart(pair), True, "anna", 1)])
     daily.touched |= {pair[0].map, pair[1].map}
     merged = daily.merged()
     assert "undone by anna" in merged.explain(*pair)
     check(merged, daily.rebuilt())
     daily.live(2)
     assert "undone by anna" in daily.merged().explain(*pair)
-    daily.constraints = daily.constraints + ManualConstraints([ManualConstraint(pair, False, "anna", 2)])
+    daily.constraints = daily.constraints + ManualConstraints(
+        [ManualConstraint(Apart(pair), False, "anna", 2)]
+    )
     daily.touched |= {pair[0].map, pair[1].map}
     merged = daily.merged()
     assert pair in {link.pair for link in merged.links}
@@ -108,9 +111,7 @@ def test_constraints_apply_to_standing_decisions() -> None:
 def test_maps_and_nodes_of_earlier_days_are_retired() -> None:
     daily = Daily(6)
     daily.live(6)
-    daily.constraints = ManualConstraints(
-        [ManualConstraint((MapId("r0", 2), MapId("r0", 2)), True, "anna", 1)]
-    )
+    daily.constraints = ManualConstraints([ManualConstraint(RetiredMap(MapId("r0", 2)), True, "anna", 1)])
     daily.touched.add(MapId("r0", 2))
     check(daily.merged(), daily.rebuilt())
     hybrid_map = HybridMap(daily.maps[MapId("r0", 3)].contents())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
@@ -98,7 +99,9 @@ def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int
         if life.maps and life.rng.random() < 0.05:
             which = sorted(life.maps)[int(life.rng.integers(len(life.maps)))]
             life.number += 1
-            constraint = ManualConstraint((which, which), bool(life.rng.random() < 0.6), "anna", life.number)
+            constraint = ManualConstraint(
+                RetiredMap(which), bool(life.rng.random() < 0.6), "anna", life.number
+            )
             life.constraints = life.constraints + ManualConstraints([constraint])
         if life.rng.random() < 0.4:
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)

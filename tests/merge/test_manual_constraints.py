@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -40,7 +41,7 @@ def between(merged: MergedMap) -> set[tuple[NodeId, NodeId]]:
 def test_one_link_is_undone_and_comes_back(merger: Merger) -> None:
     before = merger.merged()
     pair = before.links[0].pair
-    apart = ManualConstraint(pair, True, "anna", NOON, "two kitchens")
+    apart = ManualConstraint(Apart(pair), True, "anna", NOON, "two kitchens")
     merger.constrain(ManualConstraints([apart]))
     after = merger.merged()
     assert pair not in {link.pair for link in after.links}
@@ -48,7 +49,7 @@ def test_one_link_is_undone_and_comes_back(merger: Merger) -> None:
     assert refusal.reason == 'undone by anna on 2026-03-01 12:00 UTC: "two kitchens"'
     assert refusal.link is not None
     assert after.constraints.in_force == (apart,)
-    merger.constrain(ManualConstraints([apart, ManualConstraint(pair, False, "bob", NOON + 1)]))
+    merger.constrain(ManualConstraints([apart, ManualConstraint(Apart(pair), False, "bob", NOON + 1)]))
     again = merger.merged()
     assert [link.pair for link in again.links] == [link.pair for link in before.links]
     for node, place in before.poses.items():
@@ -59,7 +60,7 @@ def test_one_link_is_undone_and_comes_back(merger: Merger) -> None:
 
 def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) -> None:
     assert merger.merged().joined(A, B)
-    merger.constrain(ManualConstraints([ManualConstraint((A, B), True, "anna", NOON)]))
+    merger.constrain(ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", NOON)]))
     apart = merger.merged()
     assert not between(apart) and not apart.joined(A, B)
     assert all("all links between a.1 and b.1" in r.reason for r in apart.refused if r.link is not None)
@@ -77,7 +78,7 @@ def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> No
     for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
         merger.apply(third, change)
     assert "links join them" in explain_maps(merger.merged(), A, B).reason
-    merger.constrain(ManualConstraints([ManualConstraint((A, B), True, "anna", NOON)]))
+    merger.constrain(ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", NOON)]))
     explanation = explain_maps(merger.merged(), A, B).reason
     assert (
         "by way of c.1; no link joins the two directly, by a manual constraint" in explanation
@@ -85,7 +86,10 @@ def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> No
     )
     merger.constrain(
         ManualConstraints(
-            [ManualConstraint((A, B), True, "anna", NOON), ManualConstraint((A, third), True, "anna", NOON)]
+            [
+                ManualConstraint(Apart((A, B)), True, "anna", NOON),
+                ManualConstraint(Apart((A, third)), True, "anna", NOON),
+            ]
         )
     )
     assert explain_maps(merger.merged(), A, B).reason.startswith("a.1 and b.1 are not one map")
@@ -99,7 +103,7 @@ def test_a_robot_s_own_loop_can_be_undone_and_its_way_cannot(merger: Merger) -> 
     loop = Edge(NodeId("a", 1, 50), nodes[0], nodes[4], true, EdgeKind.LOOP)
     merger.apply(A, EdgePut(loop))
     assert loop.id in merger.merged().union().edges
-    made = [ManualConstraint((nodes[0], nodes[k]), True, "anna", NOON) for k in (1, 4)]
+    made = [ManualConstraint(Apart((nodes[0], nodes[k])), True, "anna", NOON) for k in (1, 4)]
     merger.constrain(ManualConstraints(made))
     merged = merger.merged()
     assert [r.pair for r in merged.refused if r.edge == loop.id] == [(nodes[0], nodes[4])]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.image_file import decode_grey, image_size, read_grey
 
 CAMERA = Camera(64, 48, 60, 60, 32, 24, 0.3)
@@ -67,6 +67,17 @@ def png(width: int, height: int) -> bytes:
     packed = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
     head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("chunk", [b"IDAT", b"IEND", b"tEXt"])
+def test_a_png_whose_chunk_claims_gigabytes_is_not_decoded(chunk, monkeypatch):
+    """The decoder takes as much memory as a chunk claims; found by fuzzing."""
+    data = png(64, 48)
+    at = data.find(chunk) if chunk in data else len(data)
+    begin = data[: at - 4] if chunk in data else data[:-12]
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(InvalidValue, match="the image is damaged"):
+        decode_grey(begin + struct.pack(">I", 0x7FFFFFF0) + chunk + bytes(40))
 
 
 def test_a_bomb_in_a_recording_is_not_decoded(tmp_path, monkeypatch):

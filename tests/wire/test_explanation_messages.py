@@ -12,7 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import NodeRetired
+from mapweave.hybridmap.constraint_subject import (
+    Apart,
+    Linked,
+    RetiredArea,
+    RetiredMap,
+    RetiredNodes,
+    RetiredWindow,
+)
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.explanation import (
     FleetExplanation,
@@ -25,7 +34,7 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     Standing,
 )
-from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest
@@ -34,6 +43,7 @@ from mapweave.wire.messages import decode, encode
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 2)
+APART = ManualConstraint(Apart((A, B)), True, "anna", 1, "why")
 NODE_A, NODE_B = NodeId("a", 1, 3), NodeId("b", 2, 5)
 
 
@@ -56,7 +66,7 @@ def explanation() -> PairExplanation:
     return PairExplanation(
         a, b, Standing.LINKED, "because", matches, matches[:1], np.array([math.nan]), pose,
         {"inliers": 12.0, "rms_px": 0.7}, 0.9, misfit, (LinkAgreement(NODE_A, NODE_B, 2.5, True, False),),
-        ("a has recognised the one at the other",), (ManualConstraint((A, B), True, "anna", 1, "why"),),
+        ("a has recognised the one at the other",), (APART,),
     )  # fmt: skip
 
 
@@ -93,11 +103,33 @@ words = st.text(st.characters(codec="utf-8", categories=["L", "N", "P", "Zs"]), 
 )
 counts = st.integers(0, 2**40)
 amounts = st.floats(0, 4e6)
+pairs_of_nodes = st.tuples(ids, ids).filter(lambda e: e[0] != e[1])
+pairs_of_maps = st.tuples(ids, ids).map(lambda e: (e[0].map, e[1].map)).filter(lambda e: e[0] != e[1])
+metres = st.floats(-1e3, 1e3)
+links_by_hand = st.builds(
+    lambda pair, mean, sigma, shared, evidence: Linked.of(
+        *pair, PoseGaussian.from_sigmas(Pose2(*mean), sigma, sigma),
+        np.array(shared, np.int64).reshape(-1, 2), evidence,
+    ),
+    pairs_of_nodes, st.tuples(metres, metres, st.floats(-3, 3)), st.floats(1e-3, 1.0),
+    st.lists(st.tuples(st.integers(0, 150), st.integers(0, 150)), max_size=5),
+    st.dictionaries(st.sampled_from(["inliers", "rms_px"]), st.floats(0, 1e3)),
+)  # fmt: skip
+corners = st.lists(st.tuples(metres, metres), max_size=8)
+areas = st.builds(
+    lambda anchor, more: Area(anchor, ((0.0, 0.0), (1.0, 0.0), (0.5, 1.5), *more)), ids, corners
+)
+windows = st.builds(
+    lambda node, begin, length: RetiredWindow(node.map, begin, begin + length),
+    ids, st.integers(0, 2**62), st.integers(0, 2**61),
+)  # fmt: skip
+subjects = st.one_of(
+    (pairs_of_nodes | pairs_of_maps).map(Apart), links_by_hand, ids.map(lambda node: RetiredMap(node.map)),
+    st.lists(ids, min_size=1, max_size=5).map(lambda nodes: RetiredNodes(tuple(nodes))),
+    areas.map(RetiredArea), windows,
+)  # fmt: skip
 constraints = st.builds(
-    ManualConstraint,
-    st.tuples(ids, ids).filter(lambda e: e[0] != e[1])
-    | st.tuples(ids, ids).map(lambda e: (e[0].map, e[1].map)).filter(lambda e: e[0] != e[1]),
-    st.booleans(), words, st.integers(0, 2**62), words,
+    ManualConstraint, subjects, st.booleans(), words, st.integers(0, 2**62), words,
 )  # fmt: skip
 maps = st.builds(
     MapsExplanation, ids.map(lambda n: n.map), ids.map(lambda n: n.map), st.booleans(), words, counts, counts,
@@ -128,8 +160,11 @@ def test_maps_come_back(explanation: FleetExplanation) -> None:
 @given(constraints)
 def test_constraints_and_questions_round_trip(constraint: ManualConstraint) -> None:
     assert decode(encode(constraint), ManualConstraint) == constraint
-    request = ExplainRequest(constraint.ends)
-    assert decode(encode(request), ExplainRequest) == request
+    asked = ConstraintRequest(constraint, True)
+    assert decode(encode(asked), ConstraintRequest) == asked
+    assert decode(encode(ConstraintList((constraint,))), ConstraintList).made == (constraint,)
+    for ends in ((A, B), (NODE_A, NODE_B)):
+        assert decode(encode(ExplainRequest(ends)), ExplainRequest).ends == ends
     assert decode(encode(ExplainRequest()), ExplainRequest).ends is None
 
 
@@ -159,22 +194,31 @@ def test_a_damaged_explanation_is_refused_in_one_line(field: str, value: Any) ->
     assert decode(msgpack.packb({**fields, "misfit": MISFIT}), PairExplanation).misfit is not None
 
 
-def constrained(*ends: list[Any]) -> bytes:
-    rest = {"apart": True, "who": "x", "stamp_ns": 0, "because": ""}
-    return msgpack.packb({"v": 1, "ends": list(ends), **rest})
+def constrained(kind: str, **about: Any) -> bytes:
+    rest = {"holds": True, "who": "x", "stamp_ns": 0, "because": ""}
+    return msgpack.packb({"v": 1, "about": {"kind": kind, **about}, **rest})
 
 
 @pytest.mark.parametrize(
-    "ends",
-    [[["a", 1, 2], ["a", 1, 2]], [["a", 1], ["b", 1, 2]], [["a", 1]], [["a", 1, 2, 3]] * 2],
+    ("kind", "about", "words"),
+    [
+        ("apart", {"ends": [["a", 1, 2], ["a", 1, 2]]}, "two different"),
+        ("apart", {"ends": [["a", 1], ["b", 1, 2]]}, "two different"),
+        ("apart", {"ends": [["a", 1]]}, "length 2"),
+        ("apart", {"ends": [["a", 1, 2, 3]] * 2}, "length"),
+        ("link", {"a": ["a", 1, 2], "b": ["a", 1, 2]}, "a.1.2 twice"),
+        ("link", {"a": ["a", 1, 2], "b": ["a", 1, 3], "covariance": [1.0] * 6}, "neither"),
+        ("link", {"a": ["a", 1, 2], "b": ["a", 1, 3], "pose": [0.0] * 3, "covariance": [-1.0] * 6}, "semi"),
+        ("area", {"area": {"anchor": ["a", 1, 2], "corners": [[0.0, 0.0], [1.0, 1.0]]}}, "3 to 64"),
+        ("area", {"area": {"anchor": ["a", 1, 2], "corners": [[0, 0], [1, 1], [2, 2]]}}, "one line"),
+        ("window", {"map": ["a", 1], "begin_ns": 2, "end_ns": 1}, "after it begins"),
+        ("nodes", {"nodes": []}, "1 to 1000"),
+        ("burnt", {"map": ["a", 1]}, "`kind` must be one of apart, link, map, nodes, area, window"),
+    ],
 )
-def test_a_constraint_without_effect_is_refused(ends: list[Any]) -> None:
-    with pytest.raises(InvalidMessage):
-        decode(constrained(*ends), ManualConstraint)
-
-
-def test_a_constraint_on_one_map_retires_it() -> None:
-    assert decode(constrained(["a", 1], ["a", 1]), ManualConstraint).retires == MapId("a", 1)
+def test_invalid_constraints_are_refused_in_one_line(kind: str, about: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidMessage, match=words):
+        decode(constrained(kind, **about), ManualConstraint)
 
 
 def test_undecodable_values_are_not_encoded() -> None:

@@ -15,6 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.constraint_subject import Apart, Linked
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
     FleetExplanation,
@@ -25,7 +26,7 @@ from mapweave.hybridmap.explanation import (
     PairExplanation,
     Standing,
 )
-from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
@@ -101,8 +102,9 @@ def poses(node: Node, gone: NodeId) -> PoseNews:
 def explanations(some: SimpleNamespace, a: Node, pose: PoseGaussian) -> list[tuple[Decoder, bytes]]:
     """Of two nodes and two maps, with the questions and manual constraints."""
     b, (one, two) = replace(a, id=NodeId("r1", 1, 1)), (a.id.map, MapId("r1", 1))
-    constraint = ManualConstraint((a.id, b.id), True, "anna", 5, "two kitchens")
+    constraint = ManualConstraint(Apart((a.id, b.id)), True, "anna", 5, "two kitchens")
     pairs = np.array([[1, 2], [3, 4]])
+    by_hand = replace(constraint, about=Linked.of(a.id, b.id, pose, pairs, {"inliers": 12.0}))
     misfit = Misfit(pose, np.zeros(3), 1.5, False)
     link = LinkAgreement(a.id, b.id, 2.5, True, False)
     pair = PairExplanation(
@@ -116,6 +118,7 @@ def explanations(some: SimpleNamespace, a: Node, pose: PoseGaussian) -> list[tup
         (partial(messages.decode, kind=FleetExplanation), encode(FleetExplanation((maps,)))),
         (partial(messages.decode, kind=ExplainRequest), encode(ExplainRequest((one, two)))),
         (partial(messages.decode, kind=ManualConstraint), encode(constraint)),
+        (partial(messages.decode, kind=ConstraintRequest), encode(ConstraintRequest(by_hand, True))),
     ]
 
 

@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap import (
     agent_status,
+    annotation,
+    area,
+    constraint_subject,
     explanation,
     manual_constraint,
     map_event,
@@ -26,8 +29,8 @@ from mapweave.hybridmap import (
     query,
     superseded,
 )  # fmt: skip
+from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.manual_constraint import Ends
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -157,8 +160,9 @@ def test_the_page_on_the_wire_names_the_fields() -> None:
         for name, words in ROW.findall(page)
     }
     modules = (
-        query, explanation, manual_constraint, map_event, superseded, map_file, agent_status, mission_order,
+        annotation, area, constraint_subject, query, explanation, manual_constraint, map_event, superseded,
+        map_file, agent_status, mission_order,
     )  # fmt: skip
     classes = {name: getattr(module, name) for module in modules for name in rows if hasattr(module, name)}
-    assert classes.keys() == rows.keys() and len(rows) == 32
+    assert classes.keys() == rows.keys() and len(rows) == 50
     assert {name: [one.name for one in fields(kind)] for name, kind in classes.items()} == rows

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 
 import pytest
 
@@ -14,6 +15,7 @@ from mapweave.wire.bus import Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.waiting import eventually, free_port
+from tests.wire.fleets import ZenohFleet
 
 
 def test_a_client_may_come_before_its_router() -> None:
@@ -117,3 +119,35 @@ if {closes}:
 """
     finished = subprocess.run([sys.executable, "-c", program], timeout=60, capture_output=True, text=True)
     assert (finished.returncode, finished.stderr) == (0, "")
+
+
+@pytest.fixture
+def router_fleet() -> Iterator[ZenohFleet]:
+    fleet = ZenohFleet()
+    yield fleet
+    fleet.close()
+
+
+def test_a_router_drops_what_is_too_large(router_fleet: ZenohFleet) -> None:
+    """From clients; the server's own answers, a whole map for example, are as large as they are."""
+    fleet = router_fleet
+    client, other = fleet.join(), fleet.join()
+    got: list[int] = []
+    fleet.router.subscribe("mapweave/x", lambda sample: got.append(len(sample.payload)))
+    fleet.router.serve("mapweave/map", lambda request: request.reply(bytes(2**26)))
+    fleet.router.serve("mapweave/size", lambda request: request.reply(str(len(request.payload)).encode()))
+    other.serve("mapweave/log", lambda request: request.reply(bytes(int(request.payload))))
+
+    def arrived() -> bool:
+        for size in (2**20, 2**18 + 1, 2**17):
+            client.publish("mapweave/x", bytes(size))
+        return bool(got)
+
+    eventually(arrived)
+    assert set(got) == {2**17}
+    assert client.ask("mapweave/size", bytes(2**18), 5.0)[0].payload == b"262144"
+    assert client.ask("mapweave/size", bytes(2**21), 0.5) == []
+    assert len(client.ask("mapweave/map", b"", 20.0)[0].payload) == 2**26
+    eventually(lambda: fleet.router.ask("mapweave/log", b"1000", 5.0))
+    assert len(fleet.router.ask("mapweave/log", str(2**24).encode(), 10.0)[0].payload) == 2**24
+    assert fleet.router.ask("mapweave/log", str(2**25 + 1).encode(), 1.0) == []

@@ -9,6 +9,7 @@ import pytest
 from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI
 from mapweave.agent.navigation.navigator import YIELDED, Stage
 from mapweave.agent.settings import NavigatorSettings
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
 from mapweave.mapserver.reservations import Reservations
@@ -140,3 +141,42 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
         assert Stage.ASIDE in said and Stage.YIELDING in said
     else:
         assert min(gaps) < 2 * BODY.radius, "without reservations they drive into each other"
+
+
+def test_a_robot_whose_way_is_closed_asks_for_another_one_at_once(home):
+    trial = trial_to(home)
+    closed = ReserveAnswer(0, "", None, "the way ahead is closed by anna: wet floor", closed=True)
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(1, "", None, ""))
+    trial.run(3.0)
+    before = len([question for question in trial.asked if not isinstance(question, WhereAmI)])
+    assert before == 1 and trial.commands[-1].forward > 0.0, "it is on its way"
+    trial.traffic = lambda question: Answer(question.number, closed)
+    trial.run(3.0, lambda: len(trial.asked) > 2)
+    ways = [question for question in trial.asked if not isinstance(question, WhereAmI)]
+    assert len(ways) == 2 and ways[-1].goal == B and ways[-1].blocked == (), "closed is not blocked"
+    assert any("closed by anna" in detail for _, detail in trial.said)
+    trial.run(0.5)
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(1, "", None, ""))
+    trial.run(3.0)
+    assert any(command.forward or command.turn for command in trial.commands[-10:]), "and goes on by it"
+
+
+def test_a_robot_passes_what_it_must_in_order_and_then_seeks_its_goal(home):
+    eyes, poses = Eyes(home, Pose2(1.0, 2.0)), {A: 0.0, B: 1.0, C: 2.0}
+    goal = NodeId("s", 1, 7)
+    poses[goal] = 0.5
+
+    def fleet(question: Question) -> Answer:
+        x = eyes.pose.x - 1.0
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2(x)))
+        step = poses[question.goal] - poses[question.start]
+        return Answer(
+            question.number, RouteAnswer(straight(bare(question.start), bare(question.goal), step=step), "")
+        )
+
+    trial = Trial(navigator(eyes, NOWHERE, goal, BLIND, via=(B, C)), eyes, fleet)
+    trial.run(60.0, lambda: any(getattr(question, "goal", None) == goal for question in trial.asked))
+    goals = [question.goal for question in trial.asked if not isinstance(question, WhereAmI)]
+    assert list(dict.fromkeys(goals)) == [B, C, goal]
+    assert eyes.pose.x - 1.0 == pytest.approx(poses[C], abs=0.35), "it has been at the last before it turns"

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -23,6 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from mapweave.agent.drivers.recorded import RecordedRobot
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.recordings import bag
 from mapweave.agent.recordings.mcap_writer import FLUSH_S, PART_S
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
@@ -398,3 +400,11 @@ def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, t
     (line,) = lines
     assert line.startswith(f"{tmp_path / 'walk'}: the recording ends here, ") and "\n" not in line
     assert len(Replay(tmp_path / "walk")) >= 5
+
+
+def test_a_camera_topic_that_lost_its_messages_is_reported_in_one_line() -> None:
+    """Its count says that there are some; found by fuzzing."""
+    topic = bag.Topic("/camera/camera_info", bag.CAMERA_TYPE, 3)
+    opened = SimpleNamespace(path="walk.mcap", topics=[topic], damage=[], messages=lambda name: iter(()))
+    with pytest.raises(DeviceError, match="camera_info has no message"):
+        bag._camera(opened, "/camera/image", RecordingOptions(), [])

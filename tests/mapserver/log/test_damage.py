@@ -14,6 +14,7 @@ import pytest
 from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.cli import main
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint
@@ -54,7 +55,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert replicator.wait_acknowledged(30)
     book = ConstraintRecord(fleet.store)
     for k in range(5):
-        book.add(ManualConstraint((MapId("r0", 1), MapId(f"r{k + 1}", 1)), True, "anna", k, "two kitchens"))
+        book.add(
+            ManualConstraint(Apart((MapId("r0", 1), MapId(f"r{k + 1}", 1))), True, "anna", k, "two kitchens")
+        )
     fleet.stop_robots()
     fleet.stop_server()
     return fleet.folder
@@ -138,6 +141,22 @@ def test_a_flipped_bit_anywhere_is_repaired_or_reported_in_one_line(
     fleet.stop_robots()
     fleet.stop_server()
     assert fleet.served() == maps
+
+
+def test_a_damaged_schema_that_is_no_text_is_reported_in_one_line(whole: Path, fleet: Fleet) -> None:
+    """SQLite quotes it in its error, which then is no text; found by fuzzing."""
+    with sqlite3.connect(fleet.path) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+    connection.close()
+    data = fleet.path.read_bytes()
+    assert b"tableloglog" in data and b"CREATE TABLE log " in data
+    data = data.replace(b"tableloglog", b"table\x95\x95glog").replace(
+        b"CREATE TABLE log ", b"CREATE TABLX log "
+    )
+    fleet.path.write_bytes(data)
+    with pytest.raises(InvalidFile, match="damaged") as caught:
+        Store(fleet.path)
+    assert "\n" not in str(caught.value)
 
 
 def test_the_state_of_a_log_may_be_lost(whole: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
@@ -278,6 +297,9 @@ def test_a_whole_store_is_extracted_whole(
     for one, changes in maps.items():
         content = read_map_file(fleet.folder / "out" / f"{one}.mapweave")
         assert sorted(map(encode_body, content.changes)) == changes
-    for path, words in ((fleet.folder / "nothing", "no such file"), (Path(__file__), "cannot be read")):
+    for path, words in (
+        (fleet.folder / "nothing", "no such file"),
+        (Path(__file__), "is neither a map file"),
+    ):
         assert main(["map", "extract", str(path), "-o", str(fleet.folder / "out")]) == 1
         assert words in capfd.readouterr().err

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -211,13 +212,16 @@ def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
     alone_fails(monkeypatch, BAD)
     merger = merger_of(logs, R0, R1, BAD)
     assert merger.merged().set_apart
-    merger.constrain(ManualConstraints([ManualConstraint((BAD, BAD), True, "anna", 1)]))
+    merger.constrain(ManualConstraints([ManualConstraint(RetiredMap(BAD), True, "anna", 1)]))
     merged = merger.merged()
     assert not merged.set_apart and BAD in merged.maps
     assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
     merger.constrain(
         ManualConstraints(
-            [ManualConstraint((BAD, BAD), True, "anna", 1), ManualConstraint((BAD, BAD), False, "anna", 2)]
+            [
+                ManualConstraint(RetiredMap(BAD), True, "anna", 1),
+                ManualConstraint(RetiredMap(BAD), False, "anna", 2),
+            ]
         )
     )
     assert merger.merged().set_apart.keys() == {BAD}
@@ -294,5 +298,5 @@ def test_files_are_merged_with_all_maps_or_not_at_all(
     maps = {item: HybridMap(body for _, body in logs[item]) for item in (R0, BAD)}
     with pytest.raises(InvalidValue, match=r"map bad\.1 cannot be merged: the merge fails with it .*retire"):
         merge_parts(maps, ManualConstraints())
-    retired = merge_parts(maps, ManualConstraints([ManualConstraint((BAD, BAD), True, "anna", 1)]))
+    retired = merge_parts(maps, ManualConstraints([ManualConstraint(RetiredMap(BAD), True, "anna", 1)]))
     assert retired.maps.keys() == {R0, BAD}

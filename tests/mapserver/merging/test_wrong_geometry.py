@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.answers import Answers
@@ -50,7 +51,8 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     history.follow(merged)
     assert history.events == before
     gone = [
-        ManualConstraint((item, item), True, "anna", 1, "moved") for item in (MapId("r0", 1), MapId("r1", 1))
+        ManualConstraint(RetiredMap(item), True, "anna", 1, "moved")
+        for item in (MapId("r0", 1), MapId("r1", 1))
     ]
     merger.constrain(ManualConstraints(gone))
     assert not merger.merged().wrong

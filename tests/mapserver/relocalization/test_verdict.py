@@ -85,3 +85,21 @@ def test_retrieval_is_not_asked_about_a_view_that_cannot_be_registered() -> None
     index = Ranked((NODE.id, 2.0))
     assert not retrieve(few(LEAST - 1), index, LEAST).ranked and not index.asked
     assert retrieve(VIEW, index, LEAST).ranked == [(NODE.id, 2.0)] and index.asked == 1
+
+
+def test_an_unknown_view_looks_like_places_with_a_turn_to_each(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(verdict, "ALONE", 1000)
+    # Turned away by so much that some of the node's landmarks are still in the image.
+    aside = take_view(WORLD, AT @ Pose2(0.05, 0.0, -0.35), np.random.default_rng(4))[0]
+    service = Relocalizer(FOUND, {NODE.id: NODE}.get, MergedMap.empty())
+    (weak,) = service.answer(aside).similar
+    assert weak.node == NODE.id and LEAST <= weak.inliers <= weak.matches
+    assert weak.turn == pytest.approx(0.35, abs=0.05), "to the left, where the node looked"
+    assert "second node" in weak.lacks
+    (far,) = service.answer(OTHER_WAY).similar
+    assert far.inliers < far.needed == LEAST and far.lacks
+    assert not service.answer(few(LEAST - 1)).similar
+    monkeypatch.setattr(verdict, "ALONE", 18)
+    assert not service.answer(VIEW).similar, "it is found"

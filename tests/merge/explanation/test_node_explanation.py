@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart, RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Standing
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -233,7 +234,7 @@ def test_a_robots_own_loop_closure_is_explained_with_its_constraints() -> None:
     merger.apply(A, EdgePut(loop))
     explanation = explain_nodes(merger.merged(), first, last)
     assert explanation.standing is Standing.OWN and explanation.probability is not None
-    constraint = ManualConstraint((first, last), True, "anna", 0, "no")
+    constraint = ManualConstraint(Apart((first, last)), True, "anna", 0, "no")
     merger.constrain(ManualConstraints([constraint]))
     explanation = explain_nodes(merger.merged(), first, last)
     assert explanation.standing is Standing.UNDONE and explanation.reason == reason_of(constraint)
@@ -275,14 +276,14 @@ def test_two_maps(merged: MergedMap) -> None:
 def test_manual_constraints_are_listed() -> None:
     merger = fleet()
     link = between(merger.merged())[0]
-    constraint = ManualConstraint(link.pair, True, "anna", 0, "no")
+    constraint = ManualConstraint(Apart(link.pair), True, "anna", 0, "no")
     merger.constrain(ManualConstraints([constraint]))
     explanation = explain_nodes(merger.merged(), *link.pair)
     assert explanation.standing is Standing.UNDONE and explanation.constraints == (constraint,)
     assert explanation.probability is not None and explanation.probability > 0.9, (
         "a manual constraint changes no measurement"
     )
-    merger.constrain(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
+    merger.constrain(ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 0, "no")]))
     apart = explain_maps(merger.merged(), A, B)
     assert not apart.joined and "undone" in apart.reason and len(apart.nearest) == 5
 
@@ -296,7 +297,7 @@ def test_a_merge_that_loses_its_support_is_reported() -> None:
     (joined,) = [joining for joining in joinings(joined_maps(alone), before) if "a.1 and b.1" in joining]
     assert joined == f"a.1 and b.1 are one map now, by {len(between(before))} links"
     assert joined in joinings([frozenset([B])], before)  # whichever of the two was heard of first
-    merger.constrain(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
+    merger.constrain(ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 0, "no")]))
     for links in (before.links, None):
         (words,) = partings(parts, links, merger.merged())
         assert words.startswith("a.1 and b.1 are no longer one map: ") and "refused (undone" in words
@@ -351,7 +352,7 @@ def test_a_split_by_a_retired_map_names_the_person() -> None:
             merger.apply(map_id, change)
     before = merger.merged()
     assert before.joined(A, C)
-    constraint = ManualConstraint((B, B), True, "anna", 0, "moved house")
+    constraint = ManualConstraint(RetiredMap(B), True, "anna", 0, "moved house")
     merger.constrain(ManualConstraints([constraint]))
     (words,) = partings(joined_maps(before), before.links, merger.merged())
     assert words.startswith("a.1 and c.1 are no longer one map: ")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -151,7 +152,10 @@ def test_removing_a_successor_makes_its_nodes_active(drives: Drives) -> None:
     assert all(fate.by in active(merged) for fate in merged.superseded.values())
     merger.constrain(
         ManualConstraints(
-            [ManualConstraint((OLD, NEW), True, "anna", 1), ManualConstraint((OTHER, NEW), True, "anna", 1)]
+            [
+                ManualConstraint(Apart((OLD, NEW)), True, "anna", 1),
+                ManualConstraint(Apart((OTHER, NEW)), True, "anna", 1),
+            ]
         )
     )
     assert not merger.merged().superseded, "nothing joins them now"
@@ -194,7 +198,10 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
     assert {link.pair for link in merged.links} == before, "what tied it ties it still"
     merger.constrain(
         ManualConstraints(
-            [ManualConstraint((OLD, NEW), True, "anna", 1), ManualConstraint((OTHER, NEW), True, "anna", 1)]
+            [
+                ManualConstraint(Apart((OLD, NEW)), True, "anna", 1),
+                ManualConstraint(Apart((OTHER, NEW)), True, "anna", 1),
+            ]
         )
     )
     merged = merger.merged()

@@ -231,6 +231,6 @@ def test_looking_at_a_thousand_nodes_takes_no_time() -> None:
     for _ in range(5):
         start = time.process_time()
         refutation = Refutation(maps, fragments, ExclusionSettings())
-        assert not refutation.impossible(solved, joining)
+        assert refutation.impossible(solved, joining) == ({}, {})
         took.append(time.process_time() - start)
     assert min(took) < 0.02

@@ -1,0 +1,1 @@
+"""Hostile input: every decoder is given what no honest sender sends."""

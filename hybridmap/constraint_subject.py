@@ -1,0 +1,382 @@
+"""What manual constraints are about: nodes or maps kept apart, nodes linked by hand, and what is retired.
+
+Each has a `TAG` that tells it from the others in messages, and a `key`: of constraints with one key the last
+holds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Annotated, ClassVar
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import MAX_STAMP_NS, Key, LandmarkCount, Stamp
+from mapweave.hybridmap.node import NUMBER, MapId, Node, NodeId, check_name
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+
+Ends = tuple[NodeId, NodeId] | tuple[MapId, MapId]
+"""Two nodes, or two maps; the smaller first."""
+
+EXAMPLE = "two nodes look like r0.1.17 r1.1.5, two maps like r0.1 r1.1"
+
+NANOSECONDS = 1_000_000_000
+MOST_NODES = 1000
+"""Of one constraint."""
+NAMED = 4
+"""Nodes that are named where more are meant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """Two nodes, or two maps, shall not be linked.
+
+    Attributes:
+        ends: two different ones. Of two maps it holds for every link between them, also for those to come.
+    """
+
+    TAG: ClassVar[str] = "apart"
+    ends: Ends
+
+    def __post_init__(self) -> None:
+        """Put the ends in order; refuse one that is given twice (InvalidValue)."""
+        first, second = sorted(self.ends)
+        if len(first) != len(second) or first == second:
+            raise InvalidValue("give two different nodes, or two different maps")
+        object.__setattr__(self, "ends", (first, second))
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Tells it from others."""
+        return self.TAG, *map(str, self.ends)
+
+    @property
+    def maps(self) -> frozenset[MapId]:
+        """The maps that it concerns."""
+        return frozenset(MapId(*end[:2]) for end in self.ends)
+
+    def __str__(self) -> str:
+        """For example `r0.1.17 and r1.1.5`."""
+        return f"{self.ends[0]} and {self.ends[1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Linked:
+    """Two nodes see one place, whatever the merge makes of it.
+
+    Attributes:
+        a: the smaller id.
+        b: the greater one, of the same map or of another.
+        pose: of b's robot frame in a's, `a_from_b`; None where the images shall say it, and where a link is
+            taken back.
+        covariance: of `pose`, upper triangle by rows, in b (see PoseGaussian).
+        shared: landmarks of a and of b that agree on the pose; none if it was given by hand.
+        evidence: numbers that support it, see mapweave.registration.recognition; none likewise.
+    """
+
+    TAG: ClassVar[str] = "link"
+    a: NodeId
+    b: NodeId
+    pose: Pose2 | None = None
+    covariance: Annotated[tuple[float, ...], Meta(max_length=6)] = ()
+    shared: tuple[tuple[LandmarkCount, LandmarkCount], ...] = ()
+    evidence: Annotated[tuple[tuple[Key, float], ...], Meta(max_length=64)] = ()
+
+    def __post_init__(self) -> None:
+        """Put the smaller node first.
+
+        Raises:
+            InvalidValue: the same node twice, or a covariance that is none.
+        """
+        if self.a == self.b:
+            raise InvalidValue(f"{self.a} twice: give two different nodes")
+        if len(self.covariance) != (6 if self.covariance else 0) or (self.covariance and self.pose is None):
+            raise InvalidValue("a link has a pose with a covariance of 6 numbers, or neither")
+        pose = self.pose and (PoseGaussian(self.pose, self._matrix()) if self.covariance else self.pose)
+        if self.a > self.b:
+            first, second = self.b, self.a
+            object.__setattr__(self, "a", first)
+            object.__setattr__(self, "b", second)
+            object.__setattr__(self, "shared", tuple((one, other) for other, one in self.shared))
+            back = pose and pose.inverse()
+            mean = back.mean if isinstance(back, PoseGaussian) else back
+            object.__setattr__(self, "pose", mean)
+            if isinstance(back, PoseGaussian):
+                object.__setattr__(self, "covariance", _upper(back.covariance))
+
+    @staticmethod
+    def of(
+        a: NodeId,
+        b: NodeId,
+        a_from_b: PoseGaussian,
+        shared: NDArray[np.int64] | None = None,
+        evidence: Mapping[str, float] | None = None,
+    ) -> Linked:
+        """With the pose, and what supports it."""
+        pairs = () if shared is None else tuple((int(one), int(other)) for one, other in shared)
+        numbers = tuple((name, float(value)) for name, value in sorted((evidence or {}).items()))
+        return Linked(a, b, a_from_b.mean, _upper(a_from_b.covariance), pairs, numbers)
+
+    @property
+    def by_images(self) -> bool:
+        """Whether the images of the two nodes give the pose, and not a person."""
+        return bool(self.evidence)
+
+    @property
+    def a_from_b(self) -> PoseGaussian:
+        """The pose; raises InvalidValue if there is none."""
+        if self.pose is None or not self.covariance:
+            raise InvalidValue(f"the link of {self} has no pose")
+        return PoseGaussian(self.pose, self._matrix())
+
+    def _matrix(self) -> Array:
+        matrix = np.zeros((3, 3))
+        matrix[np.triu_indices(3)] = self.covariance
+        return matrix + np.triu(matrix, 1).T
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Tells it from others: there is one link between two nodes."""
+        return self.TAG, str(self.a), str(self.b)
+
+    @property
+    def maps(self) -> frozenset[MapId]:
+        """The maps that it concerns."""
+        return frozenset((self.a.map, self.b.map))
+
+    def __str__(self) -> str:
+        """For example `r0.1.17 and r1.1.5`."""
+        return f"{self.a} and {self.b}"
+
+
+@dataclass(frozen=True, slots=True)
+class RetiredMap:
+    """A map takes no part in anything.
+
+    Attributes:
+        map: which.
+    """
+
+    TAG: ClassVar[str] = "map"
+    map: MapId
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Tells it from others."""
+        return self.TAG, str(self.map)
+
+    @property
+    def maps(self) -> frozenset[MapId]:
+        """The map."""
+        return frozenset((self.map,))
+
+    def __str__(self) -> str:
+        """For example `map r0.1`."""
+        return f"map {self.map}"
+
+
+@dataclass(frozen=True, slots=True)
+class RetiredNodes:
+    """Some nodes take no part in anything.
+
+    Attributes:
+        nodes: which, in order.
+    """
+
+    TAG: ClassVar[str] = "nodes"
+    nodes: Annotated[tuple[NodeId, ...], Meta(max_length=MOST_NODES)]
+
+    def __post_init__(self) -> None:
+        """Put them in order, each once; refuse none or too many (InvalidValue)."""
+        object.__setattr__(self, "nodes", tuple(sorted(set(self.nodes))))
+        if not 1 <= len(self.nodes) <= MOST_NODES:
+            raise InvalidValue(f"give 1 to {MOST_NODES} nodes, not {len(self.nodes)}")
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Tells them from others."""
+        return self.TAG, *map(str, self.nodes)
+
+    @property
+    def maps(self) -> frozenset[MapId]:
+        """The maps that it concerns."""
+        return frozenset(node.map for node in self.nodes)
+
+    def __str__(self) -> str:
+        """For example `node r0.1.17` or `nodes r0.1.3 and r0.1.5`."""
+        return nodes_in_words(self.nodes)
+
+
+@dataclass(frozen=True, slots=True)
+class RetiredArea:
+    """All nodes in an area take no part in anything, of all maps, also those to come.
+
+    Attributes:
+        area: where; by the merged map as it is without any retired area.
+    """
+
+    TAG: ClassVar[str] = "area"
+    area: Area
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Tells it from others."""
+        return self.TAG, str(self.area.anchor), *(f"{x!r},{y!r}" for x, y in self.area.corners)
+
+    @property
+    def maps(self) -> frozenset[MapId]:
+        """The anchor's map; which others it concerns only the merge knows."""
+        return frozenset((self.area.anchor.map,))
+
+    def __str__(self) -> str:
+        """For example `the area of 4 corners at r0.1.17`."""
+        return f"the area of {len(self.area.corners)} corners at {self.area.anchor}"
+
+
+@dataclass(frozen=True, slots=True)
+class RetiredWindow:
+    """The nodes of a map between two times take no part in anything, also those to come.
+
+    Attributes:
+        map: which.
+        begin_ns: the first stamp of a node that is retired.
+        end_ns: the last one.
+    """
+
+    TAG: ClassVar[str] = "window"
+    map: MapId
+    begin_ns: Stamp
+    end_ns: Stamp
+
+    def __post_init__(self) -> None:
+        """Refuse an end before the beginning (InvalidValue)."""
+        if not 0 <= self.begin_ns <= self.end_ns:
+            raise InvalidValue(f"a time window ends after it begins: {self.begin_ns} to {self.end_ns} ns")
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Tells it from others."""
+        return self.TAG, str(self.map), str(self.begin_ns), str(self.end_ns)
+
+    @property
+    def maps(self) -> frozenset[MapId]:
+        """The map."""
+        return frozenset((self.map,))
+
+    def holds(self, node: Node) -> bool:
+        """Whether a node is in it."""
+        return node.id.map == self.map and self.begin_ns <= node.stamp_ns <= self.end_ns
+
+    def __str__(self) -> str:
+        """For example `map r0.1 from 2026-03-01 12:00:00 to 2026-03-01 12:05:00 UTC`."""
+        return f"map {self.map} from {_time(self.begin_ns)} to {_time(self.end_ns)} UTC"
+
+
+Subject = Apart | Linked | RetiredMap | RetiredNodes | RetiredArea | RetiredWindow
+"""What a manual constraint is about."""
+
+
+def read_ends(first: str, second: str) -> Ends:
+    """Two nodes or two maps as people write them.
+
+    Raises:
+        InvalidValue: they are neither.
+    """
+    a, b = read_end(first), read_end(second)
+    if isinstance(a, NodeId) and isinstance(b, NodeId):
+        return a, b
+    if isinstance(a, NodeId) or isinstance(b, NodeId):
+        raise InvalidValue(f"{first} and {second} are a node and a map: {EXAMPLE}")
+    return a, b
+
+
+def read_end(word: str) -> NodeId | MapId:
+    """A node (r0.1.17) or a map (r0.1).
+
+    Raises:
+        InvalidValue: it is neither.
+    """
+    parts = word.split(".")
+    if len(parts) == 3:
+        return NodeId.parse(word)
+    if len(parts) != 2 or not NUMBER.fullmatch(parts[1]):
+        raise InvalidValue(f"{word!r} is neither a node nor a map: {EXAMPLE}")
+    return MapId(check_name(parts[0]), int(parts[1]))
+
+
+def read_retired(words: Iterable[str]) -> RetiredMap | RetiredNodes:
+    """One map, or some nodes, as people write them.
+
+    Raises:
+        InvalidValue: they are neither.
+    """
+    ends = [read_end(word) for word in words]
+    nodes = tuple(end for end in ends if isinstance(end, NodeId))
+    if nodes and len(nodes) == len(ends):
+        return RetiredNodes(nodes)
+    if len(ends) == 1 and isinstance(ends[0], MapId):
+        return RetiredMap(ends[0])
+    raise InvalidValue("give one map (r0.1), or nodes (r0.1.17 r0.1.18)")
+
+
+def read_pose(numbers: Iterable[float]) -> Pose2:
+    """X and y in m, and the heading in degrees, as people write them.
+
+    Raises:
+        InvalidValue: they are not three finite numbers.
+    """
+    values = [float(number) for number in numbers]
+    if len(values) != 3 or not all(math.isfinite(value) for value in values):
+        raise InvalidValue("a pose is three numbers, X,Y,DEGREES: the second node seen from the first")
+    return Pose2(values[0], values[1], math.radians(values[2]))
+
+
+def read_window(which: MapId, begin: str | int = "", end: str | int = "") -> RetiredWindow:
+    """A time window of a map; without a beginning or an end it has none.
+
+    Args:
+        which: the map.
+        begin: ns since 1970, or as people write it: 2026-03-01T12:00, UTC unless it says another zone.
+        end: likewise.
+
+    Raises:
+        InvalidValue: it is no time, or the end is before the beginning.
+    """
+    return RetiredWindow(which, _stamp(begin, 0), _stamp(end, MAX_STAMP_NS))
+
+
+def _stamp(word: str | int, default: int) -> int:
+    if isinstance(word, int) or word.isdecimal():
+        return min(int(word), MAX_STAMP_NS)
+    try:
+        time = datetime.fromisoformat(word) if word else None
+    except ValueError:
+        raise InvalidValue(f"{word!r} is no time: write 2026-03-01T12:00, or nanoseconds") from None
+    if time is None:
+        return default
+    return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()) * NANOSECONDS
+
+
+def nodes_in_words(nodes: Iterable[NodeId]) -> str:
+    """For example `nodes r0.1.3 and r0.1.5`; of many some, and their number."""
+    names = [str(node) for node in nodes]
+    if len(names) == 1:
+        return f"node {names[0]}"
+    if len(names) > NAMED:
+        return f"nodes {', '.join(names[:NAMED])} and {len(names) - NAMED} more"
+    return f"nodes {', '.join(names[:-1])} and {names[-1]}"
+
+
+def _upper(covariance: Array) -> tuple[float, ...]:
+    return tuple(float(value) for value in covariance[np.triu_indices(3)])
+
+
+def _time(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M:%S")

@@ -1,0 +1,73 @@
+"""Wall time as people write it: local time, or UTC where that is said."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta, tzinfo
+
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import MAX_STAMP_NS
+
+NANOSECONDS = 1_000_000_000
+FORMS = (
+    "write 14:00, 2026-03-01 14:00 (local time), 2026-03-01 14:00 UTC, 2026-03-01T14:00+01:00, or +2h, +30min"
+)
+CLOCK = re.compile(r"(\d{1,2}):(\d{2})")
+LATER = re.compile(r"\+(\d+(?:\.\d+)?)\s*(min|h|d)")
+HOURS = {"min": 1.0 / 60.0, "h": 1.0, "d": 24.0}
+
+
+def utc_words(stamp_ns: int) -> str:
+    """For example `2026-03-01 14:00 UTC`."""
+    return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def local_words(stamp_ns: int, zone: tzinfo | None = None) -> str:
+    """The same in local time with its distance from UTC, for example `2026-03-01 15:00 +0100`."""
+    return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).astimezone(zone).strftime("%Y-%m-%d %H:%M %z")
+
+
+def read_time(text: str, now_ns: int, zone: tzinfo | None = None) -> int:
+    """A time as ns since 1970.
+
+    Args:
+        text: see `FORMS`; without a date the next time that the clock shows this.
+        now_ns: the present.
+        zone: of times that name none; this machine's by default.
+
+    Raises:
+        InvalidValue: it is no time.
+    """
+    words, now = text.strip(), datetime.fromtimestamp(now_ns / NANOSECONDS, UTC).astimezone(zone)
+    if (later := LATER.fullmatch(words)) is not None:
+        hours = float(later[1]) * HOURS[later[2]]
+        return _stamp(text, lambda: now + timedelta(hours=hours))
+    if re.search(r"(utc|z)$", words, re.IGNORECASE):
+        words, now = re.sub(r"\s*(utc|z)$", "", words, flags=re.IGNORECASE), now.astimezone(UTC)
+    if (clock := CLOCK.fullmatch(words)) is not None:
+        return _stamp(text, lambda: _next(now, int(clock[1]), int(clock[2])))
+
+    def dated() -> datetime:
+        time = datetime.fromisoformat(words)
+        if time.tzinfo is not None:
+            return time
+        # Of a zone that is not named, the distance from UTC on that day, not today's.
+        return time.replace(tzinfo=now.tzinfo) if zone or now.tzinfo is UTC else time.astimezone()
+
+    return _stamp(text, dated)
+
+
+def _next(now: datetime, hour: int, minute: int) -> datetime:
+    time = now.replace(hour=hour, minute=minute, second=0, microsecond=0)
+    return time if time > now else time + timedelta(days=1)
+
+
+def _stamp(text: str, make: Callable[[], datetime]) -> int:
+    try:
+        stamp_ns = round(make().timestamp()) * NANOSECONDS
+    except (ValueError, OverflowError):
+        raise InvalidValue(f"{text!r} is no time: {FORMS}") from None
+    if not 0 <= stamp_ns <= MAX_STAMP_NS:
+        raise InvalidValue(f"{text!r} is out of range")
+    return stamp_ns

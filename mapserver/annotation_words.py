@@ -1,0 +1,139 @@
+"""Annotations in a person's words: places and positions where the record has nodes and polygons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from datetime import UTC
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body, Place
+from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.query import ResolveAnswer, Resolved, ResolveRequest
+from mapweave.hybridmap.wall_time import read_time
+from mapweave.wire.typed import packed, value_of
+
+NODES = ("node", "anchor", "a", "b", "merged_from_node")
+"""Fields that are nodes."""
+ANYWHERE = 1e6
+"""An area may lie away from all nodes, m: they only give its frame."""
+
+TIMES = ("begin_ns", "end_ns")
+AROUND = 1.0
+"""Of a place that is a node, so much floor around it is meant, m."""
+
+Resolve = Callable[[ResolveRequest], ResolveAnswer]
+Value = TypeVar("Value")
+
+
+def body_of_words(
+    kind: str, fields: Mapping[str, Any], resolve: Resolve, annotations: Annotations, now_ns: int
+) -> Body:
+    """The body of an annotation.
+
+    Args:
+        kind: of the annotation: place, closure and so on.
+        fields: those of the body as plain data. Times may be text, see mapweave.hybridmap.wall_time; without
+            a zone they are UTC. In the place of a node there may be a word: a node
+            (`r0.1.17`), the name of a place, a position in the merged map (`3.1,-2.0`). An area is `area`,
+            or `corners`, a list of positions in the merged map (in the frame of the component of `near`, a
+            node or place; of the largest component without), or `radius`, m, around `node`; or
+            `place`, a named place.
+        resolve: returns nodes for words.
+        annotations: the record.
+        now_ns: the present time.
+
+    Raises:
+        InvalidValue: something is missing or wrong, with the reason.
+    """
+    if kind not in BODIES:
+        raise InvalidValue(f"there are no annotations of kind {kind!r}: {', '.join(BODIES)}")
+    plain = dict(fields)
+    corners, radius, near = (plain.pop(name, None) for name in ("corners", "radius", "near"))
+    for name in TIMES:
+        if isinstance(plain.get(name), str):
+            plain[name] = read_time(plain[name], now_ns, UTC)
+    if (place := plain.pop("place", None)) is not None:
+        entry = annotations.last("place", str(place))
+        if entry is None:
+            raise InvalidValue(f"there is no place {place}")
+        if isinstance(entry.body, Place) and entry.body.area is not None:
+            plain["area"], radius = packed(entry.body.area), None
+        else:
+            plain["node"], radius = str(place), AROUND if radius is None else radius
+    if corners is not None:
+        plain["area"] = packed(_area(corners, near or "", resolve))
+    elif isinstance(area := plain.get("area"), Mapping):
+        plain["area"] = {name: _node(value, name, near, resolve) for name, value in area.items()}
+    elif radius is not None:
+        node = NodeId(*_node(plain.pop("node", None), "node", near, resolve))
+        plain["area"] = packed(Area.around(node, value_of(radius, float)))
+    if isinstance(edge := plain.get("edge"), list | tuple):
+        plain["edge"] = [_node(word, "node", near, resolve) for word in edge]
+    body = {name: _node(value, name, near, resolve) for name, value in plain.items()}
+    unknown = body.keys() - BODIES[kind].__dataclass_fields__.keys() - {"kind"}
+    if unknown:
+        raise InvalidValue(f"a {kind} has no {', '.join(sorted(unknown))}")
+    return value_of(body, BODIES[kind])
+
+
+def _node(value: Any, name: str, near: str | None, resolve: Resolve) -> Any:
+    """A word as a node; everything else as it is."""
+    if name not in NODES or not isinstance(value, str):
+        return value
+    return packed(_found(value, near or "", resolve).node)
+
+
+def _found(word: str, near: str, resolve: Resolve, reach: float | None = None) -> Resolved:
+    request = ResolveRequest((word,), near) if reach is None else ResolveRequest((word,), near, reach)
+    return resolve(request).found[0]
+
+
+def _area(corners: Any, near: str, resolve: Resolve) -> Area:
+    points = value_of(corners, list[tuple[float, float]])
+    if not points:
+        raise InvalidValue("an area has 3 corners or more")
+    x, y = np.mean(points, axis=0)
+    found = _found(f"{x:.3f},{y:.3f}", near, resolve, ANYWHERE)
+    return Area.of_merged(found.node, found.merged_from_node, points)
+
+
+def annotation_of_words(
+    name: str,
+    fields: Mapping[str, Any],
+    removed: bool,
+    annotations: Callable[[], Annotations],
+    resolve: Resolve,
+    who: str,
+    because: str,
+    stamp_ns: int,
+) -> Annotation:
+    """An entry for the record.
+
+    Args:
+        name: of the annotation.
+        fields: `kind`, and what the body has; see `body_of_words`. To withdraw an entry its kind is enough.
+        removed: whether the entry of this name is withdrawn.
+        annotations: returns the record.
+        resolve: returns nodes for words.
+        who: says so.
+        because: why.
+        stamp_ns: the present time.
+
+    Raises:
+        InvalidValue: something is missing or wrong, or there is nothing to withdraw.
+    """
+    kind = fields.get("kind")
+    if not isinstance(kind, str) or kind not in BODIES:
+        raise InvalidValue(f"an annotation has a kind: {', '.join(BODIES)}")
+    if removed:
+        before = annotations().last(kind, name)
+        if before is None:
+            raise InvalidValue(f"there is no {kind} {name}")
+        body = before.body
+    else:
+        body = body_of_words(kind, fields, resolve, annotations(), stamp_ns)
+    return Annotation(name, body, removed, who, stamp_ns, because)

@@ -1,0 +1,130 @@
+"""What people say about the map: the record of annotations on the disk, and questions about it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.places import Places
+from mapweave.mapserver.services import guarded
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.bus import Bus, Closing
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import encode_record
+from mapweave.wire.messages import decode, encode
+
+log = logging.getLogger(__name__)
+
+
+class AnnotationRecord:
+    """The server's record of annotations, on its disk. Entries are added, never removed."""
+
+    def __init__(self, store: Store) -> None:
+        """Read the record."""
+        self._store = store
+        made: list[Annotation] = []
+        for body in store.annotations():
+            try:
+                made.append(decode(body, Annotation))
+            except InvalidMessage as error:
+                log.error("an annotation cannot be read (%s); it is left out", error)
+        self._annotations = Annotations(tuple(made))
+
+    @property
+    def annotations(self) -> Annotations:
+        """All of them, in order."""
+        return self._annotations
+
+    def add(self, annotation: Annotation) -> None:
+        """Add an annotation; it is on the disk when this returns.
+
+        Raises:
+            InvalidValue: there are too many.
+            InvalidFile: the disk does not take it; then nothing has changed.
+        """
+        self._store.add_annotation(encode(annotation))
+        self._annotations = Annotations((*self._annotations.made, annotation))
+
+
+class Annotator:
+    """Declared on a bus until closed."""
+
+    def __init__(
+        self, bus: Bus, keys: Keys, name: str, places: Callable[[], Places], record: AnnotationRecord
+    ) -> None:
+        """Begin to answer.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            name: of the server in the fleet.
+            places: of the newest merged map. May wait for it.
+            record: of annotations.
+        """
+        self._places, self._record = places, record
+        self._turn = threading.Lock()
+        self._closing: list[Closing] = [
+            bus.serve(keys.annotate(name), guarded(self._annotate)),
+            bus.serve(keys.annotations(name), guarded(lambda _: encode(record.annotations))),
+            bus.serve(
+                keys.resolve(name),
+                guarded(lambda payload: encode(self.resolve(decode(payload, ResolveRequest)))),
+            ),
+        ]
+
+    def close(self) -> None:
+        """Stop answering."""
+        for closing in self._closing:
+            closing.close()
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words, from any thread; see Places.answer."""
+        return self._places().answer(request)
+
+    def annotate(self, annotation: Annotation) -> str:
+        """Add an annotation to the record, from any thread; returns what it says, in words.
+
+        Raises:
+            InvalidValue: it says nothing new, or is about something that is not there.
+        """
+        with self._turn:
+            check_annotation(self._places().merged, self._record.annotations, annotation)
+            self._record.add(annotation)
+        log.warning("%s", annotation.words)
+        return annotation.words
+
+    def _annotate(self, payload: bytes) -> bytes:
+        return encode_record({"said": self.annotate(decode(payload, Annotation))})
+
+
+def check_annotation(merged: MergedMap, annotations: Annotations, annotation: Annotation) -> None:
+    """Refuse an annotation that is a mistake.
+
+    Args:
+        merged: what it is made about.
+        annotations: the record.
+        annotation: the new one.
+
+    Raises:
+        InvalidValue: it says nothing new, or is about something that is not there.
+    """
+    kind, name = annotation.kind, annotation.name
+    before = annotations.last(kind, name)
+    if annotation.removed:
+        if before is None:
+            raise InvalidValue(f"there is no {kind} {name}")
+        return
+    if before is not None and before.body == annotation.body:
+        raise InvalidValue(f"that is known already: {before.words}")
+    body = annotation.body
+    if isinstance(body, Closure) and body.end_ns is not None and body.end_ns <= annotation.stamp_ns:
+        raise InvalidValue(f"the closure is over already: {body.words}")
+    anchor = body.anchor
+    merged.check(anchor)
+    if merged.component_of(anchor) is None:
+        raise InvalidValue(f"node {anchor} is not in the merged map")

@@ -1,0 +1,42 @@
+"""Any explanation of a merged map, as it is asked for: of two nodes, of maps, of a route."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from mapweave.hybridmap.explanation import MAX_MAPS_LISTED, Explanation, FleetExplanation
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.query import ExplainRequest
+from mapweave.mapserver.route_explaining import explain_route
+from mapweave.mapserver.routes import Router
+from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
+from mapweave.merge.explanation.node_explanation import explain_nodes
+from mapweave.merge.settings import ConsistencySettings
+
+
+def explained(
+    request: ExplainRequest,
+    router: Router,
+    consistency: ConsistencySettings,
+    wary: Collection[tuple[NodeId, NodeId]] = (),
+) -> Explanation:
+    """Why nodes or maps are linked, or are not, or why a route leads this way. Takes its time.
+
+    Args:
+        request: what is asked.
+        router: of the merged map.
+        consistency: as in the merge.
+        wary: pairs of nodes between which robots of late did not get through.
+
+    Raises:
+        InvalidValue: they are not there.
+    """
+    merged = router.merged
+    if request.ends is None:
+        return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED))
+    first, second = request.ends
+    if isinstance(first, NodeId) and isinstance(second, NodeId):
+        if request.route:
+            return explain_route(router, first, second, request.blocked, wary)
+        return explain_nodes(merged, first, second, None, consistency)
+    return FleetExplanation((explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),))

@@ -1,0 +1,87 @@
+"""Annotations over HTTP, as JSON."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import msgspec
+
+from mapweave.hybridmap.annotation import MAX_NAME, Annotation, Annotations
+from mapweave.hybridmap.constraint_subject import Ends, read_ends
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.annotation_words import annotation_of_words
+from mapweave.mapserver.http.json_values import json_values
+
+FORM = 'send JSON: {"name": "kitchen", "body": {"kind": "place", "node": "r0.1.17"}}'
+
+
+class _Posted(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    body: dict[str, Any]
+    removed: bool = False
+    who: str = ""
+    because: str = ""
+
+
+class Annotating(Protocol):
+    """What a map server offers, see MapServer."""
+
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+
+    def annotate(self, annotation: Annotation) -> str:
+        """Add an annotation."""
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words."""
+
+
+def annotations_json(server: Annotating) -> Mapping[str, Any]:
+    """The whole record, and which of its entries hold now: each by the number of its place in the record."""
+    record = server.annotations()
+    holding = {id(record.last(entry.kind, entry.name)) for entry in record.made}
+    values = json_values(record)["made"]
+    return {
+        "annotations": [
+            {**value, "in_force": id(entry) in holding}
+            for entry, value in zip(record.made, values, strict=True)
+        ]
+    }
+
+
+def annotate(server: Annotating, data: bytes, by: str) -> Mapping[str, Any]:
+    """Add the annotation of a request.
+
+    Args:
+        server: keeps the record.
+        data: JSON; the body's nodes may be words, see `body_of_words`.
+        by: who says so, if the request does not tell.
+
+    Raises:
+        InvalidValue: it is none, or says nothing new.
+    """
+    try:
+        posted = msgspec.json.decode(data, type=_Posted)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise InvalidValue(f"{error}; {FORM}") from None
+    annotation = annotation_of_words(
+        posted.name[: MAX_NAME + 1], posted.body, posted.removed, server.annotations, server.resolve,
+        posted.who or by, posted.because, time.time_ns(),
+    )  # fmt: skip
+    return {"said": server.annotate(annotation), "annotation": json_values(annotation)}
+
+
+def ends_of_words(server: Annotating, words: tuple[str, str]) -> Ends:
+    """Two nodes or maps; a word that is none may be the name of a place, or a position.
+
+    Raises:
+        InvalidValue: it is none of these.
+    """
+    known = server.annotations()
+    if any(known.last("place", word) or "," in word for word in words):
+        first, second = server.resolve(ResolveRequest(words)).found
+        return first.node, second.node
+    return read_ends(*words)

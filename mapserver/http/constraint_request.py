@@ -1,0 +1,110 @@
+"""Manual constraints as JSON: what people post, and what it means.
+
+    {"link": ["r0.1.17", "r1.1.5"], "pose": [1.0, 0.2, 90]}      two nodes see one place; `pose` only by hand
+    {"unmerge": ["r0.1", "r1.1"]}                                two nodes or two maps
+    {"retire": ["r0.1.17", "r0.1.18"]}                           nodes, or one map
+    {"area": {"anchor": "r0.1.17", "corners": [[0, -1], [2, -1], [2, 1]]}}
+    {"window": {"map": "r0.1", "begin": "2026-03-01T12:00", "end": "2026-03-01T12:05"}}
+    {"undo": 3}                                                  takes back number 3 of the record
+
+With each: `because`, `by`, `undo: true` (takes it back), `check: true` (only says what it would do).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.constraint_subject import (
+    Apart,
+    Linked,
+    RetiredArea,
+    RetiredMap,
+    Subject,
+    read_ends,
+    read_pose,
+    read_retired,
+    read_window,
+)
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
+from mapweave.hybridmap.node import NodeId
+
+ONE = "link, unmerge, retire, area, window, or undo with a number"
+
+
+class _Area(msgspec.Struct, forbid_unknown_fields=True):
+    anchor: str
+    corners: list[tuple[float, float]]
+
+
+class _Window(msgspec.Struct, forbid_unknown_fields=True):
+    map: str
+    begin: str | int = ""
+    end: str | int = ""
+
+
+class _Body(msgspec.Struct, forbid_unknown_fields=True):
+    link: tuple[str, str] | None = None
+    pose: tuple[float, float, float] | None = None
+    unmerge: tuple[str, str] | None = None
+    retire: list[str] | None = None
+    area: _Area | None = None
+    window: _Window | None = None
+    undo: bool | int = False
+    check: bool = False
+    because: str = ""
+    by: str = ""
+
+
+def read_request(body: bytes, by: str, now_ns: int, record: Sequence[ManualConstraint]) -> ConstraintRequest:
+    """A manual constraint as it is posted.
+
+    Args:
+        body: JSON.
+        by: has decided, if the request does not say.
+        now_ns: wall time.
+        record: the constraints that there are, in order.
+
+    Raises:
+        InvalidValue: it is no such request.
+    """
+    try:
+        asked = msgspec.json.decode(body, type=_Body)
+    except msgspec.DecodeError as error:
+        raise InvalidValue(f"the body is no constraint: {error}; write {ONE}, as JSON") from None
+    numbered = not isinstance(asked.undo, bool)
+    given = [
+        subject
+        for subject in (asked.link, asked.unmerge, asked.retire, asked.area, asked.window)
+        if subject is not None
+    ]
+    if len(given) + numbered != 1:
+        raise InvalidValue(f"give one of {ONE}")
+    about = _numbered(asked.undo, record) if numbered else _subject(asked)
+    constraint = ManualConstraint(about, asked.undo is False, asked.by or by, now_ns, asked.because)
+    return ConstraintRequest(constraint, asked.check)
+
+
+def _numbered(number: int, record: Sequence[ManualConstraint]) -> Subject:
+    if not 1 <= number <= len(record):
+        raise InvalidValue(f"there is no constraint {number}: the record has {len(record)}")
+    return record[number - 1].about
+
+
+def _subject(asked: _Body) -> Subject:
+    if asked.link is not None:
+        a, b = map(NodeId.parse, asked.link)
+        return Linked(a, b, None if asked.pose is None else read_pose(asked.pose))
+    if asked.unmerge is not None:
+        return Apart(read_ends(*asked.unmerge))
+    if asked.area is not None:
+        return RetiredArea(Area(NodeId.parse(asked.area.anchor), tuple(asked.area.corners)))
+    if asked.window is not None:
+        which = read_retired([asked.window.map])
+        if not isinstance(which, RetiredMap):
+            raise InvalidValue(f"{asked.window.map} is no map")
+        return read_window(which.map, asked.window.begin, asked.window.end)
+    return read_retired(asked.retire or ())

@@ -1,0 +1,182 @@
+"""What viewers see live, over a WebSocket: the merged map, the robots, and what happens to the maps.
+
+A viewer gets the whole map and then differences. Between two messages it is sent nothing, so one that is slow
+gets the newest state when it is ready, and no queue grows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from starlette.concurrency import run_in_threadpool
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.map_event import History, MapEvent
+from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.http.live_map import LiveMap, Pair
+from mapweave.mapserver.http.serving import json_bytes
+from mapweave.merge.outlier_rejection.link_probability import link_probabilities
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.log_messages import Scalar
+
+log = logging.getLogger(__name__)
+
+EVERY = 0.5
+"""Time between two looks at the server, s; robots report as often."""
+MOST_VIEWERS = 64
+"""More are refused."""
+SERVER_FIELDS = ("summary", "settled", "event")
+"""Of the server's status, which are sent along."""
+
+
+class Shown(Protocol):
+    """What viewers see; from any thread."""
+
+    @property
+    def read_only(self) -> bool:
+        """Whether nothing can be changed, and no robot be moved, as with a map file."""
+
+    def merged(self) -> MergedMap:
+        """The newest merged map; the same object as long as nothing has changed."""
+
+    def robots(self) -> FleetStatus:
+        """The robots, and where they are."""
+
+    def history(self) -> tuple[MapEvent, ...]:
+        """The history of the maps."""
+
+    def status(self) -> dict[str, Scalar]:
+        """What the server holds and does."""
+
+
+class Live:
+    """Looks at the server as long as there are viewers."""
+
+    def __init__(self, server: Shown, may_command: Callable[[str], bool]) -> None:
+        """Begin with no viewer.
+
+        Args:
+            server: what viewers see.
+            may_command: whether a viewer at some address may change things.
+        """
+        self._server, self._may_command = server, may_command
+        self._turn = threading.Lock()
+        self._map = LiveMap()
+        self._shown: MergedMap | None = None
+        self._rated: MergedMap | None = None
+        self._probabilities: Mapping[Pair, float] = {}
+        self._events: dict[MapEvent, int] = {}
+        self._state = ""
+        self._viewers = 0
+        self._looked = asyncio.Event()
+        self._looking: asyncio.Task[None] | None = None
+        self._rating: asyncio.Task[None] | None = None
+
+    async def serve(self, viewer: WebSocket) -> None:
+        """Show a viewer everything until it goes."""
+        await viewer.accept()
+        if self._viewers >= MOST_VIEWERS:
+            await viewer.close(1013, f"{MOST_VIEWERS} watch already")
+            return
+        self._viewers += 1
+        if self._looking is None or self._looking.done():
+            self._looking = asyncio.create_task(self._look_on())
+        hearing = asyncio.create_task(_until_gone(viewer))
+        showing = asyncio.create_task(self._show(viewer))
+        try:
+            await asyncio.wait({hearing, showing}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self._viewers -= 1
+            for task in (hearing, showing):
+                task.cancel()
+            await asyncio.gather(hearing, showing, return_exceptions=True)
+
+    async def _show(self, viewer: WebSocket) -> None:
+        host = "" if viewer.client is None else viewer.client.host
+        commands = not self._server.read_only and self._may_command(host)
+        hello = {"kind": "hello", "read_only": self._server.read_only, "commands": commands}
+        await viewer.send_text(json_bytes(hello).decode())
+        version, events, state = 0, 0, ""
+        while True:
+            looked = self._looked
+            if self._map.version > version:
+                text, version = await run_in_threadpool(self._map_since, version)
+                await viewer.send_text(text)
+            if len(self._events) > events:
+                text, events = self._events_since(events)
+                await viewer.send_text(text)
+            if self._state != state:
+                state = self._state
+                await viewer.send_text(state)
+            await looked.wait()
+
+    def _map_since(self, version: int) -> tuple[str, int]:
+        with self._turn:
+            return self._map.message(version), self._map.version
+
+    def _events_since(self, first: int) -> tuple[str, int]:
+        fresh = tuple(event for event, number in self._events.items() if number >= first)
+        content = {"kind": "events", **json_values(History(fresh))}
+        return json_bytes(content).decode(), len(self._events)
+
+    async def _look_on(self) -> None:
+        while self._viewers:
+            try:
+                fresh = await run_in_threadpool(self._look)
+            except MapweaveError as error:
+                log.warning("nothing new is shown: %s", error)
+            except Exception:  # viewers keep what they have; the next look may succeed
+                log.exception("nothing new is shown")
+            else:
+                if fresh and (self._rating is None or self._rating.done()):
+                    self._rating = asyncio.create_task(run_in_threadpool(self._rate))
+            looked, self._looked = self._looked, asyncio.Event()
+            looked.set()
+            await asyncio.sleep(EVERY)
+
+    def _look(self) -> bool:
+        """Take over what is new; returns whether the links' probabilities are of another merge."""
+        merged = self._server.merged()
+        with self._turn:
+            if merged is not self._shown:
+                self._shown = merged
+                self._map.show(merged, self._probabilities)
+        for event in self._server.history():
+            self._events.setdefault(event, len(self._events))
+        status = self._server.status()
+        content = {
+            "kind": "state",
+            "server": {name: status[name] for name in SERVER_FIELDS if name in status},
+            **json_values(self._server.robots()),
+        }
+        self._state = json_bytes(content).decode()
+        return merged is not self._rated
+
+    def _rate(self) -> None:
+        """Work out the links' probabilities, which takes long in a large map."""
+        merged = self._rated = self._shown
+        if merged is None:
+            return
+        try:
+            probabilities = link_probabilities(merged)
+        except Exception:  # the map is shown without
+            log.exception("the links have no probabilities")
+            return
+        with self._turn:
+            self._probabilities = probabilities
+            if self._shown is merged:
+                self._map.show(merged, probabilities)
+
+
+async def _until_gone(viewer: WebSocket) -> None:
+    """Viewers say nothing; what they say is not read."""
+    with contextlib.suppress(WebSocketDisconnect):
+        while (await viewer.receive())["type"] != "websocket.disconnect":
+            pass

@@ -1,0 +1,54 @@
+"""A WebSocket with limits: a viewer that is gone or takes nothing is dropped."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
+
+
+class WebSocketConnection(WSProtocol):
+    """One viewer.
+
+    Attributes:
+        stall: s in which it may take nothing of what is sent.
+    """
+
+    stall = 10.0
+    _stalled: asyncio.TimerHandle | None = None
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        """Begin."""
+        super().__init__(*arguments, **named)
+        # A handshake has a header Connection of its own.
+        self.default_headers = [
+            (name, value) for name, value in self.default_headers if name != b"connection"
+        ]
+
+    def pause_writing(self) -> None:
+        """The peer is slower than what is sent."""
+        super().pause_writing()
+        self._watch(self.transport.get_write_buffer_size())
+
+    def resume_writing(self) -> None:
+        """It has taken enough."""
+        super().resume_writing()
+        if self._stalled is not None:
+            self._stalled.cancel()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop the clock."""
+        if self._stalled is not None:
+            self._stalled.cancel()
+        super().connection_lost(exc)
+
+    def _watch(self, before: int) -> None:
+        def check() -> None:
+            left = self.transport.get_write_buffer_size()
+            if left >= before:
+                self.transport.abort()
+            else:
+                self._watch(left)
+
+        self._stalled = self.loop.call_later(self.stall, check)

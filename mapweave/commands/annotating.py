@@ -1,0 +1,91 @@
+"""What people say about the map, on the command line: the options, and how it reaches a server or a file."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapweave.commands.network import add_network
+
+if TYPE_CHECKING:
+    from mapweave.fleet import Fleet
+    from mapweave.offline_annotations import OfflineAnnotations
+
+
+def add_record_options(parser: argparse.ArgumentParser, changes: bool) -> None:
+    """Declare options.
+
+    Args:
+        parser: of the command.
+        changes: whether the command adds to the record.
+    """
+    if changes:
+        parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
+        parser.add_argument("--by", default="", metavar="NAME", help="your name (default: the login name)")
+        parser.add_argument("-o", "--out", type=Path, metavar="OUT", help="with --map: write there instead")
+    else:
+        parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
+    add_network(parser)
+
+
+def add_area_options(parser: argparse.ArgumentParser) -> None:
+    """Declare how an area is given."""
+    parser.add_argument("--radius", type=float, metavar="M", help="the floor so far around, m")
+    parser.add_argument(
+        "--corners", nargs="+", metavar="X,Y", help="the floor within these corners in the merged map, m"
+    )
+    parser.add_argument(
+        "--near", metavar="NODE|PLACE",
+        help="positions are in the part of the map where this is (default: the largest part)",
+    )  # fmt: skip
+
+
+def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
+    """The options of `add_area_options` as fields of an annotation.
+
+    Raises:
+        InvalidValue: a corner is no position.
+    """
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.places import position_of
+
+    fields: dict[str, object] = {}
+    if arguments.radius is not None:
+        fields["radius"] = arguments.radius
+    if arguments.corners:
+        corners = [position_of(word) for word in arguments.corners]
+        if None in corners:
+            raise InvalidValue("--corners: give positions, as 3.1,-2.0 4,-2 4,1.5")
+        fields["corners"] = corners
+    if arguments.near:
+        fields["near"] = arguments.near
+    return fields
+
+
+@contextmanager
+def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineAnnotations]:
+    """The record of annotations that the command line names.
+
+    Raises:
+        MapweaveError: no server answers, or the file cannot be read.
+    """
+    from mapweave.fleet import login
+    from mapweave.hybridmap.errors import InvalidValue
+
+    if arguments.map is None:
+        from mapweave.commands.missions import fleet_of
+
+        if getattr(arguments, "out", None) is not None:
+            raise InvalidValue("--out goes with --map: a server keeps its own record")
+        with fleet_of(arguments) as fleet:
+            yield fleet
+    else:
+        from mapweave.commands.network import settings_of
+        from mapweave.offline_annotations import OfflineAnnotations
+
+        by, out = getattr(arguments, "by", "") or login(), getattr(arguments, "out", None)
+        yield OfflineAnnotations(arguments.map, out, by, settings_of(arguments).merge)

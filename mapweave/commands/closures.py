@@ -1,0 +1,160 @@
+"""`mapweave close`, `reopen`, `prefer`, `avoid` and `closures`: which ways robots may take, and should."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.annotating import add_area_options, add_record_options, area_fields, record_of
+
+if TYPE_CHECKING:
+    from mapweave.fleet import Fleet
+    from mapweave.offline_annotations import OfflineAnnotations
+
+WHERE = (
+    "WHERE is two nodes with an edge between them (r0.1.17 r0.1.19), a named place, or a node or position "
+    "with the floor around it (--radius, default: 1 m); or --corners."
+)
+TIMES = "14:00, '2026-03-01 14:00' (local time), '2026-03-01 14:00 UTC', +2h, +30min"
+
+
+def add_to(commands: Any) -> None:
+    """Declare the commands."""
+    close: argparse.ArgumentParser = commands.add_parser(
+        "close",
+        help="close a way or an area to robots, for a time",
+        description="Close an edge or an area: no route leads through it, robots on their way take another "
+        f"one, and a goal within it is refused. {WHERE} Closing an edge closes all that crosses its middle. "
+        "Examples: `mapweave close r0.1.17 r0.1.19 --until 14:00`, `mapweave close kitchen --because paint`.",
+    )
+    _add_where(close)
+    close.add_argument("--from", dest="begin", metavar="TIME", help=f"from when on (default: now): {TIMES}")
+    close.add_argument("--until", dest="end", metavar="TIME", help="until when (default: until `reopen`)")
+    close.set_defaults(run=run_close)
+
+    reopen: argparse.ArgumentParser = commands.add_parser(
+        "reopen",
+        help="withdraw a closure",
+        description="Withdraw a closure by its name, or by what was closed: `mapweave reopen kitchen`, "
+        "`mapweave reopen r0.1.17 r0.1.19`. `mapweave closures` lists the names.",
+    )
+    reopen.add_argument("where", nargs="+", metavar="NAME|NODE", help="the name, or the two nodes")
+    add_record_options(reopen, changes=True)
+    reopen.set_defaults(run=lambda arguments: _withdraw(arguments, "closure"))
+
+    for verb, factor, words in (("prefer", 0.5, "below 1"), ("avoid", 4.0, "above 1")):
+        parser: argparse.ArgumentParser = commands.add_parser(
+            verb,
+            help=f"let robots {verb} a way or an area",
+            description=f"Let robots {verb} an edge or an area where they can: its cost in routes is "
+            f"multiplied by a factor. {WHERE} Example: `mapweave {verb} r0.1.17 r0.1.19`; "
+            f"`mapweave {verb} r0.1.17 r0.1.19 --undo` withdraws it.",
+        )
+        _add_where(parser)
+        parser.add_argument(
+            "--factor", type=float, default=factor, metavar="F", help=f"{words} (default: {factor:g})"
+        )
+        parser.add_argument("--undo", action="store_true", help="take it back")
+        parser.set_defaults(run=run_prefer, verb=verb)
+
+    listing: argparse.ArgumentParser = commands.add_parser(
+        "closures",
+        help="what is closed, preferred and avoided",
+        description="List closures and preferences that are not withdrawn, those to come and those that are "
+        "over included: `mapweave closures`.",
+    )
+    add_record_options(listing, changes=False)
+    listing.set_defaults(run=run_list)
+
+
+def _add_where(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("where", nargs="*", metavar="WHERE", help="two nodes, a place, a node or a position")
+    add_area_options(parser)
+    parser.add_argument("--name", help="its name (default: what is meant)")
+    add_record_options(parser, changes=True)
+
+
+def run_close(arguments: argparse.Namespace) -> int:
+    """Close a way."""
+    from mapweave.hybridmap.wall_time import local_words, read_time, utc_words
+
+    now_ns = time.time_ns()
+    times: dict[str, Any] = {}
+    for field, text, word in (("begin_ns", arguments.begin, "from"), ("end_ns", arguments.end, "until")):
+        if text is not None:
+            times[field] = stamp_ns = read_time(text, now_ns)
+            print(f"{word} {local_words(stamp_ns)} ({utc_words(stamp_ns)})")
+    with record_of(arguments) as record:
+        name, fields = _meant(arguments, record)
+        print(record.annotate("closure", name, arguments.because, **fields, **times))
+    return 0
+
+
+def run_prefer(arguments: argparse.Namespace) -> int:
+    """Prefer or avoid a way, or withdraw that."""
+    from mapweave.hybridmap.errors import InvalidValue
+
+    if (arguments.factor < 1.0) != (arguments.verb == "prefer"):
+        raise InvalidValue(f"--factor {arguments.factor:g}: below 1 prefers a way, above 1 avoids it")
+    if arguments.undo:
+        return _withdraw(arguments, "preference")
+    with record_of(arguments) as record:
+        name, fields = _meant(arguments, record)
+        print(record.annotate("preference", name, arguments.because, factor=arguments.factor, **fields))
+    return 0
+
+
+def run_list(arguments: argparse.Namespace) -> int:
+    """Print closures and preferences."""
+    from mapweave.hybridmap.annotation import Closure, Preference
+    from mapweave.mapserver.http.json_values import json_values
+
+    with record_of(arguments) as record:
+        said = record.annotations()
+    entries = [entry for entry, _ in (*said.in_force(Closure), *said.in_force(Preference))]
+    if arguments.json:
+        print(json.dumps({"annotations": [json_values(entry) for entry in entries]}))
+        return 0
+    now_ns = time.time_ns()
+    for entry in entries:
+        body = entry.body
+        state = "" if not isinstance(body, Closure) or body.holds(now_ns) else ", not now"
+        print(f"{entry.words}{state}")
+    if not entries:
+        print("nothing is closed, preferred or avoided")
+    return 0
+
+
+def _withdraw(arguments: argparse.Namespace, kind: str) -> int:
+    name = getattr(arguments, "name", None) or " ".join(arguments.where)
+    with record_of(arguments) as record:
+        names = {entry.name for entry in record.annotations().made if entry.kind == kind}
+        # An edge has no direction.
+        other = " ".join(reversed(arguments.where))
+        name = other if name not in names and other in names else name
+        print(record.withdraw(kind, name, arguments.because))
+    return 0
+
+
+def _meant(arguments: argparse.Namespace, record: Fleet | OfflineAnnotations) -> tuple[str, dict[str, Any]]:
+    """Name and fields of what WHERE means.
+
+    Raises:
+        InvalidValue: nothing, or too much, is given.
+    """
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.annotation_words import AROUND
+
+    where, fields = arguments.where, dict[str, Any](area_fields(arguments))
+    if len(where) > 2 or bool(where) == ("corners" in fields) or (len(where) == 2 and "radius" in fields):
+        raise InvalidValue("give two nodes, or one place, node or position, or --corners")
+    if len(where) == 2:
+        fields["edge"] = where
+    elif where and record.annotations().last("place", where[0]) is not None:
+        fields["place"] = where[0]
+    elif where:
+        fields["node"] = where[0]
+        fields.setdefault("radius", AROUND)
+    return arguments.name or " ".join(where or arguments.corners)[:64], fields

@@ -1,0 +1,137 @@
+"""`mapweave keys`: who belongs to a fleet, and what each may do."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+ROLES = ("robot", "server", "operator", "viewer")
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command and its actions."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "keys",
+        help="keys of robots, servers and people, for a network that others can reach",
+        description="Without keys the map server listens on its own machine alone. With keys it serves a "
+        "network: each robot, server and person has a key file, and the router lets each do what its role "
+        "may: a robot writes its own map and asks, a viewer reads, an operator gives missions and corrects.",
+        epilog="example: mapweave keys init --at 192.168.1.10; mapweave keys add r0; "
+        "mapweave server --keys keys; on the robot: mapweave agent r0 --keys r0.key.toml",
+    )
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True, title="actions")
+
+    init = _action(actions, "init", "make the keys of a fleet, and those of its map server",
+                   "mapweave keys init --fleet demo --at 192.168.1.10")  # fmt: skip
+    init.add_argument("--fleet", default="demo", metavar="NAME", help="name of the fleet (default: demo)")
+    init.add_argument(
+        "--at", action="append", default=[], metavar="HOST",
+        help="name or address under which robots reach the server; may be repeated (default: 127.0.0.1)",
+    )  # fmt: skip
+    init.add_argument(
+        "--profile", choices=("production", "lab"), default="production",
+        help="production: certificates over mutual TLS; lab: users and passwords, unencrypted, for a network "
+        "that you trust (default: production)",
+    )  # fmt: skip
+    init.add_argument("--server", default="s0", metavar="NAME", help="name of the map server (default: s0)")
+    init.set_defaults(run=_init)
+
+    add = _action(actions, "add", "give a robot, server or person a key, or a new one",
+                  "mapweave keys add anna --role operator")  # fmt: skip
+    add.add_argument("name", metavar="NAME", help="a robot's name is that of its agent")
+    add.add_argument("--role", choices=ROLES, default="robot", help="what it may do (default: robot)")
+    add.add_argument("--days", type=float, default=365.0, help="for which it holds (default: 365)")
+    add.set_defaults(run=_add)
+
+    listing = _action(actions, "list", "who has a key, and until when", "mapweave keys list")
+    listing.add_argument("--json", action="store_true", help="print one JSON object")
+    listing.set_defaults(run=_list)
+
+    revoke = _action(
+        actions, "revoke", "admit an identity no more, at once", "mapweave keys revoke r3 --because stolen"
+    )
+    revoke.add_argument("name", metavar="NAME")
+    revoke.add_argument("--because", default="", metavar="TEXT", help="why; the router's log says it")
+    revoke.set_defaults(run=_revoke)
+
+    bundle = _action(actions, "bundle", "the one file to copy to a robot or person",
+                     "mapweave keys bundle r0 -o /media/stick/r0.key.toml")  # fmt: skip
+    bundle.add_argument("name", metavar="NAME")
+    bundle.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="where to")
+    bundle.set_defaults(run=_bundle)
+
+
+def _action(actions: Any, name: str, words: str, example: str) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = actions.add_parser(
+        name, help=words, description=f"{words[0].upper()}{words[1:]}.", epilog=f"example: {example}"
+    )
+    parser.add_argument(
+        "--keys", type=Path, default=Path("keys"), metavar="FOLDER", help="folder of the keys (default: keys)"
+    )
+    return parser
+
+
+def _init(arguments: argparse.Namespace) -> int:
+    from mapweave.identities.key_folder import KeyFolder, Profile
+
+    profile = Profile(arguments.profile)
+    folder = KeyFolder.create(arguments.keys, arguments.fleet, profile, arguments.at, arguments.server)
+    where = ", ".join(folder.catalogue.endpoints)
+    print(f"{arguments.keys}: keys of fleet {arguments.fleet}; robots find the server at {where}")
+    if not arguments.at:
+        print("that is this machine alone: give --at HOST if robots are to reach it (in another folder)")
+    if profile is Profile.LAB:
+        print("passwords and maps travel unencrypted: use it only in a network that you trust")
+    print(f"next: mapweave keys add r0 --keys {arguments.keys}; mapweave server --keys {arguments.keys}")
+    return 0
+
+
+def _add(arguments: argparse.Namespace) -> int:
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.identities.key_folder import KeyFolder
+    from mapweave.wire.credentials import Role
+
+    if not 0.0 < arguments.days <= 3650.0:
+        raise InvalidValue(f"--days {arguments.days:g}: give 1 to 3650")
+    path = KeyFolder(arguments.keys).add(arguments.name, Role(arguments.role), arguments.days)
+    print(f"{path}: copy this file to {arguments.name}, and to no other")
+    return 0
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    import json
+
+    from mapweave.identities.key_folder import KeyFolder
+
+    catalogue = KeyFolder(arguments.keys).catalogue
+    if arguments.json:
+        rows = [
+            {"name": one.name, "role": one.role, "state": one.state, "issued": one.issued,
+             "expires": one.expires} for one in catalogue.identities
+        ]  # fmt: skip
+        print(json.dumps({"fleet": catalogue.fleet, "profile": catalogue.profile, "identities": rows}))
+        return 0
+    print(f"fleet {catalogue.fleet}, profile {catalogue.profile}")
+    width = max(len(one.name) for one in catalogue.identities)
+    for one in catalogue.identities:
+        until = f", until {one.expires[:10]}" if one.expires and not one.revoked else ""
+        print(f"{one.name:<{width}}  {one.role:<8}  {one.state}{until}")
+    return 0
+
+
+def _revoke(arguments: argparse.Namespace) -> int:
+    from mapweave.identities.key_folder import KeyFolder
+
+    KeyFolder(arguments.keys).revoke(arguments.name, " ".join(arguments.because.split()))
+    print(f"{arguments.name} is admitted no more; a running server takes note within seconds")
+    return 0
+
+
+def _bundle(arguments: argparse.Namespace) -> int:
+    from mapweave.identities.key_file import read_key_file, write_key_file
+    from mapweave.identities.key_folder import KeyFolder
+
+    write_key_file(arguments.out, read_key_file(KeyFolder(arguments.keys).key_file(arguments.name)))
+    print(f"{arguments.out}: the key of {arguments.name}")
+    return 0

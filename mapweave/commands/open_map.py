@@ -1,0 +1,45 @@
+"""`mapweave open`: the map server's page for a map file, a store or a journal, without robots."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.network import settings_of, stop_on_signals
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "open",
+        help="show a map in the browser, without robots",
+        description="Serve the map server's page for a map file, a server's store or an agent's journal: "
+        "`mapweave open office.mapweave`, then open the address that is printed. The map is only shown: "
+        "neither the file nor its folder is ever changed, and there are no robots to send.",
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help=SOURCES)
+    parser.add_argument(
+        "--http", metavar="[HOST:]PORT", default="8080",
+        help="where, on this machine alone unless HOST is given (default: 8080)",
+    )  # fmt: skip
+    parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML; [merge] says how it was merged")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve until stopped."""
+    from mapweave.mapserver.http.web import Web, parse_address
+    from mapweave.read_only_server import ReadOnlyServer
+
+    host, port = parse_address(arguments.http)
+    settings = settings_of(arguments).merge
+    one = opened(arguments.file)
+    merged = merged_with_progress(one, settings)
+    stop = stop_on_signals()
+    with ReadOnlyServer(one, merged, settings) as server, Web((host, port), server):
+        print(f"{arguments.file}: {merged.summary()}", flush=True)
+        print(f"open http://{host}:{port}/ to see it; Ctrl-C ends", flush=True)
+        stop.wait()
+    return 0

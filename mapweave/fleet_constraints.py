@@ -1,0 +1,142 @@
+"""Manual constraints from Python: links by hand, links undone, what is retired, and taking it back."""
+
+from __future__ import annotations
+
+import time
+
+from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.constraint_subject import (
+    Apart,
+    Linked,
+    RetiredArea,
+    RetiredMap,
+    Subject,
+    read_ends,
+    read_retired,
+    read_window,
+)
+from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.wire.bus import Bus, Reply
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
+from mapweave.wire.messages import decode, encode
+
+SOON = 2.0
+"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
+CHECKING = 20.0
+"""How long a server may take to check a manual constraint against a large map, s."""
+
+
+class FleetConstraints:
+    """The part of `mapweave.fleet.Fleet` by which people correct the merge."""
+
+    _bus: Bus
+    _keys: Keys
+    _by: str
+
+    def link(
+        self, a: str, b: str, pose: Pose2 | None = None, because: str = "", *, check: bool = False
+    ) -> str:
+        """Link two nodes by hand: they see one place.
+
+        Args:
+            a: a node, `r0.1.17`.
+            b: another one, of the same map or of another.
+            pose: of b's robot frame in a's, where their images do not say it; needs `because`.
+            because: why.
+            check: only say what it would do.
+
+        Returns:
+            What the server made of it, in words.
+
+        Raises:
+            InvalidValue: the images do not agree, or the map contradicts it: the evidence, and what to do.
+            NotConnected: no map server answers.
+        """
+        return self.constrain(Linked(NodeId.parse(a), NodeId.parse(b), pose), True, because, check=check)
+
+    def unlink(self, first: str, second: str, because: str = "", *, check: bool = False) -> str:
+        """Undo the link between two nodes, or all links between two maps; see `link`."""
+        return self.constrain(Apart(read_ends(first, second)), True, because, check=check)
+
+    def retire(
+        self,
+        *which: str,
+        area: Area | None = None,
+        begin: str | int = "",
+        end: str | int = "",
+        because: str = "",
+        check: bool = False,
+    ) -> str:
+        """Retire a map, some nodes, an area, or what a map has of a time; see `link`.
+
+        Args:
+            which: one map, `r0.1`, or nodes, `r0.1.17`; none with an area.
+            area: where all nodes are retired, of all maps.
+            begin: of one map alone nodes from then on: ns since 1970, or `2026-03-01T12:00` (UTC).
+            end: and until then.
+            because: why.
+            check: only say what it would do.
+        """
+        about: Subject
+        if area is not None:
+            if which or begin or end:
+                raise InvalidValue("an area goes with neither maps, nodes nor times")
+            about = RetiredArea(area)
+        else:
+            about = read_retired(which)
+            if begin or end:
+                if not isinstance(about, RetiredMap):
+                    raise InvalidValue("a time window is of one map")
+                about = read_window(about.map, begin, end)
+        return self.constrain(about, True, because, check=check)
+
+    def undo(self, what: int | ManualConstraint, because: str = "", *, check: bool = False) -> str:
+        """Take a manual constraint back.
+
+        Args:
+            what: the constraint, or its number in `constraints()`, from 1.
+            because: why.
+            check: only say what it would do.
+        """
+        if isinstance(what, int):
+            record = self.constraints()
+            if not 1 <= what <= len(record):
+                raise InvalidValue(f"there is no constraint {what}: the record has {len(record)}")
+            what = record[what - 1]
+        return self.constrain(what.about, False, because, check=check)
+
+    def constraints(self) -> tuple[ManualConstraint, ...]:
+        """What people have linked, unmerged, retired and taken back, in order; the first is number 1.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        replies = self._ask(self._keys.any_constraints(), b"", SOON)
+        if not replies:
+            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+        return decode(replies[0].payload, ConstraintList).made
+
+    def constrain(self, about: Subject, holds: bool, because: str = "", *, check: bool = False) -> str:
+        """Set a manual constraint of any kind, or take it back; see `link`."""
+        constraint = ManualConstraint(about, holds, self._by, time.time_ns(), because)
+        request = encode(ConstraintRequest(constraint, check))
+        end = time.monotonic() + CHECKING
+        while True:
+            replies = self._bus.ask(self._keys.any_constrain(), request, CHECKING)
+            pause = max((reply.retry_after for reply in replies), default=0.0)
+            if pause <= 0.0 or time.monotonic() + pause > end:
+                break
+            time.sleep(pause)
+        if not replies:
+            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
+        taken = [reply for reply in replies if not reply.error]
+        if not taken:
+            raise InvalidValue(replies[0].error.removeprefix("refused: "))
+        return str(decode_record(taken[0].payload)["said"])
+
+    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
+        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]

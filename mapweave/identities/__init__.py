@@ -1,0 +1,1 @@
+"""Who belongs to a fleet: the authority, the identities that it has given keys, and key files."""

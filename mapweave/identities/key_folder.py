@@ -1,0 +1,258 @@
+"""The folder of a fleet's keys, beside its server: authority, identities, key files.
+
+fleet.json        name of the fleet, profile, endpoints, identities; no secret in it
+authority.pem     certificate of the authority; authority.key signs with it
+passwords         of the lab profile, as the router reads them
+NAME.key.toml     key file of NAME: copy it there
+"""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+
+import msgspec
+
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.node import check_name
+from mapweave.identities.key_file import SUFFIX, KeyFile, read_key_file, write_key_file, write_private
+from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.credentials import Access, Credentials, Member, Role
+
+CATALOGUE = "fleet.json"
+AUTHORITY, AUTHORITY_KEY, PASSWORDS = "authority.pem", "authority.key", "passwords"
+PORT = 7447
+SERVER_DAYS = 825
+DAYS = 365
+"""For which a key holds, unless it is said otherwise."""
+
+
+class Profile(StrEnum):
+    """How identities are proved."""
+
+    LAB = "lab"
+    """By user and password, unencrypted, for a trusted network."""
+    PRODUCTION = "production"
+    """By certificates, over mutual TLS."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A member of the fleet.
+
+    Attributes:
+        name: of the robot, server or person.
+        role: what it may do.
+        issued: when its present key was made, ISO 8601.
+        expires: when that key ends; empty if it does not.
+        subject: common name of its certificate, or its user name. After a revocation it is another one, since
+            the old certificate still has the old one.
+        revoked: when and why the key was revoked; empty while it is good.
+        void: subjects of revoked keys, each with when and why.
+    """
+
+    name: str
+    role: Role
+    subject: str
+    issued: str
+    expires: str = ""
+    revoked: str = ""
+    void: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def state(self) -> str:
+        """In a word or two."""
+        if self.revoked:
+            return f"revoked {self.revoked}"
+        over = self.expires and datetime.fromisoformat(self.expires) <= datetime.now(UTC)
+        return "expired" if over else "good"
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """What is known of a fleet's keys.
+
+    Attributes:
+        fleet: its name.
+        profile: how identities are proved.
+        listen: where the router listens.
+        endpoints: where robots find it.
+        hosts: names and addresses in the server's certificate.
+        identities: by the order in which they were added.
+    """
+
+    fleet: str
+    profile: Profile
+    listen: tuple[str, ...]
+    endpoints: tuple[str, ...]
+    hosts: tuple[str, ...]
+    identities: tuple[Identity, ...] = field(default=())
+
+
+class KeyFolder:
+    """The keys of a fleet."""
+
+    def __init__(self, path: Path) -> None:
+        """Read it.
+
+        Raises:
+            SettingsError: it is missing or damaged.
+        """
+        self.path = path
+        try:
+            self.catalogue = msgspec.json.decode(read_whole(path / CATALOGUE), type=Catalogue)
+        except FileNotFoundError:
+            raise SettingsError(f"{path}: no keys are here; make some with `mapweave keys init`") from None
+        except NotADirectoryError:
+            raise SettingsError(f"{path}: is a file; give the folder of `mapweave keys init`") from None
+        except (OSError, msgspec.DecodeError) as error:
+            raise SettingsError(f"{path / CATALOGUE}: {error}") from None
+
+    @classmethod
+    def create(
+        cls, path: Path, fleet: str, profile: Profile, hosts: Sequence[str], server: str, port: int = PORT
+    ) -> KeyFolder:
+        """Make the authority and the server's key.
+
+        Raises:
+            SettingsError: there are keys already.
+        """
+        if (path / CATALOGUE).exists():
+            raise SettingsError(f"{path}: there are keys already; add to them with `mapweave keys add`")
+        check_name(fleet)
+        scheme = "tls" if profile is Profile.PRODUCTION else "tcp"
+        reached = tuple(hosts) or ("127.0.0.1",)
+        known = dict.fromkeys((*reached, "localhost", "127.0.0.1", "::1", socket.gethostname()))
+        catalogue = Catalogue(
+            fleet, profile, (f"{scheme}/0.0.0.0:{port}",),
+            tuple(f"{scheme}/{f'[{host}]' if ':' in host else host}:{port}" for host in reached),
+            tuple(known),
+        )  # fmt: skip
+        path.mkdir(parents=True, exist_ok=True)
+        path.chmod(0o700)
+        if profile is Profile.PRODUCTION:
+            from mapweave.identities.authority import Authority
+
+            authority, private_key = Authority.create(fleet)
+            write_whole(path / AUTHORITY, authority.certificate.encode())
+            write_private(path / AUTHORITY_KEY, private_key)
+        write_whole(path / CATALOGUE, msgspec.json.format(msgspec.json.encode(catalogue), indent=1))
+        folder = cls(path)
+        folder.add(server, Role.SERVER, SERVER_DAYS)
+        return folder
+
+    @property
+    def profile(self) -> Profile:
+        """How identities are proved."""
+        return self.catalogue.profile
+
+    def add(self, name: str, role: Role, days: float = DAYS) -> Path:
+        """Give an identity a key. One that it has and that was not revoked holds until it expires.
+
+        Returns:
+            Its key file.
+
+        Raises:
+            InvalidValue: it has a key, and another role.
+        """
+        check_name(name)
+        known = self.find(name)
+        if known is not None and not known.revoked and known.role is not role:
+            raise InvalidValue(f"{name} is a {known.role} already; revoke that key first")
+        issued_at = datetime.now(UTC).isoformat(timespec="seconds")
+        void = () if known is None else known.void
+        subject = f"{name}~{len(void)}" if void and self.profile is Profile.PRODUCTION else name
+        if self.profile is Profile.PRODUCTION:
+            from mapweave.identities.authority import Authority
+
+            authority = Authority(self._read(AUTHORITY), self._read(AUTHORITY_KEY))
+            hosts = self.catalogue.hosts
+            issued = authority.issue(subject, role, timedelta(days=days), hosts)
+            credentials = Credentials(
+                name, role, authority.certificate, issued.certificate, issued.private_key
+            )
+            expires = issued.expires.isoformat(timespec="seconds")
+            identity = Identity(name, role, subject, issued_at, expires, void=void)
+        else:
+            credentials = Credentials(name, role, password=secrets.token_urlsafe(24))
+            identity = Identity(name, role, subject, issued_at, void=void)
+        path = self.path / f"{name}{SUFFIX}"
+        write_key_file(path, KeyFile(self.catalogue.fleet, self.catalogue.endpoints, credentials))
+        self._keep(identity)
+        return path
+
+    def revoke(self, name: str, because: str = "") -> None:
+        """Admit an identity no more.
+
+        Raises:
+            InvalidValue: there is none, or its key is revoked.
+        """
+        identity = self.find(name)
+        if identity is None or identity.revoked:
+            known = ", ".join(one.name for one in self.catalogue.identities if not one.revoked)
+            raise InvalidValue(f"{name} has no key; these have: {known}")
+        when = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        said = f"{when}{f': {because}' if because else ''}"
+        (self.path / f"{name}{SUFFIX}").unlink(missing_ok=True)
+        self._keep(replace(identity, revoked=said, void=(*identity.void, (identity.subject, said))))
+
+    def find(self, name: str) -> Identity | None:
+        """The identity of this name."""
+        return next((one for one in self.catalogue.identities if one.name == name), None)
+
+    def key_file(self, name: str) -> Path:
+        """The key file of an identity.
+
+        Raises:
+            InvalidValue: it is not here.
+        """
+        path = self.path / f"{name}{SUFFIX}"
+        if not path.exists():
+            raise InvalidValue(f"{name} has no key here; make one with `mapweave keys add {name}`")
+        return path
+
+    def router(self, server: str, listen: Sequence[str] = ()) -> BusSettings:
+        """Settings of the fleet's router.
+
+        Args:
+            server: name of the map server, whose key the router has.
+            listen: other endpoints than those of the keys.
+        """
+        catalogue = self.catalogue
+        good = [Member(one.name, one.role, one.subject) for one in catalogue.identities if not one.revoked]
+        bad = [pair for one in catalogue.identities for pair in one.void]
+        passwords = str(self.path / PASSWORDS) if self.profile is Profile.LAB else ""
+        return BusSettings(
+            mode="router", listen=tuple(listen) or catalogue.listen, fleet=catalogue.fleet,
+            credentials=read_key_file(self.key_file(server)).credentials,
+            access=Access(tuple(good), passwords, tuple(bad)),
+        )  # fmt: skip
+
+    def changed(self) -> bool:
+        """Whether identities came or went since this was read; afterwards this knows them."""
+        before = self.catalogue
+        self.catalogue = KeyFolder(self.path).catalogue
+        return self.catalogue != before
+
+    def _keep(self, identity: Identity) -> None:
+        others = tuple(one for one in self.catalogue.identities if one.name != identity.name)
+        self.catalogue = replace(self.catalogue, identities=(*others, identity))
+        if self.profile is Profile.LAB:
+            users = [one.name for one in self.catalogue.identities if not one.revoked]
+            lines = [f"{name}:{read_key_file(self.key_file(name)).credentials.password}" for name in users]
+            write_private(self.path / PASSWORDS, "\n".join(lines) + "\n")
+        # Last: the server reads all of it again when this has changed.
+        text = msgspec.json.format(msgspec.json.encode(self.catalogue), indent=1)
+        write_whole(self.path / CATALOGUE, text)
+
+    def _read(self, name: str) -> str:
+        try:
+            return read_whole(self.path / name).decode()
+        except (OSError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{self.path / name}: {error}") from None

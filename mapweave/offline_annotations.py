@@ -1,0 +1,88 @@
+"""Annotations of a map file or store, without a server; the same methods as of mapweave.fleet.Fleet."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.annotation_words import annotation_of_words
+from mapweave.mapserver.annotator import check_annotation
+from mapweave.mapserver.places import Places
+from mapweave.mapserver.routes import Router
+from mapweave.merge.settings import MergeSettings
+from mapweave.opened_map import MapSource, open_map
+from mapweave.storage.atomic_file import check_place
+from mapweave.storage.map_file import write_map_file
+
+
+class OfflineAnnotations:
+    """The annotations of one map. Map files are written; a store is only read, since it is its server's."""
+
+    def __init__(
+        self, path: Path, out: Path | None = None, by: str = "a person", settings: MergeSettings | None = None
+    ) -> None:
+        """Read a map.
+
+        Args:
+            path: of the file or store.
+            out: where the file with new annotations is written; over the old file by default.
+            by: says so.
+            settings: with which the file was merged.
+
+        Raises:
+            InvalidFile: it cannot be read.
+        """
+        self._by, self._settings = by, settings
+        self._opened = open_map(path)
+        self._out = path if out is None and self._opened.source is MapSource.FILE else out
+        self._made = Annotations(self._opened.content.annotations)
+
+    def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
+        """See Fleet.annotate; the file is written.
+
+        Raises:
+            MapweaveError: it says nothing new, is about something that is not there, or cannot be written.
+        """
+        return self._annotate(name, {"kind": kind, **fields}, False, because)
+
+    def withdraw(self, kind: str, name: str, because: str = "") -> str:
+        """See Fleet.withdraw; the file is written."""
+        return self._annotate(name, {"kind": kind}, True, because)
+
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+        return self._made
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+        """
+        return Places(self._router, self.annotations()).answer(request)
+
+    @cached_property
+    def _router(self) -> Router:
+        return Router(self._opened.merged(self._settings))
+
+    def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
+        if self._out is None:
+            raise InvalidValue(
+                f"{self._opened.path} is a {self._opened.source}, which is not written: give -o"
+            )
+        check_place(self._out)
+        annotation = annotation_of_words(
+            name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
+        )
+        check_annotation(self._router.merged, self.annotations(), annotation)
+        self._made = Annotations((*self._made.made, annotation))
+        content = self._opened.file(self._router.merged)
+        write_map_file(self._out, replace(content, annotations=self._made.made))
+        return annotation.words

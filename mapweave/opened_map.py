@@ -1,0 +1,209 @@
+"""A map that is opened: a map file, a server's store or an agent's journal. Opening never changes it.
+
+What a file is shows its content, not its name: map files and SQLite files have their own first bytes, and
+stores and journals their own application ids.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from mapweave.agent.replication import journal
+from mapweave.agent.replication.retained_map import RetainedMap
+from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log import store
+from mapweave.mapserver.log.salvage import Salvage, salvage
+from mapweave.mapserver.own_maps import maps_of
+from mapweave.storage.database_reader import MAGIC as SQLITE
+from mapweave.storage.database_reader import reading
+from mapweave.storage.map_file import MAGIC, MapFile, read_map_file
+from mapweave.wire.messages import KeptHistory, decode
+
+if TYPE_CHECKING:
+    from mapweave.merge.pose_graph.merged_map import MergedMap
+    from mapweave.merge.settings import MergeSettings
+
+Value = TypeVar("Value")
+OTHER = "is neither a map file nor an agent's journal nor a server's store"
+
+
+class MapSource(StrEnum):
+    """What a map is in, in words."""
+
+    FILE = "map file"
+    STORE = "server's store"
+    JOURNAL = "agent's journal"
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedMap:
+    """A map file, store or journal, as it was when it was opened.
+
+    Attributes:
+        path: of the file.
+        source: what it is.
+        content: of a file as it is; of a store or journal all maps, constraints, annotations and history, not
+            merged yet.
+        maps: the robots' maps in it, also those of a journal that are empty.
+        complaints: what of each map could not be read, in one line each; key None: what belongs to no map.
+    """
+
+    path: Path
+    source: MapSource
+    content: MapFile
+    maps: tuple[MapId, ...]
+    complaints: Mapping[MapId | None, str]
+
+    def merged(
+        self,
+        settings: MergeSettings | None = None,
+        progress: Callable[[int, int], None] = lambda done, of: None,
+    ) -> MergedMap:
+        """The merged map.
+
+        Of a file as it was decided when it was written, and of a single robot's map with its own loop
+        closures applied; several maps of a store or journal are merged as a server merges them.
+
+        Raises:
+            InvalidFile: the measurements determine no poses.
+            InvalidValue: a map cannot be merged.
+        """
+        # These load the libraries that solve pose graphs: what only looks into a map does without.
+        from mapweave.mapserver.map_files import merged_of
+        from mapweave.offline_merge import merge_parts
+
+        maps = maps_of(self.content)
+        if self.source is MapSource.FILE or len(maps) < 2:
+            return merged_of(self.content, settings)
+        constraints = ManualConstraints(self.content.constraints)
+        of_store = self.path if self.source is MapSource.STORE else None
+        return merge_parts(maps, constraints, progress, settings, of_store)
+
+    def file(self, merged: MergedMap) -> MapFile:
+        """The content of a map file that holds the whole map.
+
+        Args:
+            merged: see `merged`.
+        """
+        if self.source is MapSource.FILE or len(merged.maps) < 2:
+            return self.content
+        from mapweave.mapserver.map_files import map_file_of
+
+        return map_file_of(merged, self.content.history, Annotations(self.content.annotations))
+
+
+def open_map(path: Path) -> OpenedMap:
+    """Open a map file, a server's store or an agent's journal, whatever its name. Nothing is written.
+
+    Raises:
+        InvalidFile: it is none of these, damaged, truncated, of another version, or in use by a process.
+    """
+    source = source_of(path)
+    if source is MapSource.FILE:
+        content = read_map_file(path)
+        return OpenedMap(path, source, content, tuple(sorted(maps_of(content))), {})
+    return _of_journal(path) if source is MapSource.JOURNAL else _of_store(path)
+
+
+def source_of(path: Path) -> MapSource:
+    """What a file is, by its content.
+
+    Raises:
+        InvalidFile: it is no map, cannot be read, or is of a newer version.
+    """
+    if path.is_dir():
+        raise InvalidFile(f"{path}: is a folder; give a map file, or a server's or agent's .sqlite in it")
+    if not path.exists():
+        raise InvalidFile(f"{path}: no such file")
+    if not path.is_file():
+        raise InvalidFile(f"{path}: cannot be read (not a regular file)")
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(SQLITE))
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+    if head and head.startswith(MAGIC[: len(head)]):
+        return MapSource.FILE
+    if head != SQLITE:
+        raise InvalidFile(f"{path}: {OTHER}")
+    try:
+        with reading(path) as connection:
+            kind, version = (
+                int(connection.execute(f"PRAGMA {name}").fetchone()[0])
+                for name in ("application_id", "user_version")
+            )
+    except sqlite3.Error as error:
+        raise InvalidFile(f"{path}: cannot be read ({error})") from None
+    if kind == journal.APPLICATION_ID:
+        return MapSource.JOURNAL
+    if kind != store.APPLICATION_ID:
+        raise InvalidFile(f"{path}: {OTHER}")
+    if version != store.VERSION:
+        raise InvalidFile(f"{path}: map store of format {version}, this program uses {store.VERSION}")
+    return MapSource.STORE
+
+
+def _of_journal(path: Path) -> OpenedMap:
+    with closing(journal.Journal(path)) as of_agent:
+        kept = {map_id: RetainedMap.of(of_agent, map_id) for map_id in of_agent.maps()}
+    changes = tuple(body for retained in kept.values() for body in retained.contents)
+    complaints: dict[MapId | None, str] = {m: one.complaint for m, one in kept.items() if one.complaint}
+    return OpenedMap(
+        path, MapSource.JOURNAL, MapFile("agent", _title(kept), changes), tuple(kept), complaints
+    )
+
+
+def _of_store(path: Path) -> OpenedMap:
+    salvaged = salvage(path)
+    constraints, bad = _read(salvaged.constraints, ManualConstraint)
+    history, worse = _read(
+        [salvaged.results[store.HISTORY]] if store.HISTORY in salvaged.results else [], KeptHistory
+    )
+    annotations, worst = _read(salvaged.annotations, Annotation)
+    content = MapFile(
+        "agent",
+        _title(salvaged.maps),
+        tuple(body for _, hybrid in sorted(salvaged.maps.items()) for body in hybrid.contents()),
+        constraints=tuple(constraints),
+        history=tuple(event for record in history for event in record.events),
+        annotations=tuple(annotations),
+    )
+    complaint = _lost(path, salvaged, bad + worse + worst)
+    maps = tuple(sorted(salvaged.maps))
+    return OpenedMap(path, MapSource.STORE, content, maps, {None: complaint} if complaint else {})
+
+
+def _title(maps: Collection[MapId]) -> str:
+    return str(*maps) if len(maps) == 1 else f"{len(maps)} maps"
+
+
+def _read(bodies: Iterable[bytes], kind: type[Value]) -> tuple[list[Value], int]:
+    """The values, and how many could not be read."""
+    values, bad = [], 0
+    for body in bodies:
+        try:
+            values.append(decode(body, kind))
+        except InvalidMessage:
+            bad += 1
+    return values, bad
+
+
+def _lost(path: Path, salvaged: Salvage, unread: int) -> str:
+    """What of a store could not be read, in one line; empty if all could."""
+    lost = salvaged.damaged + unread
+    if salvaged.whole and not lost:
+        return ""
+    damaged = f"{lost} damaged changes" if lost else "no damaged change"
+    pages = (
+        "" if salvaged.whole else ", and pages that cannot be read: how many changes they had is not known"
+    )
+    return f"{path} had {damaged}{pages}"

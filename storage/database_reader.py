@@ -1,0 +1,64 @@
+"""Reading an SQLite file without changing anything: not the file, not its folder."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from mapweave.hybridmap.errors import InvalidFile
+
+MAGIC = b"SQLite format 3\0"
+"""First bytes of every SQLite file (https://sqlite.org/fileformat2.html, 1.3.1)."""
+
+
+@contextmanager
+def reading(path: Path, what: str = "file") -> Iterator[sqlite3.Connection]:
+    """A connection that only reads; also in a folder that cannot be written.
+
+    A file next to which there is no write-ahead log is read in place, as immutable: SQLite then makes no
+    files beside it. A process that was killed leaves such a log; its last commits are in there alone. SQLite
+    would put them into the file, so both are copied and the copy is read.
+
+    Args:
+        path: of the file.
+        what: for the errors, for example `agent journal`.
+
+    Raises:
+        InvalidFile: there is no such file, it cannot be opened, or another process has it open for writing.
+    """
+    if not path.is_file():
+        raise InvalidFile(f"{path}: no such file")
+    log = path.with_name(path.name + "-wal")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            if not log.exists():
+                uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+            else:
+                if _in_use(path):
+                    raise InvalidFile(f"{path}: {what} is in use by another process")
+                copy = Path(folder) / "copy"
+                shutil.copyfile(path, copy)
+                shutil.copyfile(log, copy.with_name("copy-wal"))
+                uri = copy.as_uri()
+            with closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
+                # Text with a flipped bit may be no UTF-8; its meaning is checked by the reader.
+                connection.text_factory = lambda data: data.decode("utf-8", "replace")
+                yield connection
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _in_use(path: Path) -> bool:
+    """Whether a process has locked the file. Makes no file, if a write-ahead log is there already."""
+    uri = f"{path.absolute().as_uri()}?mode=ro&readonly_shm=1"
+    try:
+        with closing(sqlite3.connect(uri, uri=True, timeout=1.0)) as connection:
+            connection.execute("PRAGMA schema_version").fetchone()
+    except sqlite3.Error as error:
+        # Any other error is not of the lock: without shared memory the log itself cannot be opened.
+        return "locked" in str(error)
+    return False

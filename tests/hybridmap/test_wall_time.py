@@ -1,0 +1,50 @@
+"""Wall time in people's words."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta, timezone
+
+import pytest
+
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.wall_time import local_words, read_time, utc_words
+
+NOW = datetime(2026, 3, 1, 13, 30, tzinfo=UTC)
+NOW_NS = round(NOW.timestamp()) * 10**9
+EAST = timezone(timedelta(hours=2))
+
+
+@pytest.mark.parametrize(
+    ("text", "zone", "expected"),
+    [
+        ("14:00", UTC, datetime(2026, 3, 1, 14, 0, tzinfo=UTC)),
+        ("13:30", UTC, datetime(2026, 3, 2, 13, 30, tzinfo=UTC)),
+        ("14:00", EAST, datetime(2026, 3, 2, 12, 0, tzinfo=UTC)),
+        ("16:00", EAST, datetime(2026, 3, 1, 14, 0, tzinfo=UTC)),
+        ("14:00 UTC", EAST, datetime(2026, 3, 1, 14, 0, tzinfo=UTC)),
+        ("14:00z", EAST, datetime(2026, 3, 1, 14, 0, tzinfo=UTC)),
+        ("2026-07-01 08:15", EAST, datetime(2026, 7, 1, 6, 15, tzinfo=UTC)),
+        ("2026-07-01 08:15 utc", EAST, datetime(2026, 7, 1, 8, 15, tzinfo=UTC)),
+        ("2026-07-01T08:15:30+01:00", EAST, datetime(2026, 7, 1, 7, 15, 30, tzinfo=UTC)),
+        ("2026-07-01", UTC, datetime(2026, 7, 1, tzinfo=UTC)),
+        ("+2h", EAST, datetime(2026, 3, 1, 15, 30, tzinfo=UTC)),
+        ("+30min", UTC, datetime(2026, 3, 1, 14, 0, tzinfo=UTC)),
+        ("+1.5d", UTC, datetime(2026, 3, 3, 1, 30, tzinfo=UTC)),
+    ],
+)
+def test_times_are_read(text, zone, expected) -> None:
+    assert read_time(text, NOW_NS, zone) == round(expected.timestamp()) * 10**9
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "soon", "25:00", "14:61", "2026-13-01", "1960-01-01", "+h", "9999-12-31 23:59", "14"],
+)
+def test_what_is_no_time_is_refused(text) -> None:
+    with pytest.raises(InvalidValue):
+        read_time(text, NOW_NS, UTC)
+
+
+def test_a_time_is_written_in_both_zones() -> None:
+    assert utc_words(NOW_NS) == "2026-03-01 13:30 UTC"
+    assert local_words(NOW_NS, EAST) == "2026-03-01 15:30 +0200"

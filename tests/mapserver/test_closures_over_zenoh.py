@@ -1,0 +1,103 @@
+"""A real server over Zenoh: places and closures from the shell, and what robots get to know of them."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+
+import pytest
+
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mission_control import MissionControl
+from mapweave.cli import main
+from mapweave.fleet import Fleet
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.mission_order import MissionState
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer, RouteRequest
+from mapweave.mapserver.server import MapServer
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode, encode
+from mapweave.wire.zenoh_bus import ZenohBus
+from tests.mapserver.conftest import ROBOT, MappedRoom
+from tests.waiting import eventually, free_port
+
+KEYS = Keys("demo")
+
+
+def test_what_is_closed_from_the_shell_holds_for_all(
+    mapped_room: Callable[[], MappedRoom], capsys: pytest.CaptureFixture[str]
+) -> None:
+    endpoint, mapped = f"tcp/127.0.0.1:{free_port()}", mapped_room()
+    first, second, last = sorted(mapped.truth)[0], sorted(mapped.truth)[1], sorted(mapped.truth)[-1]
+    router = ZenohBus(BusSettings("router", listen=(endpoint,)))
+    robot = ZenohBus(BusSettings(endpoints=(endpoint,)))
+
+    def shell(*words: str) -> tuple[int, str, str]:
+        status = main([*words, "--connect", endpoint])
+        return status, *capsys.readouterr()
+
+    try:
+        with MapServer(router, KEYS, mapped.path, "s0") as server, Fleet(endpoint, by="anna") as fleet:
+            eventually(lambda: server.status()["nodes"] == 7)
+            control = MissionControl("r0")
+            link = FleetClient(robot, KEYS, ROBOT, control)
+            standing = Status("standing", "", 7, 0, Pose2(), False, "explore", located=True)
+            eventually(lambda: link.report(standing, 1) or fleet.status().robots)
+            assert shell("place", "add", "kitchen", str(last), "--by", "anna")[0] == 0
+            assert shell("place", "add", "door", str(second), "--by", "anna")[0] == 0
+            status, out, _ = shell("map", "route", str(first), "kitchen", "--json")
+            assert status == 0 and json.loads(out)["goal"] == str(last)
+            sent = fleet.go("r0", "kitchen", via=["door"])
+            assert sent.state is MissionState.RUNNING and sent.order.via == (second,)
+            assert control.report is not None and control.report.order == sent.order
+
+            drives = ReserveRequest("r0", first, Pose2(), (last,))
+
+            def asks() -> ReserveAnswer:
+                return decode(robot.ask(KEYS.any_reserve(), encode(drives), 5.0)[0].payload, ReserveAnswer)
+
+            assert asks() == ReserveAnswer(1, "", None, "")
+            status, out, _ = shell(
+                "close", "kitchen", "--radius", "0.02", "--until", "+2h", "--because", "paint", "--by", "bob"
+            )
+            assert status == 0 and out.startswith("until ") and "UTC)\nclosure kitchen is an area" in out
+            answer = asks()
+            assert (answer.granted, answer.closed) == (0, True)
+            assert "the way ahead is closed by bob until" in answer.reason and '"paint"' in answer.reason
+            request = encode(RouteRequest(first, last))
+            refused = decode(robot.ask(KEYS.any_route(), request, 5.0)[0].payload, RouteAnswer)
+            assert refused.legs == () and "is in kitchen, which is closed by bob" in refused.reason
+            with pytest.raises(InvalidValue, match=r'is in kitchen, which is closed by bob .*"paint"'):
+                fleet.go("r0", "kitchen")
+            status, out, _ = shell("map", "route", str(first), "kitchen")
+            assert status == 2 and "closed by bob" in out
+            assert "closure kitchen is an area" in shell("closures")[1]
+            assert shell("reopen", "kitchen")[0] == 0
+            assert shell("reopen", "kitchen")[::2] == (1, "mapweave: there is no closure kitchen\n")
+            assert asks().closed is False and fleet.go("r0", "kitchen").state is MissionState.RUNNING
+
+            # One that ends by itself.
+            soon = time.time_ns() + 300_000_000
+            fleet.annotate("closure", "brief", place="kitchen", radius=0.02, end_ns=soon)
+            eventually(lambda: not asks().closed)
+            assert time.time_ns() >= soon
+
+            assert shell("avoid", str(first), str(second), "--factor", "9")[0] == 0
+            assert "cost times 9" in shell("closures")[1]
+            assert shell("avoid", str(second), str(first), "--undo")[0] == 0
+            assert shell("closures")[1].splitlines()[0].startswith("closure brief")
+            for wrong in (
+                ["close", "nowhere"], ["close"], ["close", "a", "b", "c"], ["close", str(first), str(first)],
+                ["close", "kitchen", "--until", "soon"], ["close", "kitchen", "--until", "1999-01-01"],
+                ["prefer", "kitchen", "--factor", "2"], ["reopen", "nothing"],
+            ):  # fmt: skip
+                status, _, err = shell(*wrong)
+                assert status == 1 and err.count("\n") == 1, wrong
+            link.close()
+    finally:
+        robot.close()
+        router.close()

@@ -1,0 +1,261 @@
+"""Named places by way of the map server: made, used wherever a node is, kept, and taken back."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+
+from mapweave.cli import main
+from mapweave.hybridmap.annotation import Annotation, Annotations, Place
+from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.constraint_subject import RetiredMap
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.map_event import MapEventKind
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
+from mapweave.hybridmap.superseded import Superseded
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.map_files import merged_of
+from mapweave.mapserver.places import Places
+from mapweave.mapserver.routes import Router
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
+from mapweave.wire.messages import decode, encode_view
+from tests.mapserver.conftest import MappedRoom
+from tests.mapserver.house import KEYS, House
+from tests.waiting import eventually
+
+THERE = NodeId("r0", 1, 3)
+
+
+@pytest.fixture
+def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
+    house = House(mapped_room())
+    yield house
+    house.close()
+
+
+def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house: House) -> None:
+    person, (link, _) = house.person, house.robot()
+    said = person.annotate("place", "kitchen", because="the sink", node=str(THERE))
+    assert said == f'place kitchen is node {THERE}, by anna: "the sink"'
+    at = house.server._worker.current().merged.pose(THERE)
+    person.annotate("place", "hall", node=f"{at.x:.2f},{at.y:.2f}", radius=3.0)
+    with pytest.raises(InvalidValue, match="that is known already"):
+        person.annotate("place", "kitchen", node=str(THERE))
+    with pytest.raises(InvalidValue, match=r"there is no map r9\.1"):
+        person.annotate("place", "cellar", node="r9.1.1")
+    with pytest.raises(InvalidValue, match="place 'home'"):
+        person.annotate("place", "home", node=str(THERE))
+    for _ in range(2):
+        assert person.go("r0", "kitchen").order.node == THERE
+        assert house.entry("r0").place == "kitchen", "next to it, within the hall"
+        answer = decode(
+            house.bus().ask(KEYS.relocalize("s0"), encode_view(house.mapped.view(THERE)), 20.0)[0].payload,
+            RelocalizeAnswer,
+        )
+        assert (answer.certainty, answer.candidates[0].place) == (Certainty.FOUND, "kitchen")
+        house.stop_server()
+        house.start_server()
+        eventually(lambda: house.entry("r0").status is not None or link.report(link_status(), 3))
+    with pytest.raises(InvalidValue, match=r"goal 'kitchn' \(is it kitchen\?\): give a node"):
+        person.go("r0", "kitchn")
+    person.withdraw("place", "kitchen")
+    with pytest.raises(InvalidValue, match="goal 'kitchen': give a node"):
+        person.go("r0", "kitchen")
+    with pytest.raises(InvalidValue, match="there is no place kitchen"):
+        person.withdraw("place", "kitchen")
+    events = [event.words for event in house.server.history() if event.kind is MapEventKind.ANNOTATED]
+    assert [words.partition(" is ")[0] for words in events] == [
+        "place kitchen",
+        "place hall",
+        "place kitchen",
+    ]
+    assert person.map().annotations == person.annotations().made and len(person.annotations().made) == 3
+    link.close()
+
+
+def link_status():
+    from mapweave.hybridmap.agent_status import Status
+
+    return Status("standing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "explore", located=True)
+
+
+def ask(web: Web, method: str, path: str, body: object = None) -> tuple[int, dict]:
+    connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=20)
+    data = body if isinstance(body, bytes) else json.dumps(body).encode() if body is not None else None
+    connection.request(method, path, data)
+    reply = connection.getresponse()
+    content = reply.read()
+    connection.close()
+    return reply.status, json.loads(content)
+
+
+def test_places_over_http(house: House) -> None:
+    with Web(("127.0.0.1", 0), house.server) as web:
+        body = {"name": "Küche", "body": {"kind": "place", "node": "r0.1.3"}, "because": "tea"}
+        status, posted = ask(web, "POST", "/annotations?by=bob", body)
+        assert status == 200 and posted["annotation"]["who"] == "bob"
+        corners = [[-2, -2], [3, -2], [3, 3], [-2, 3]]
+        hall = {"name": "hall", "body": {"kind": "place", "corners": corners}}
+        assert ask(web, "POST", "/annotations", hall)[0] == 200
+        gone = {"name": "hall", "body": {"kind": "place"}, "removed": True}
+        assert "withdrawn" in ask(web, "POST", "/annotations", gone)[1]["said"]
+        entries = ask(web, "GET", "/annotations")[1]["annotations"]
+        assert [(one["name"], one["removed"], one["in_force"]) for one in entries] == [
+            ("Küche", False, True), ("hall", False, False), ("hall", True, False),
+        ]  # fmt: skip
+        assert entries[0]["body"] == {"kind": "place", "node": "r0.1.3", "area": None}
+        route = ask(web, "GET", f"/route?a={quote('Küche')}&b=r0.1.9")[1]
+        assert route["found"] and (route["start"], route["goal"]) == ("r0.1.3", "r0.1.9")
+        for wrong, reason in [
+            (b"{", "Input data was truncated"),
+            (b'{"name": "x", "body": {"kind": "hologram"}}', "an annotation has a kind: place"),
+            (b'{"name": "x", "body": {"kind": "place", "colour": 1}}', "a place has no colour"),
+            (b'{"name": "x", "body": {"kind": "place", "node": 5}}', "Expected `array"),
+            (b'{"name": "x", "body": {"kind": "place", "node": "50,50"}}', "nothing is mapped within 2 m"),
+            (b'{"name": "r0.1.1", "body": {"kind": "place", "node": "r0.1.3"}}', "looks like a node"),
+        ]:
+            status, answer = ask(web, "POST", "/annotations", wrong)
+            assert status == 400 and reason in answer["error"], answer
+
+
+@pytest.fixture(scope="module")
+def fetched(mapped_room: Callable[[], MappedRoom]) -> MapFile:
+    house = House(mapped_room())
+    content = house.person.map()
+    house.close()
+    return content
+
+
+@pytest.fixture(scope="module")
+def merged(fetched: MapFile) -> MergedMap:
+    return merged_of(fetched)
+
+
+def record(name: str, place: Place) -> Annotations:
+    return Annotations((Annotation(name, place, False, "anna", 1),))
+
+
+def test_a_place_whose_node_is_superseded_is_the_nearest_active_node(merged: MergedMap) -> None:
+    away = {node: merged.pose(node).distance(merged.pose(THERE)) for node in merged.poses if node != THERE}
+    nearest = min(away, key=away.__getitem__)
+    older = replace(merged, superseded={THERE: Superseded(max(away, key=away.__getitem__), 9, 0.1, 0.1)})
+    found = Places(Router(older), record("kitchen", Place(THERE))).resolve("kitchen")
+    assert found.node == nearest and "r0.1.3 is superseded" in found.note
+
+
+def test_a_place_whose_node_is_in_no_map_any_more_says_why(merged: MergedMap) -> None:
+    kitchen = record("kitchen", Place(NodeId("r9", 1, 1)))
+    with pytest.raises(InvalidValue, match=r"place kitchen is at r9\.1\.1, which is not in the merged map"):
+        Places(Router(merged), kitchen).resolve("kitchen")
+    # All of its map is retired: no node of it is left to take its place.
+    constraint = ManualConstraint(RetiredMap(THERE.map), True, "bob", 0, "the old flat")
+    none = replace(merged, poses={}, components=(), graphs=(), constraints=ManualConstraints([constraint]))
+    with pytest.raises(InvalidValue, match=r'map r0\.1 is retired by bob on .* "the old flat"'):
+        Places(Router(none), record("kitchen", Place(THERE))).resolve("kitchen")
+
+
+def test_a_place_whose_node_is_retired_is_the_nearest_one_of_its_map(merged: MergedMap) -> None:
+    left = {node: placement for node, placement in merged.poses.items() if node != THERE}
+    without = replace(merged, poses=left, components=(frozenset(left),))
+    at = merged.maps[THERE.map].nodes[THERE].map_from_robot.mean
+    own = merged.maps[THERE.map].nodes
+    nearest = min(left, key=lambda node: at.distance(own[node].map_from_robot.mean))
+    found = Places(Router(without), record("kitchen", Place(THERE))).resolve("kitchen")
+    assert found.node == nearest and "r0.1.3 takes no part" in found.note
+
+
+def test_an_area_is_the_active_node_next_to_its_centre(merged: MergedMap) -> None:
+    anchor, (x, y) = merged.pose(THERE), (merged.pose(THERE).x, merged.pose(THERE).y)
+    area = Area.of_merged(
+        min(merged.poses),
+        merged.pose(min(merged.poses)),
+        [(x - 0.05, y - 0.04), (x + 0.05, y - 0.04), (x + 0.05, y + 0.04), (x - 0.05, y + 0.04)],
+    )
+    places = Places(Router(merged), record("desk", Place(area=area)))
+    assert places.resolve("desk").node == THERE
+    assert places.name_at(0, anchor) == "desk" and places.name_at(0, Pose2(x + 0.1, y)) == ""
+    far = Place(area=Area.around(THERE, 0.5))
+    shifted = replace(far.area, corners=tuple((px + 20.0, py) for px, py in far.area.corners))
+    with pytest.raises(InvalidValue, match="in which no node is active"):
+        Places(Router(merged), record("yard", Place(area=shifted))).resolve("yard")
+
+
+def test_the_narrowest_place_names_a_position(merged: MergedMap) -> None:
+    first, second = sorted(merged.poses)[:2]
+    entries = [
+        Annotation("house", Place(area=Area.around(first, 9.0)), False, "", 1),
+        Annotation("room", Place(area=Area.around(first, 4.0)), False, "", 2),
+        Annotation("one", Place(first), False, "", 3),
+        Annotation("two", Place(second), False, "", 4),
+    ]
+    places = Places(Router(merged), Annotations(tuple(entries)))
+    assert places.name_at(0, merged.pose(first)) == "one"
+    assert places.name_at(0, merged.pose(second)) == "two"
+    assert places.name_at(0, merged.pose(first) @ Pose2(3.5, 0.0)) == "room"
+    assert places.name_at(0, merged.pose(first) @ Pose2(0.0, 7.0)) == "house"
+    assert places.name_at(1, merged.pose(first)) == ""
+
+
+def test_a_store_of_an_earlier_program_takes_annotations(mapped_room: Callable[[], MappedRoom]) -> None:
+    mapped = mapped_room()
+    disk = sqlite3.connect(mapped.path)
+    disk.execute("DROP TABLE annotation")
+    disk.commit()
+    disk.close()
+    house = House(mapped)
+    house.person.annotate("place", "kitchen", node=str(THERE))
+    assert [entry.name for entry in house.person.annotations().made] == ["kitchen"]
+    house.close()
+
+
+def test_places_of_a_map_file_from_the_shell(
+    fetched: MapFile, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, other = tmp_path / "room.mapweave", tmp_path / "other.mapweave"
+    write_map_file(path, fetched)
+
+    def run(*words: str) -> tuple[int, str, str]:
+        status = main([*words, "--map", str(path)])
+        return status, *capsys.readouterr()
+
+    assert run("place", "list")[1] == "no place has a name yet: mapweave place add NAME NODE\n"
+    status, out, _ = run("place", "add", "kitchen", "r0.1.3", "--by", "anna", "--because", "tea")
+    assert (status, out) == (0, 'place kitchen is node r0.1.3, by anna: "tea"\n')
+    assert run("place", "add", "hall", "kitchen", "--radius", "2")[0] == 0
+    assert run("place", "add", "cube", "--corners", "0,0", "1,0", "1,1", "0,1", "--near", "kitchen")[0] == 0
+    listed = json.loads(run("place", "list", "--json")[1])["places"]
+    assert [(one["name"], one["at"] is not None) for one in listed] == [
+        ("cube", True), ("hall", True), ("kitchen", True),
+    ]  # fmt: skip
+    assert "kitchen  node r0.1.3 (tea), by anna" in run("place", "list")[1]
+    status, out, _ = run("map", "route", "kitchen", "r0.1.9", "--json")
+    assert status == 0 and json.loads(out)["start"] == "r0.1.3"
+    assert "r0.1.3" in run("map", "explain", "kitchen", "r0.1.9")[1]
+    assert run("map", "route", "kitschen", "r0.1.9") == (
+        1, "", "mapweave: 'kitschen' is no place of this map (is it kitchen?): give a node (r0.1.17), the "
+        "name of a place, or a position in the merged map (3.1,-2.0)\n",
+    )  # fmt: skip
+    for wrong in (["add", "x"], ["add", "x", "r0.1.3", "--corners", "0,0"], ["add", "r0.1", "r0.1.3"],
+                  ["add", "x", "r0.1.3", "--radius", "-1"], ["add", "x", "--corners", "0,0", "1,0"],
+                  ["remove", "attic"]):  # fmt: skip
+        status, _, err = run("place", *wrong)
+        assert status == 1 and err.count("\n") == 1, wrong
+    assert main(["place", "remove", "hall", "--map", str(path), "-o", str(other)]) == 0
+    assert [one.name for one in read_map_file(other).annotations] == ["kitchen", "hall", "cube", "hall"]
+    assert len(read_map_file(path).annotations) == 3, "the first file is as it was"
+    assert main(["map", "history", "--map", str(other)]) == 0
+    assert "annotated    place hall is withdrawn" in capsys.readouterr().out
+    both = tmp_path / "both.mapweave"
+    assert main(["map", "merge", str(path), str(other), "-o", str(both)]) == 0
+    assert len(read_map_file(both).annotations) == 4

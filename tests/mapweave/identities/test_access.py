@@ -1,0 +1,296 @@
+"""Who may do what on a router with keys: separate sessions over real TLS, and over TCP with passwords.
+
+Denials are observed at the other end: there is a listener that may hear the message, and that hears what is
+allowed before and after.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from mapweave.hybridmap.errors import SettingsError
+from mapweave.hybridmap.node import MapId
+from mapweave.identities.authority import Authority
+from mapweave.identities.key_file import read_key_file
+from mapweave.identities.key_folder import KeyFolder, Profile
+from mapweave.wire.access_rules import ASKS, COMMANDS, OF_ROBOTS
+from mapweave.wire.bus import Request
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.credentials import Credentials, Role
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
+from tests.waiting import eventually, free_port
+
+KEYS = Keys("demo")
+SOON = 1.0
+"""s in which a question is answered; what is denied takes as long."""
+
+
+class Fleet:
+    """A router with keys, and sessions of its members."""
+
+    def __init__(self, folder: Path, profile: Profile) -> None:
+        port = free_port()
+        self.folder = KeyFolder.create(folder, "demo", profile, [], "s0", port)
+        self.endpoint = self.folder.catalogue.endpoints[0]
+        for name, role in (
+            ("r0", Role.ROBOT),
+            ("r1", Role.ROBOT),
+            ("anna", Role.OPERATOR),
+            ("bob", Role.VIEWER),
+        ):
+            self.folder.add(name, role)
+        self.router = ZenohBus(self.folder.router("s0", [self.endpoint]))
+        self.open: list[ZenohBus] = []
+
+    def join(self, name: str) -> ZenohBus:
+        return self.join_as(read_key_file(self.folder.key_file(name)).credentials)
+
+    def join_as(self, credentials: Credentials | None, connected: bool = True) -> ZenohBus:
+        bus = ZenohBus(BusSettings(endpoints=(self.endpoint,), credentials=credentials))
+        self.open.append(bus)
+        assert not connected or bus.wait_connected(10)
+        return bus
+
+    def renew(self) -> None:
+        """As the server does when the keys have changed."""
+        self.router.reopen(self.folder.router("s0", [self.endpoint]))
+
+    def close(self) -> None:
+        for bus in (*self.open, self.router):
+            bus.close()
+
+
+@pytest.fixture(params=list(Profile))
+def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
+    fleet = Fleet(tmp_path / "keys", request.param)
+    yield fleet
+    fleet.close()
+
+
+@pytest.fixture
+def certified(tmp_path: Path) -> Iterator[Fleet]:
+    fleet = Fleet(tmp_path / "keys", Profile.PRODUCTION)
+    yield fleet
+    fleet.close()
+
+
+def answer(request: Request) -> None:
+    request.reply(b"yes")
+
+
+def asked(bus: ZenohBus, key: str) -> bool:
+    return any(reply.payload == b"yes" for reply in bus.ask(key, b"", SOON))
+
+
+def test_a_robot_writes_under_its_own_name_alone(fleet: Fleet) -> None:
+    got: list[str] = []
+    fleet.router.subscribe("mapweave/**", lambda sample: got.append(sample.key))
+    r0 = fleet.join("r0")
+    own = [KEYS.change(MapId("r0", 1)), KEYS.head(MapId("r0", 1)), KEYS.agent_status("r0")]
+    forged = [
+        KEYS.change(MapId("r1", 1)), KEYS.head(MapId("r1", 1)), KEYS.agent_status("r1"), KEYS.ack("s0", "r0"),
+        KEYS.ack("s0", "r1"), KEYS.poses("s0", "r1"), KEYS.server_status("s0"),
+    ]  # fmt: skip
+
+    def all_own() -> bool:
+        for key in (*own, *forged):
+            r0.publish(key, b"x")
+        return set(own) <= set(got)
+
+    eventually(all_own)
+    assert not set(forged) & set(got)
+
+
+def test_a_robot_hears_what_is_for_it_alone(fleet: Fleet) -> None:
+    r0, r1 = fleet.join("r0"), fleet.join("r1")
+    got: list[str] = []
+    for pattern in (KEYS.acks("r0"), KEYS.acks("r1"), "mapweave/**", KEYS.changes(), KEYS.agent_statuses()):
+        r0.subscribe(pattern, lambda sample: got.append(sample.key))
+
+    def delivered() -> bool:
+        r1.publish(KEYS.change(MapId("r1", 1)), b"x")
+        r1.publish(KEYS.agent_status("r1"), b"x")
+        fleet.router.publish(KEYS.ack("s0", "r1"), b"x")
+        fleet.router.publish(KEYS.poses("s0", "r1"), b"x")
+        fleet.router.publish(KEYS.ack("s0", "r0"), b"x")
+        return bool(got)
+
+    eventually(delivered)
+    assert set(got) == {KEYS.ack("s0", "r0")}
+
+
+def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet) -> None:
+    alive: list[str] = []
+    fleet.router.watch(KEYS.agents_alive(), lambda key, is_alive: alive.append(key) if is_alive else None)
+    r0 = fleet.join("r0")
+    r0.announce(KEYS.agent_alive(MapId("r1", 1)))
+    r0.announce(KEYS.agent_alive(MapId("r0", 1)))
+    for key in (KEYS.mission("r1"), KEYS.log(MapId("r1", 1)), KEYS.relocalize("s0"), KEYS.route("s0")):
+        r0.serve(key, answer)
+    r0.serve(KEYS.mission("r0"), answer)
+    anna, r1 = fleet.join("anna"), fleet.join("r1")
+    eventually(lambda: asked(anna, KEYS.mission("r0")))
+    eventually(lambda: alive)
+    assert alive == [KEYS.agent_alive(MapId("r0", 1))]
+    assert not asked(anna, KEYS.mission("r1"))
+    assert not asked(fleet.router, KEYS.log(MapId("r1", 1)))
+    assert not asked(r1, KEYS.relocalize("s0"))
+    assert not asked(r1, KEYS.route("s0"))
+
+
+@pytest.mark.parametrize(
+    ("name", "may"),
+    [("r0", OF_ROBOTS), ("bob", frozenset(ASKS) - COMMANDS), ("anna", frozenset(ASKS))],
+)
+def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[str]) -> None:
+    every = {what: f"{KEYS.root}/server/s0/{what}" for what in ASKS}
+    for key in every.values():
+        certified.router.serve(key, answer)
+    bus = certified.join(name)
+    eventually(lambda: asked(bus, every["status"]))
+    answered: set[str] = set()
+
+    def ask(what: str) -> None:
+        if asked(bus, every[what]):
+            answered.add(what)
+
+    threads = [threading.Thread(target=ask, args=(what,)) for what in every]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert answered == may
+
+
+def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
+    r0 = fleet.join("r0")
+    for key in (KEYS.mission("r0"), KEYS.drive("r0"), KEYS.agent_status("r0")):
+        r0.serve(key, answer)
+    anna, bob = fleet.join("anna"), fleet.join("bob")
+    eventually(lambda: asked(anna, KEYS.mission("r0")) and asked(anna, KEYS.drive("r0")))
+    eventually(lambda: asked(bob, KEYS.agent_status("r0")))
+    assert not asked(bob, KEYS.mission("r0"))
+    assert not asked(bob, KEYS.drive("r0"))
+
+
+def test_who_has_no_good_key_is_not_let_in(certified: Fleet) -> None:
+    good = read_key_file(certified.folder.key_file("r0")).credentials
+    foreign, _ = Authority.create("demo")
+    theirs = foreign.issue("r0", Role.ROBOT, timedelta(days=1))
+    own = Authority(good.authority, (certified.folder.path / "authority.key").read_text())
+    long_ago = datetime.now(UTC) - timedelta(days=3)
+    expired = own.issue("r0", Role.ROBOT, timedelta(days=1), now=long_ago)
+    strangers = [
+        certified.join_as(None, connected=False),
+        *(
+            certified.join_as(
+                Credentials("r0", Role.ROBOT, good.authority, bad.certificate, bad.private_key),
+                connected=False,
+            )
+            for bad in (theirs, expired)
+        ),
+    ]
+    tcp = certified.endpoint.replace("tls/", "tcp/")
+    plain = ZenohBus(BusSettings(endpoints=(tcp,)))
+    certified.open.append(plain)
+    certified.join("r1")
+    assert not any(bus.wait_connected(0.5) for bus in (*strangers, plain))
+
+
+def test_a_wrong_password_is_not_let_in(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path / "keys", Profile.LAB)
+    try:
+        wrong = fleet.join_as(Credentials("r0", Role.ROBOT, password="guessed"), connected=False)
+        keyless = fleet.join_as(None, connected=False)
+        fleet.join("r0")
+        assert not wrong.wait_connected(0.5)
+        assert not keyless.wait_connected(0.5)
+    finally:
+        fleet.close()
+
+
+def test_a_robot_is_no_router(certified: Fleet) -> None:
+    """Its certificate is none of a server, so no client connects to a router that has it."""
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    stolen = read_key_file(certified.folder.key_file("r0")).credentials
+    false = ZenohBus(BusSettings(mode="router", listen=(endpoint,), credentials=stolen))
+    certified.open.append(false)
+    victim = ZenohBus(
+        BusSettings(
+            endpoints=(endpoint,), credentials=read_key_file(certified.folder.key_file("r1")).credentials
+        )
+    )
+    certified.open.append(victim)
+    certified.join("r1")
+    assert not victim.wait_connected(0.5)
+
+
+def test_a_key_that_ends_ends_its_connection(certified: Fleet) -> None:
+    good = read_key_file(certified.folder.key_file("r0")).credentials
+    own = Authority(good.authority, (certified.folder.path / "authority.key").read_text())
+    soon = own.issue("r0", Role.ROBOT, timedelta(seconds=2.5))
+    bus = certified.join_as(Credentials("r0", Role.ROBOT, good.authority, soon.certificate, soon.private_key))
+    eventually(lambda: not bus.connected(), 15)
+    assert not bus.wait_connected(0.5)
+
+
+def test_a_revoked_key_is_of_no_use_and_nothing_else_changes(
+    fleet: Fleet, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "mapweave.wire")
+    stolen = read_key_file(fleet.folder.key_file("r0")).credentials
+    got: list[bytes] = []
+    fleet.router.subscribe(KEYS.changes(), lambda sample: got.append(sample.payload))
+    fleet.router.serve(KEYS.route("s0"), answer)
+    r1 = fleet.join("r1")
+    fleet.folder.revoke("r0", "stolen")
+    replacement = read_key_file(fleet.folder.add("r0", Role.ROBOT)).credentials
+    fleet.renew()
+    old = fleet.join_as(stolen, connected=False)
+    new = fleet.join_as(replacement)
+
+    def both() -> bool:
+        old.publish(KEYS.change(MapId("r0", 1)), b"old")
+        new.publish(KEYS.change(MapId("r0", 1)), b"new")
+        r1.publish(KEYS.change(MapId("r1", 1)), b"r1")
+        return {b"new", b"r1"} <= set(got)
+
+    eventually(both)
+    assert b"old" not in got
+    assert not asked(old, KEYS.route("s0"))
+    eventually(lambda: asked(r1, KEYS.route("s0")))
+    if fleet.folder.profile is Profile.PRODUCTION:
+        eventually(lambda: "refused: r0 at" in caplog.text)
+        assert "this key was revoked" in caplog.text
+        assert "stolen" in caplog.text
+
+
+def test_who_was_alive_is_so_after_the_keys_have_changed_unless_revoked(fleet: Fleet) -> None:
+    alive: set[str] = set()
+
+    def hear(key: str, is_alive: bool) -> None:
+        (alive.add if is_alive else alive.discard)(KEYS.parse_agent_alive(key).agent)
+
+    fleet.router.watch(KEYS.agents_alive(), hear)
+    for name in ("r0", "r1"):
+        fleet.join(name).announce(KEYS.agent_alive(MapId(name, 1)))
+    eventually(lambda: alive == {"r0", "r1"})
+    fleet.folder.revoke("r1")
+    fleet.renew()
+    eventually(lambda: alive == {"r0"})
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/0.0.0.0:7447", "tcp/192.168.1.7:7447", "tcp/[::]:7447", "tcp/maps.local:1"]
+)
+def test_without_keys_a_router_listens_on_its_own_machine_alone(endpoint: str) -> None:
+    with pytest.raises(SettingsError, match="mapweave keys init"):
+        BusSettings(mode="router", listen=(endpoint,))
+    BusSettings(mode="router", listen=("tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"))

@@ -1,0 +1,101 @@
+"""`mapweave keys`, and who may read what it writes."""
+
+from __future__ import annotations
+
+import json
+import stat
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from mapweave.cli import main
+from mapweave.identities.key_file import read_key_file
+from mapweave.identities.key_folder import KeyFolder
+from mapweave.wire.credentials import Role
+from tests.mapweave.command_line import complaint
+
+
+@pytest.fixture(params=["production", "lab"])
+def keys(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    folder = tmp_path / "keys"
+    where = ["--keys", str(folder)]
+    assert (
+        main(["keys", "init", *where, "--fleet", "f1", "--at", "10.0.0.5", "--profile", request.param]) == 0
+    )
+    assert main(["keys", "add", "r0", *where]) == 0
+    return folder
+
+
+def test_secrets_are_their_owners_alone(keys: Path) -> None:
+    public = {"fleet.json", "authority.pem"}
+    assert stat.S_IMODE(keys.stat().st_mode) == 0o700
+    for path in keys.iterdir():
+        assert path.name in public or stat.S_IMODE(path.stat().st_mode) == 0o600, path
+    text = (keys / "fleet.json").read_text()
+    assert "PRIVATE" not in text
+    assert (read_key_file(keys / "r0.key.toml").credentials.password or "PRIVATE") not in text
+
+
+def test_a_key_file_is_refused_if_others_may_read_it(keys: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = keys / "r0.key.toml"
+    path.chmod(0o640)
+    assert f"chmod 600 {path}" in complaint(capfd, "status", "--keys", path)
+
+
+def test_a_key_says_where_the_server_is_and_is_for_one_name_and_fleet(
+    keys: Path, capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = keys / "r0.key.toml"
+    assert "10.0.0.5:7447" in read_key_file(path).endpoints[0]
+    assert "is the key of r0, not of r1" in complaint(
+        capfd, "agent", "r1", "--keys", path, "--data", tmp_path / "data"
+    )
+    assert "fleet f1, not of other" in complaint(capfd, "status", "--keys", path, "--fleet", "other")
+
+
+def test_who_has_a_key_is_listed(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    where = ["--keys", str(keys)]
+    assert main(["keys", "revoke", "r0", "--because", "lost", *where]) == 0
+    capsys.readouterr()
+    assert main(["keys", "list", "--json", *where]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["identities"]}
+    assert (rows["s0"]["role"], rows["s0"]["state"]) == ("server", "good")
+    assert rows["r0"]["state"].startswith("revoked 20") and rows["r0"]["state"].endswith("UTC: lost")
+    assert not (keys / "r0.key.toml").exists()
+
+
+def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    where = ("--keys", keys)
+    assert "there are keys already" in complaint(capfd, "keys", "init", *where)
+    assert "no keys are here" in complaint(capfd, "keys", "list", "--keys", tmp_path)
+    assert "r9 has no key" in complaint(capfd, "keys", "revoke", "r9", *where)
+    assert "r0 is a robot already" in complaint(capfd, "keys", "add", "r0", "--role", "viewer", *where)
+    assert "no keys are here" in complaint(capfd, "server", "--keys", tmp_path, "--data", tmp_path / "d")
+    (keys / "fleet.json").write_text('{"fleet": 3}')
+    assert "fleet.json" in complaint(capfd, "keys", "list", *where)
+
+
+def test_a_copy_is_the_same_key(keys: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "r0.key.toml"
+    assert main(["keys", "bundle", "r0", "-o", str(copy), "--keys", str(keys)]) == 0
+    assert read_key_file(copy) == read_key_file(keys / "r0.key.toml")
+    assert stat.S_IMODE(copy.stat().st_mode) == 0o600
+
+
+def test_certificates_are_what_they_say(tmp_path: Path) -> None:
+    """Read by the library of certificates itself: the chain, the name, what it may be used for, the hosts."""
+    assert main(["keys", "init", "--keys", str(tmp_path), "--at", "maps.local", "--at", "10.0.0.5"]) == 0
+    folder = KeyFolder(tmp_path)
+    authority = x509.load_pem_x509_certificate((tmp_path / "authority.pem").read_bytes())
+    for name, role, server in (("r0", Role.ROBOT, False), ("s0", Role.SERVER, True)):
+        folder.add(name, role)
+        text = read_key_file(folder.key_file(name)).credentials.certificate
+        certificate = x509.load_pem_x509_certificate(text.encode())
+        certificate.verify_directly_issued_by(authority)
+        assert certificate.subject.rfc4514_string() == f"CN={name}"
+        usage = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+        assert (x509.ExtendedKeyUsageOID.SERVER_AUTH in usage) == server
+        assert not certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        assert ("maps.local" in names.get_values_for_type(x509.DNSName)) == server

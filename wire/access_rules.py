@@ -1,0 +1,107 @@
+"""The router's rules: what each identity may send and receive. What no rule names is denied.
+
+Zenoh checks what a client sends (ingress) and what is sent to it (egress), by the kind of the message and its
+key. Declarations, questions and answers are messages too: a robot that may not declare itself the answerer
+for `server/s0/route` gets no question.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mapweave.wire.credentials import Access, Role
+from mapweave.wire.keys import Keys
+
+ASKS = (
+    "relocalize", "route", "known", "reserve", "mission", "missions", "robots", "map", "explain", "constrain",
+    "annotate", "annotations", "resolve", "history", "status",
+)  # fmt: skip
+"""Every question to a server, by the last part of its key."""
+COMMANDS = frozenset({"constrain", "annotate", "mission"})
+"""Those that change something."""
+WATCHES = ("liveliness_query", "declare_liveliness_subscriber")
+OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve", "status"})
+"""Those of robots."""
+
+
+def access_control(keys: Keys, access: Access, certified: bool) -> dict[str, object]:
+    """Zenoh's `access_control`: default deny, one subject and one policy an identity.
+
+    Args:
+        keys: of the fleet.
+        access: who is admitted.
+        certified: whether identities are common names of certificates; else user names.
+    """
+    rules: list[dict[str, object]] = []
+    subjects: list[dict[str, object]] = []
+    policies: list[dict[str, object]] = []
+    kind = "cert_common_names" if certified else "usernames"
+    for member in access.members:
+        name = member.name
+        own: list[dict[str, object]] = [
+            {"id": f"{name} {k}", "permission": "allow", "flows": [flow], "messages": list(messages),
+             "key_exprs": list(patterns)}
+            for k, (flow, messages, patterns) in enumerate(_allowed(keys, name, member.role))
+        ]  # fmt: skip
+        rules += own
+        subjects.append({"id": name, kind: [member.subject]})
+        policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
+    return {
+        "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects,
+        "policies": policies,
+    }  # fmt: skip
+
+
+_Rule = tuple[str, Sequence[str], Sequence[str]]
+
+
+def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
+    """Flow, messages and keys of each rule."""
+    if role is Role.SERVER:
+        return _writes([f"{keys.root}/**"]) + _reads([f"{keys.root}/**"]) + _asks([f"{keys.root}/**"])
+    if role is Role.ROBOT:
+        return _robot(keys, name)
+    asks = [what for what in ASKS if role is Role.OPERATOR or what not in COMMANDS]
+    questions = [f"{keys.root}/server/*/{what}" for what in asks]
+    questions += [keys.agent_statuses(), f"{keys.root}/server/*/ack/*"]
+    if role is Role.OPERATOR:
+        questions += [f"{keys.root}/agent/*/mission", f"{keys.root}/agent/*/drive"]
+    reads = [
+        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), f"{keys.root}/server/*/alive",
+        f"{keys.root}/server/*/poses/*",
+    ]  # fmt: skip
+    return [*_reads(reads), *_asks(questions)]
+
+
+def _robot(keys: Keys, name: str) -> list[_Rule]:
+    agent, base = f"{keys.root}/agent/{name}", f"{keys.root}/robot/{name}"
+    addressed = [f"{keys.root}/server/*/{what}/{name}" for what in ("ack", "poses")]
+    return [
+        *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
+                  f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/drive",
+                  f"{base}/describe", f"{base}/step"]),
+        *_reads([*addressed, f"{keys.root}/server/*/alive", f"{base}/driver/*", f"{agent}/alive/*"]),
+        *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
+                f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
+    ]  # fmt: skip
+
+
+def _writes(patterns: list[str]) -> list[_Rule]:
+    """To publish, be alive and answer under these keys, and to be asked there."""
+    return [
+        ("ingress", ("put", "liveliness_token", "declare_queryable", "reply"), patterns),
+        ("egress", ("query", "declare_subscriber", *WATCHES), patterns),
+    ]
+
+
+def _reads(patterns: list[str]) -> list[_Rule]:
+    """To hear what is published and who is alive under these keys."""
+    return [
+        ("ingress", ("declare_subscriber", *WATCHES), patterns),
+        ("egress", ("put", "liveliness_token"), patterns),
+    ]
+
+
+def _asks(patterns: list[str]) -> list[_Rule]:
+    """To ask, and to get the answers."""
+    return [("ingress", ("query",), patterns), ("egress", ("reply", "declare_queryable"), patterns)]
