@@ -47,8 +47,8 @@ STEPS = 1
 SETTLED = 0.5
 """Two solutions in a row must agree to this share of a useful sigma."""
 LASTING = 1.5
-"""A parameter is wrong if all solutions say so while the pairs grow by this factor: what a few have in common by
-chance, more do not bear out. Without, one of nine simulated robots got three false names within 23 s."""
+"""A parameter is wrong if all solutions say so while the pairs grow by this factor: what a few have in common
+by chance, more do not bear out. Without, one of nine simulated robots got three false names within 23 s."""
 WORTH = 2.0
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
 
@@ -209,7 +209,7 @@ class OnlineCalibration:
         return found
 
     def _lasting(self, wrong: NDArray[np.bool_], since: Array) -> NDArray[np.bool_]:
-        """(10,) which were wrong while the pairs grew; (10,) since which number of them is kept up to date."""
+        """(10,) which were wrong while the pairs grew; (10,) since how many they are is kept up to date."""
         since[~wrong] = np.inf
         since[wrong] = np.minimum(since[wrong], self._taken)
         return np.asarray(self._taken >= LASTING * since)
