@@ -16,7 +16,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Mapweave needs Python 3.11 or newer; try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@echo "installing into $(VENV), 1.5 GB (a minute or two) ..."
+	@echo "installing into $(VENV), 2 GB (a minute or two) ..."
 ifeq ($(EXTRA),dev)
 	@$(PIP) --only-binary :all: pybullet 2>/dev/null || \
 	  echo "there is no wheel of pybullet for $$($(BIN)/python -V) on $$(uname -m): compiling it takes ten minutes" \

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.observation import RobotDescription
-from mapweave.agent.occupancy_grid import HIT, MISS, MOST, OccupancyGrid
+from mapweave.agent.occupancy_grid import DECIDED, HIT, MISS, MOST, OccupancyGrid
 from mapweave.agent.settings import OccupancyGridSettings
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2
@@ -156,7 +156,7 @@ class CameraOccupancyGrid(OccupancyGrid):
         rays = (self._description.radius + along)[None, :, None] * directions[:, None]
         cells = self.cells(np.array([map_from_robot.x, map_from_robot.y]) + rays)
         at = cells[..., 0], cells[..., 1]
-        readings = _first((self._odds[at] > 0.3) | self._touched[at], along)
+        readings = _first((self._odds[at] > DECIDED) | self._touched[at], along)
         for direction, beyond in ((0.0, DARED), (math.pi, SLACK)):
             beam = BEARINGS.index(direction)
             readings[beam] = min(readings[beam], self.known_ahead(map_from_robot, direction, REACH) + beyond)
@@ -178,7 +178,7 @@ class CameraOccupancyGrid(OccupancyGrid):
         way = along[:, None] * np.array([math.cos(angle), math.sin(angle)])
         cells = self.cells(start + way[:, None] + rim)
         at = cells[..., 0], cells[..., 1]
-        known = ((self._odds[at] < -0.3) & ~self._touched[at]).all(axis=1)
+        known = ((self._odds[at] < -DECIDED) & ~self._touched[at]).all(axis=1)
         return float(_first(np.logical_not(known)[None], along, reach)[0])
 
     def room(self) -> Array:
@@ -211,11 +211,11 @@ class CameraOccupancyGrid(OccupancyGrid):
 
     @property
     def _occupied(self) -> NDArray[np.bool_]:
-        return np.asarray((self._odds > 0.3) | self._touched)
+        return np.asarray((self._odds > DECIDED) | self._touched)
 
     @property
     def _free(self) -> NDArray[np.bool_]:
-        return np.asarray((self._odds < -0.3) & ~self._touched)
+        return np.asarray((self._odds < -DECIDED) & ~self._touched)
 
     def _distance(self, cells: NDArray[np.bool_]) -> Array:
         """For each cell the distance to the nearest of some cells, m."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,8 +22,26 @@ MOST = 3.0
 """Log-odds are kept within plus and minus this, so that a thing that moved away is forgotten."""
 
 
+DECIDED = 0.3
+"""Log-odds beyond which a cell counts as occupied, or free."""
 RAYS = 48
 """Rays of a full turn."""
+
+
+class GridCells(NamedTuple):
+    """An occupancy grid as it was at one time.
+
+    Attributes:
+        odds: (N, N) log-odds that a cell is occupied; rows along x, columns along y of the map.
+        decided: a cell is occupied above this, and free below its negative.
+        corner: (2,) m in map, where the first cell begins.
+        side: of a cell, m.
+    """
+
+    odds: NDArray[np.float32]
+    decided: float
+    corner: Array
+    side: float
 
 
 class OccupancyGrid:
@@ -37,6 +56,12 @@ class OccupancyGrid:
         self._odds: NDArray[np.float32] = np.zeros((2 * self._half, 2 * self._half), np.float32)
         self._bearings = np.array(description.ranger_bearings)
         self._steps = np.arange(0.5, description.ranger_reach / self._settings.cell) * self._settings.cell
+
+    def taken(self) -> GridCells:
+        """The grid as it is now; it does not change any more."""
+        side = self._settings.cell
+        corner = np.asarray((self._middle - self._half) * side, np.float64)
+        return GridCells(self._odds.copy(), DECIDED, corner, side)
 
     def cells(self, points: Array) -> NDArray[np.int64]:
         """(..., 2) m in map -> (..., 2) cell indices, clipped to the grid."""
@@ -93,12 +118,12 @@ class OccupancyGrid:
 
     def room(self) -> Array:
         """For each cell the distance to the nearest thing seen, m."""
-        occupied = (self._odds > 0.3).astype(np.uint8)
+        occupied = (self._odds > DECIDED).astype(np.uint8)
         return np.asarray(cv2.distanceTransform(1 - occupied, cv2.DIST_L2, 5) * self._settings.cell)
 
     def drivable(self, unknown: bool = False) -> NDArray[np.bool_]:
         """Cells that are known to be free, with clearance for the footprint; or that may be free."""
-        free = self._odds < (0.3 if unknown else -0.3)
+        free = self._odds < (DECIDED if unknown else -DECIDED)
         return np.asarray(free & (self.room() >= self._enough))
 
     @property
@@ -127,7 +152,7 @@ class OccupancyGrid:
             radius: of that floor, m.
             reach: how far one can see, m.
         """
-        cell, unknown, hidden = self._settings.cell, self._unknown(covered, radius), self._odds > 0.3
+        cell, unknown, hidden = self._settings.cell, self._unknown(covered, radius), self._odds > DECIDED
         angles = np.arange(RAYS) * (math.tau / RAYS)
         along = np.arange(0.5 * cell, reach, cell)
         ray = along[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
@@ -141,7 +166,7 @@ class OccupancyGrid:
 
     def _unknown(self, covered: Array, radius: float) -> NDArray[np.float32]:
         """1 where a cell is unknown and none of (N, 2) points in map is within the radius (m), else 0."""
-        unknown = (np.abs(self._odds) <= 0.3).astype(np.float32)
+        unknown = (np.abs(self._odds) <= DECIDED).astype(np.float32)
         for row, column in self.cells(covered):
             cv2.circle(unknown, (int(column), int(row)), round(radius / self._settings.cell), 0.0, -1)
         return unknown

@@ -26,6 +26,7 @@ from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.random_exploration import RandomExploration
 from mapweave.agent.global_localization.resumption import Resumption
+from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
@@ -111,6 +112,7 @@ class Pipeline:
         self._resumption: Resumption | None = None
         self._direction = 1.0
         self._lifted = self._put_elsewhere = False
+        self._image: NDArray[np.uint8] | None = None
 
     @property
     def map(self) -> HybridMap:
@@ -120,13 +122,41 @@ class Pipeline:
     @property
     def map_from_robot(self) -> PoseGaussian | None:
         """Where the robot is on its own map; None if it does not know."""
-        fix = self._navigator.fix if self._navigator is not None else None
+        fix = self.fix
         match self._mission:
             case Explore() | Carried() if self._located:
                 return self._mapper.map_from_robot
             case GoTo() if fix is not None and fix.node in self.map.nodes:
                 return self.map.nodes[fix.node].map_from_robot @ fix.node_from_robot
         return None
+
+    # What displays read
+
+    @property
+    def image(self) -> NDArray[np.uint8] | None:
+        """(H, W) grey, the last image as it is used: of a fisheye the rectified one."""
+        return self._image
+
+    @property
+    def lens(self) -> Lens:
+        """Of that image."""
+        return self._lens
+
+    @property
+    def mapper(self) -> Mapper:
+        """Maps; only the pipeline changes it."""
+        return self._mapper
+
+    @property
+    def fix(self) -> Fix | None:
+        """By which node the robot drives to a goal; None if it does not, or does not know where it is."""
+        navigator = self._navigator if isinstance(self._mission, GoTo) else None
+        return None if navigator is None else navigator.fix
+
+    @property
+    def floor(self) -> OccupancyGrid:
+        """The floor around the robot."""
+        return self._floor
 
     @property
     def _located(self) -> bool:
@@ -185,6 +215,7 @@ class Pipeline:
         if self._fisheye.rectifies and observation.image is not None:
             # From here on the camera is a pinhole.
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
+        self._image = observation.image
         observation = self.calibration.correct(observation)
         self._rangers.see(observation.proximity)
         self._take_over(driven)

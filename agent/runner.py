@@ -75,16 +75,22 @@ class Runner:
 
     def tick(self, observation: Observation) -> Step:
         """Take one observation; changes and status go their way, questions wait for `exchange`."""
+        step = self._think(observation)
+        self._hand_over(observation, step)
+        return step
+
+    def _think(self, observation: Observation) -> Step:
         home = min(self._pipeline.map.nodes, default=None)
         mission = self._missions.next(self._fleet.server_in_reach(), observation.stamp_ns * 1e-9, home)
         if mission is not None:
             self._pipeline.set_mission(mission)
         answers, self._answers = (*self._answers, *self._fleet.answers()), ()
         step = self._pipeline.step(observation, answers, self._fleet.driven())
-        if step.changes:
-            self._replicator.submit(step.changes, observation.stamp_ns)
-            self._synchronization.changes_submitted(self._replicator, self._fleet)
         self._questions = step.questions
+        return step
+
+    def _hand_over(self, observation: Observation, step: Step) -> None:
+        """Changes come last: the thread that writes them works while the robot waits for its next image."""
         line = self._monitor.see(observation, step.status, step.command)
         if line:
             self._print(line)
@@ -94,7 +100,9 @@ class Runner:
         self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
         self._ticks += 1
         self._on_step(observation, step)
-        return step
+        if step.changes:
+            self._replicator.submit(step.changes, observation.stamp_ns)
+            self._synchronization.changes_submitted(self._replicator, self._fleet)
 
     @property
     def curious(self) -> bool:
@@ -122,7 +130,9 @@ class Runner:
                 break
             self._count_skipped(observation.stamp_ns, tick)
             began = self._clock()
-            robot.act(self.tick(observation).command)
+            step = self._think(observation)
+            robot.act(step.command)
+            self._hand_over(observation, step)
             if self.curious:
                 self.exchange()
             self._previous = observation.stamp_ns, self._clock() - began

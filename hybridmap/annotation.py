@@ -16,9 +16,11 @@ from msgspec import Meta
 
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import MOST_WORDS
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.wall_time import utc_words
 
 MAX_NAME = 64
@@ -135,8 +137,8 @@ class Preference:
         return f"{_edge_or_area(self.edge, self.area)}, {verb}: cost times {self.factor:g}"
 
 
-Body = Place | Closure | Preference
-BODIES: dict[str, type[Body]] = {body.TAG: body for body in (Place, Closure, Preference)}
+Body = Place | Closure | Preference | FloorPlan | Pin
+BODIES: dict[str, type[Body]] = {body.TAG: body for body in (Place, Closure, Preference, FloorPlan, Pin)}
 """Kinds of annotations, by the word that names them in messages."""
 AnyBody = TypeVar("AnyBody", bound=Body)
 
@@ -217,6 +219,12 @@ class Annotations:
             for _, entry in sorted(self._last.items())
             if isinstance(entry.body, body) and not entry.removed
         )
+
+    @property
+    def pins(self) -> tuple[Pin, ...]:
+        """Pins that hold, oldest first."""
+        made = sorted(self.in_force(Pin), key=lambda item: item[0].stamp_ns)
+        return tuple(pin for _, pin in made)
 
     @cached_property
     def _last(self) -> dict[tuple[str, str], Annotation]:

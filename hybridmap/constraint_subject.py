@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -21,13 +21,13 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import MAX_STAMP_NS, Key, LandmarkCount, Stamp
 from mapweave.hybridmap.node import NUMBER, MapId, Node, NodeId, check_name
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.wall_time import NANOSECONDS, read_time
 
 Ends = tuple[NodeId, NodeId] | tuple[MapId, MapId]
 """Two nodes, or two maps; the smaller first."""
 
 EXAMPLE = "two nodes look like r0.1.17 r1.1.5, two maps like r0.1 r1.1"
 
-NANOSECONDS = 1_000_000_000
 MOST_NODES = 1000
 """Of one constraint."""
 NAMED = 4
@@ -275,8 +275,10 @@ class RetiredWindow:
         return node.id.map == self.map and self.begin_ns <= node.stamp_ns <= self.end_ns
 
     def __str__(self) -> str:
-        """For example `map r0.1 from 2026-03-01 12:00:00 to 2026-03-01 12:05:00 UTC`."""
-        return f"map {self.map} from {_time(self.begin_ns)} to {_time(self.end_ns)} UTC"
+        """For example `map r0.1 from 2026-03-01 12:00:00 UTC until 2026-03-01 12:05:00 UTC`."""
+        begin = f" from {_time(self.begin_ns)}" if self.begin_ns else ""
+        end = f" until {_time(self.end_ns)}" if self.end_ns < MAX_STAMP_NS else ""
+        return f"map {self.map}{begin}{end}"
 
 
 Subject = Apart | Linked | RetiredMap | RetiredNodes | RetiredArea | RetiredWindow
@@ -338,30 +340,28 @@ def read_pose(numbers: Iterable[float]) -> Pose2:
     return Pose2(values[0], values[1], math.radians(values[2]))
 
 
-def read_window(which: MapId, begin: str | int = "", end: str | int = "") -> RetiredWindow:
+def read_window(
+    which: MapId, begin: str | int, end: str | int, now_ns: int, zone: tzinfo | None = UTC
+) -> RetiredWindow:
     """A time window of a map; without a beginning or an end it has none.
 
     Args:
         which: the map.
-        begin: ns since 1970, or as people write it: 2026-03-01T12:00, UTC unless it says another zone.
+        begin: ns since 1970, or as people write it (mapweave.hybridmap.wall_time); empty: no beginning.
         end: likewise.
+        now_ns: the present.
+        zone: of times that name none; None: this machine's.
 
     Raises:
         InvalidValue: it is no time, or the end is before the beginning.
     """
-    return RetiredWindow(which, _stamp(begin, 0), _stamp(end, MAX_STAMP_NS))
-
-
-def _stamp(word: str | int, default: int) -> int:
-    if isinstance(word, int) or word.isdecimal():
-        return min(int(word), MAX_STAMP_NS)
-    try:
-        time = datetime.fromisoformat(word) if word else None
-    except ValueError:
-        raise InvalidValue(f"{word!r} is no time: write 2026-03-01T12:00, or nanoseconds") from None
-    if time is None:
-        return default
-    return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()) * NANOSECONDS
+    stamps = []
+    for word, default in ((begin, 0), (end, MAX_STAMP_NS)):
+        if isinstance(word, int) or word.isdecimal():
+            stamps.append(min(int(word), MAX_STAMP_NS))
+        else:
+            stamps.append(read_time(word, now_ns, zone) if word else default)
+    return RetiredWindow(which, *stamps)
 
 
 def nodes_in_words(nodes: Iterable[NodeId]) -> str:
@@ -379,4 +379,4 @@ def _upper(covariance: Array) -> tuple[float, ...]:
 
 
 def _time(stamp_ns: int) -> str:
-    return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 from mapweave.hybridmap.constraint_subject import (
-    NANOSECONDS,
     Apart,
     Ends,
     Linked,
@@ -20,6 +18,7 @@ from mapweave.hybridmap.constraint_subject import (
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.wall_time import utc_words
 
 MOST_WORDS = 300
 """Characters of a reason."""
@@ -110,6 +109,10 @@ class ManualConstraints:
         """The same with other retired nodes."""
         return ManualConstraints(self.made, nodes)
 
+    def without(self, kind: type[Subject]) -> ManualConstraints:
+        """Only those that are about something else."""
+        return ManualConstraints(c for c in self.made if not isinstance(c.about, kind))
+
     @property
     def in_force(self) -> tuple[ManualConstraint, ...]:
         """Those that hold, in the order of what they are about."""
@@ -121,7 +124,9 @@ class ManualConstraints:
         return {
             (link.a, link.b): link
             for constraint in self.in_force
-            if isinstance(link := constraint.about, Linked) and self.against(link.a, link.b) is None
+            if isinstance(link := constraint.about, Linked)
+            and link.covariance
+            and self.against(link.a, link.b) is None
         }
 
     def standing(self, about: Subject) -> ManualConstraint | None:
@@ -169,9 +174,8 @@ class ManualConstraints:
 
 def decided(constraint: ManualConstraint) -> str:
     """For example `by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
-    when = datetime.fromtimestamp(constraint.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
     why = f': "{constraint.because}"' if constraint.because else ""
-    return f"by {constraint.who or 'a person'} on {when}{why}"
+    return f"by {constraint.who or 'a person'} on {utc_words(constraint.stamp_ns)}{why}"
 
 
 def reason_of(constraint: ManualConstraint) -> str:
@@ -183,7 +187,7 @@ def reason_of(constraint: ManualConstraint) -> str:
             return f"undone{scope} {how}"
         case Linked():
             return f"linked by hand {how}"
-    return f"{about} {_verb(about)} retired {how}"
+    return f"{about} {verb_of(about)} retired {how}"
 
 
 def event_words(constraint: ManualConstraint) -> str:
@@ -196,8 +200,9 @@ def event_words(constraint: ManualConstraint) -> str:
             return f"{about}: may be linked again, by {who}"
         case Linked():
             return f"{about}: the link by hand is taken back, by {who}"
-    return reason_of(constraint) if constraint.holds else f"{about} {_verb(about)} in use again, by {who}"
+    return reason_of(constraint) if constraint.holds else f"{about} {verb_of(about)} in use again, by {who}"
 
 
-def _verb(about: Subject) -> str:
+def verb_of(about: Subject) -> str:
+    """Of a sentence on what is retired: `is`, or `are`."""
     return "are" if isinstance(about, RetiredNodes) and len(about.nodes) > 1 else "is"

@@ -22,6 +22,8 @@ class MapEventKind(StrEnum):
     """A person has decided."""
     ANNOTATED = "annotated"
     """A person has said something about the map."""
+    FRAME = "frame"
+    """A pin yields to an older one, or holds its component's frame again."""
     CONTRADICTED = "contradicted"
     """What robots have measured contradicts a link by hand, which stays."""
     FAILED = "failed"

@@ -14,6 +14,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ResolveAnswer, Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
+from mapweave.mapserver.places import position_of
 from mapweave.wire.typed import packed, value_of
 
 NODES = ("node", "anchor", "a", "b", "merged_from_node")
@@ -41,7 +42,8 @@ def body_of_words(
             (`r0.1.17`), the name of a place, a position in the merged map (`3.1,-2.0`). An area is `area`,
             or `corners`, a list of positions in the merged map (in the frame of the component of `near`, a
             node or place; of the largest component without), or `radius`, m, around `node`; or
-            `place`, a named place.
+            `place`, a named place. A pair of a plan has `at`, such a word, or `node` with `x` and `y`. A pin
+            without `merged_from_node` holds its node where it is.
         resolve: returns nodes for words.
         annotations: the record.
         now_ns: the present time.
@@ -73,6 +75,10 @@ def body_of_words(
         plain["area"] = packed(Area.around(node, value_of(radius, float)))
     if isinstance(edge := plain.get("edge"), list | tuple):
         plain["edge"] = [_node(word, "node", near, resolve) for word in edge]
+    if isinstance(pairs := plain.get("pairs"), list | tuple):
+        plain["pairs"] = [_pair(pair, near, resolve) for pair in pairs]
+    if kind == "pin" and "merged_from_node" not in plain and isinstance(word := plain.get("node"), str):
+        plain["merged_from_node"] = packed(_found(word, near or "", resolve).merged_from_node)
     body = {name: _node(value, name, near, resolve) for name, value in plain.items()}
     unknown = body.keys() - BODIES[kind].__dataclass_fields__.keys() - {"kind"}
     if unknown:
@@ -90,6 +96,21 @@ def _node(value: Any, name: str, near: str | None, resolve: Resolve) -> Any:
 def _found(word: str, near: str, resolve: Resolve, reach: float | None = None) -> Resolved:
     request = ResolveRequest((word,), near) if reach is None else ResolveRequest((word,), near, reach)
     return resolve(request).found[0]
+
+
+def _pair(pair: Any, near: str | None, resolve: Resolve) -> Any:
+    """A pair of a plan, its place as a node and a position from there."""
+    if not isinstance(pair, Mapping):
+        return pair
+    plain = dict(pair)
+    word = plain.pop("at", None)
+    if not isinstance(word, str):
+        return {name: _node(value, name, near, resolve) for name, value in plain.items()}
+    found, position = _found(word, near or "", resolve, ANYWHERE), position_of(word)
+    x, y = (0.0, 0.0)
+    if position is not None:
+        x, y = found.merged_from_node.inverse().apply(np.array(position)).tolist()
+    return {**plain, "node": packed(found.node), "x": x, "y": y}
 
 
 def _area(corners: Any, near: str, resolve: Resolve) -> Area:

@@ -8,7 +8,9 @@ from collections.abc import Callable
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.services import guarded
@@ -24,8 +26,13 @@ log = logging.getLogger(__name__)
 class AnnotationRecord:
     """The server's record of annotations, on its disk. Entries are added, never removed."""
 
-    def __init__(self, store: Store) -> None:
-        """Read the record."""
+    def __init__(self, store: Store, base: Annotations | None = None) -> None:
+        """Read the record.
+
+        Args:
+            store: where it is kept.
+            base: annotations of before, of a map that is there from the start.
+        """
         self._store = store
         made: list[Annotation] = []
         for body in store.annotations():
@@ -33,7 +40,8 @@ class AnnotationRecord:
                 made.append(decode(body, Annotation))
             except InvalidMessage as error:
                 log.error("an annotation cannot be read (%s); it is left out", error)
-        self._annotations = Annotations(tuple(made))
+        own = Annotations(tuple(made))
+        self._annotations = base + own if base is not None and base.made else own
 
     @property
     def annotations(self) -> Annotations:
@@ -55,7 +63,14 @@ class Annotator:
     """Declared on a bus until closed."""
 
     def __init__(
-        self, bus: Bus, keys: Keys, name: str, places: Callable[[], Places], record: AnnotationRecord
+        self,
+        bus: Bus,
+        keys: Keys,
+        name: str,
+        places: Callable[[], Places],
+        record: AnnotationRecord,
+        check: Callable[[Annotation], None],
+        changed: Callable[[Annotations], None],
     ) -> None:
         """Begin to answer.
 
@@ -65,8 +80,11 @@ class Annotator:
             name: of the server in the fleet.
             places: of the newest merged map. May wait for it.
             record: of annotations.
+            check: refuses an annotation that lacks something on this server (InvalidValue).
+            changed: called with the whole record whenever there is a new entry.
         """
         self._places, self._record = places, record
+        self._check, self._changed = check, changed
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.annotate(name), guarded(self._annotate)),
@@ -94,7 +112,9 @@ class Annotator:
         """
         with self._turn:
             check_annotation(self._places().merged, self._record.annotations, annotation)
+            self._check(annotation)
             self._record.add(annotation)
+            self._changed(self._record.annotations)
         log.warning("%s", annotation.words)
         return annotation.words
 
@@ -128,3 +148,5 @@ def check_annotation(merged: MergedMap, annotations: Annotations, annotation: An
     merged.check(anchor)
     if merged.component_of(anchor) is None:
         raise InvalidValue(f"node {anchor} is not in the merged map")
+    if isinstance(annotation.body, FloorPlan):
+        check_plan(annotation.body, merged)

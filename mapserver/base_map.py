@@ -8,8 +8,9 @@ node by node.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import Change, ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -30,18 +31,29 @@ class BaseMap:
         name: of the file.
         maps: the robots' own maps.
         constraints: manual constraints.
+        annotations: what people say about them.
         history: of these maps.
+        images: of floor plans, by their names.
     """
 
     name: str = ""
     maps: Mapping[MapId, HybridMap] = field(default_factory=dict)
     constraints: ManualConstraints = field(default_factory=ManualConstraints)
+    annotations: Annotations = field(default_factory=Annotations)
     history: tuple[MapEvent, ...] = ()
+    images: Mapping[str, bytes] = field(default_factory=dict)
 
     @staticmethod
     def of(name: str, content: MapFile) -> BaseMap:
         """All that a file has; its links are found again, by the maps that are there then."""
-        return BaseMap(name, maps_of(content), ManualConstraints(content.constraints), content.history)
+        return BaseMap(
+            name,
+            maps_of(content),
+            ManualConstraints(content.constraints),
+            Annotations(content.annotations),
+            content.history,
+            content.images,
+        )
 
     def __str__(self) -> str:
         """For example `office.mapweave: 120 nodes of 3 maps`."""
@@ -74,7 +86,7 @@ class BaseMap:
             mine = self.maps[map_id]
             if newest >= max((own.number for own in (*mine.nodes, *mine.edges)), default=0):
                 del kept[map_id]
-        return BaseMap(self.name, kept, self.constraints, self.history)
+        return replace(self, maps=kept)
 
     def before(self, stored: Iterable[Change]) -> Iterator[Change]:
         """All changes at the start: those of the maps here, then those of the store's other maps."""

@@ -7,8 +7,10 @@ lines are sorted, each ends with a line feed, and the hash is the SHA-256 of thi
                  links included; evidence in the order of its names, without the probability of a link
     refused      MessagePack [a, b, body of the refused edge, or nil]
     constraint   MessagePack [its number from 0, the constraint]: a later one may undo an earlier one
+    annotation   MessagePack [its number from 0, the annotation]: likewise
     superseded   MessagePack [node, the node that replaces it]
     faded        MessagePack [node, the flags of its landmarks]
+    retired      MessagePack [node, the number of the constraint that retires it]
 
 What follows from these is left out: poses and probabilities, which are computed again whenever a file is
 read, and words for people (title, reasons, history).
@@ -49,10 +51,14 @@ def _items(content: MapFile) -> Iterator[tuple[str, bytes]]:
         yield "refused", _packed([pair.a, pair.b, edge])
     for number, constraint in enumerate(content.constraints):
         yield "constraint", _packed([number, constraint])
+    for number, annotation in enumerate(content.annotations):
+        yield "annotation", _packed([number, annotation])
     for node, fate in content.superseded.items():
         yield "superseded", _packed([node, fate.by])
     for node, flags in content.faded.items():
         yield "faded", _packed([node, flags])
+    for node, number in content.retired.items():
+        yield "retired", _packed([node, number])
 
 
 def _packed(item: list[Any]) -> bytes:

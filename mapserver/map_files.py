@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import Edge
+from mapweave.hybridmap.node import Edge, NodeId
 from mapweave.mapserver.own_maps import PROBABILITY, is_link, maps_of
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
@@ -20,12 +20,16 @@ from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link, RefusedLink, link_of
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, RefusedPair
 
 
 def map_file_of(
-    merged: MergedMap, history: Iterable[MapEvent] = (), annotations: Annotations | None = None
+    merged: MergedMap,
+    history: Iterable[MapEvent] = (),
+    annotations: Annotations | None = None,
+    images: Mapping[str, bytes] | None = None,
 ) -> MapFile:
     """A whole merged map: nodes, edges, links with their probabilities, refusals, manual constraints, poses.
 
@@ -33,6 +37,7 @@ def map_file_of(
         merged: the map.
         history: events of its maps.
         annotations: what people say about it.
+        images: PNG files of floor plans, by their names.
     """
     whole = merged.union()
     probabilities = link_probabilities(merged)
@@ -51,6 +56,8 @@ def map_file_of(
         merged.faded,
         tuple(history),
         (annotations or Annotations()).made,
+        _numbered(merged.constraints),
+        dict(images or {}),
     )
 
 
@@ -67,7 +74,8 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         InvalidFile: its measurements determine no poses.
     """
     s = settings or MergeSettings()
-    maps, constraints = maps_of(content), ManualConstraints(content.constraints)
+    nodes = {node: content.constraints[number] for node, number in content.retired.items()}
+    maps, constraints = maps_of(content), ManualConstraints(content.constraints, nodes)
     links = tuple(_links(change.edge for change in content.changes if isinstance(change, EdgePut)))
     try:
         parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency)
@@ -85,7 +93,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     components = tuple(frozenset(graph.nodes) for graph in solved)
     superseded = {node: fate for node, fate in content.superseded.items() if node in poses}
     faded = {node: mask for node, mask in content.faded.items() if node in poses}
-    return MergedMap(
+    merged = MergedMap(
         dict(sorted(maps.items())),
         links,
         refused,
@@ -96,6 +104,13 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         superseded,
         faded,
     )
+    return PinnedFrames().moved(merged, Annotations(content.annotations).pins)
+
+
+def _numbered(constraints: ManualConstraints) -> dict[NodeId, int]:
+    """Retired nodes with the numbers of their constraints."""
+    number = {constraint: k for k, constraint in enumerate(constraints.made)}
+    return {node: number[constraint] for node, constraint in constraints.nodes.items()}
 
 
 def _links(edges: Iterable[Edge]) -> list[Link]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import Counter
@@ -17,6 +18,7 @@ from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.pinned_frames import FrameChange, frame_changes
 from mapweave.wire.messages import KeptHistory, decode, encode
 
 log = logging.getLogger(__name__)
@@ -107,9 +109,22 @@ class MapHistory:
             log.info("%s", words)
         for words in (*parted, *held, *left_out, *contradicted):
             log.warning("%s", words)
+        frames = {
+            (change.pinned, change.holding or change.pinned): change for change in frame_changes(merged)
+        }
+        before_frames = self._kept.frames
+        moved = [_frame_words(change) for key, change in frames.items() if key not in before_frames]
+        not_holding, pinned = {node for node, _ in frames}, {pin.node for pin in merged.pins}
+        moved += [
+            f"the pin of {node} holds its component's frame again"
+            for node in sorted({node for node, _ in before_frames} & pinned - not_holding)
+        ]
+        for words in moved:
+            log.warning("%s", words)
         # Of what happens at once, that something came apart is what people must see last.
         fresh = [
             *_briefly(MapEventKind.JOINED, joined),
+            *_briefly(MapEventKind.FRAME, moved),
             *_briefly(MapEventKind.KEPT_APART, held),
             *_briefly(MapEventKind.PARTED, parted),
             *_briefly(MapEventKind.SET_APART, taken_in),
@@ -118,7 +133,7 @@ class MapHistory:
         ]
         apart_pairs = frozenset(still | set(new))
         self._links = merged.links
-        after = KeptHistory((), now, apart_pairs, frozenset(bad), frozenset(against_hand))
+        after = KeptHistory((), now, apart_pairs, frozenset(bad), frozenset(against_hand), frozenset(frames))
         if fresh or replace(after, events=self._kept.events) != self._kept:
             self._keep(fresh, after)
 
@@ -128,7 +143,12 @@ class MapHistory:
             self._keep([(MapEventKind.FAILED, words)], self._kept)
 
     def _keep(self, fresh: list[tuple[MapEventKind, str]], state: KeptHistory) -> None:
-        """Add to the record; it is on the disk when this returns, unless the disk does not take it."""
+        """Add to the record; it is on the disk when this returns, unless the disk does not take it.
+
+        Args:
+            fresh: new events.
+            state: what is remembered besides events.
+        """
         now = self._clock()
         more = [MapEvent(now, kind, _one_line(words)) for kind, words in fresh]
         kept = replace(state, events=(*self._kept.events, *more)[-self._most :])
@@ -179,6 +199,17 @@ def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pa
             f"{first} and {second} are kept apart: {links} refused ({counts.most_common(1)[0][0]})"
         )
     return out
+
+
+def _frame_words(change: FrameChange) -> str:
+    if change.holding is None:
+        return f"the pin of {change.pinned} holds no frame: the node is not in the merged map"
+    x, y, heading = change.now_from_pinned.vector
+    return (
+        f"the pin of {change.pinned} yields to the older one of {change.holding} in its component: "
+        f"coordinates are turned by {math.degrees(heading):.2f} deg about the origin, then shifted by "
+        f"{x:.3f}, {y:.3f} m"
+    )
 
 
 def _briefly(kind: MapEventKind, events: Sequence[str]) -> list[tuple[MapEventKind, str]]:

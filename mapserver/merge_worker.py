@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import islice
 
@@ -12,6 +12,7 @@ from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger
@@ -131,6 +132,10 @@ class MergeWorker:
     def constrain(self, constraints: ManualConstraints) -> None:
         """Apply exactly these manual constraints from now on. Returns at once."""
         self._post(lambda: self._merger.constrain(constraints))
+
+    def pin(self, pins: Sequence[Pin]) -> None:
+        """Hold the frames of components by exactly these pins from now on, oldest first. Returns at once."""
+        self._post(lambda: self._merger.pin(pins))
 
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
 
 from mapweave.hybridmap.annotation import Annotations
@@ -36,6 +36,7 @@ class PackedMap:
         answer: Callable[[Request, Callable[[], bytes]], None],
         executor: Executor,
         annotations: Callable[[], Annotations] = Annotations,
+        images: Callable[[], Mapping[str, bytes]] = dict,
     ) -> None:
         """Start.
 
@@ -45,7 +46,9 @@ class PackedMap:
             answer: replies to a question with what a function returns, or refuses with what it raises.
             executor: packs, one job at a time; it is shut down with this.
             annotations: of the map, likewise.
+            images: of the plans among them.
         """
+        self._images = images
         self._annotations = annotations
         self._answers = answers
         self._history = history
@@ -84,7 +87,7 @@ class PackedMap:
         merged, history, said = self._answers().merged, tuple(self._history()), self._annotations()
         if self._packed is not None and self._packed[0]() is merged and self._packed[1:3] == (history, said):
             return self._packed[3]
-        data = pack_map_file(map_file_of(merged, history, said))
+        data = pack_map_file(map_file_of(merged, history, said, self._images()))
         # Bytes of a map that has been replaced are freed with it.
         self._packed = weakref.ref(merged, self._forget), history, said, data
         return data

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,8 +22,11 @@ from mapweave.hybridmap.query import (
     Resolved,
     ResolveRequest,
 )
-from mapweave.mapserver.routes import Router
-from mapweave.merge.pose_graph.merged_map import MergedMap
+
+if TYPE_CHECKING:
+    # Programs that only give names of places need none of the server's libraries.
+    from mapweave.mapserver.routes import Router
+    from mapweave.merge.pose_graph.merged_map import MergedMap
 
 NEARBY = 1.5
 """A place that is a node reaches so far, m: a robot there sees the same as from the node."""

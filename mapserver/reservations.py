@@ -9,7 +9,7 @@ mapped one corridor have an edge each for it, and on a wide floor both may drive
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mapweave.hybridmap.node import NodeId
-from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
 from mapweave.mapserver.routes import Router
 
 LEASE = 5.0
@@ -31,8 +32,8 @@ RADIUS = 0.2
 """Of a robot whose footprint is not known, m."""
 STEP = 0.05
 """Between two points of a way that are compared, m."""
-ASIDE = 12
-"""Nodes that are tried as a place to step aside."""
+ASIDE, APART = 12, 0.3
+"""Places that are tried to step aside to, and m between two: a place has a node for each heading."""
 
 Points = NDArray[np.float64]
 
@@ -42,25 +43,40 @@ class _Lease:
     """What one robot holds.
 
     Attributes:
+        request: what it asked last.
         component: of the merged map.
         radius: of the robot, m.
         here: (2,) where it is.
         held: (N, 2) points of the part that it may drive, `here` among them, and of what it claims: the way
             aside, which others leave free from their next question on.
         way: (N, 2) points of its whole way.
-        since: since when it has held anything without a pause, s.
         until: s.
         waits_for: the robot that holds what it wants next; empty if it waits for none.
     """
 
+    request: ReserveRequest
     component: int
     radius: float
     here: Points
     held: Points
     way: Points
-    since: float
     until: float
     waits_for: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Aside:
+    """Where a robot steps aside.
+
+    Attributes:
+        node: the place.
+        way: (N, 2) points up to it.
+        boxed_in: whether the others will stand between it and its goal.
+    """
+
+    node: NodeId
+    way: Points
+    boxed_in: bool
 
 
 class Reservations:
@@ -81,7 +97,7 @@ class Reservations:
         """
         with self._turn:
             self._leases = {robot: lease for robot, lease in self._leases.items() if now < lease.until}
-            before = self._leases.pop(request.robot, None)
+            self._leases.pop(request.robot, None)
             merged = router.merged
             component = merged.component_of(request.start)
             if not request.route or component is None:
@@ -95,27 +111,37 @@ class Reservations:
             radius = max(router.roads.union.nodes[node].radius for node in request.route) or RADIUS
             others = {name: one for name, one in self._leases.items() if one.component == component}
             granted, held, holder = _free(stops, radius, others)
-            since = before.since if before is not None else now
             way = np.vstack([_points(a, b) for a, b in pairwise(stops)])
-            lease = _Lease(component, radius, here, held, way, since, now + LEASE, holder)
+            lease = _Lease(request, component, radius, here, held, way, now + LEASE, holder)
             self._leases[request.robot] = lease
             if not holder:
                 return ReserveAnswer(granted, "", None, "")
-            aside = None
-            if self._yields(request.robot):
-                aside, claimed = _place_aside(request, lease, self._leases[holder], router)
-                self._leases[request.robot] = replace(lease, held=np.vstack([held, claimed]))
-                if aside is not None and _free(claimed, radius, others)[0] < len(claimed) - 1:
-                    aside = None  # the other one drives there yet
-            return ReserveAnswer(granted, holder, aside, f"{holder} drives there")
+            aside = self._yields(request.robot, router)
+            if aside is None:
+                return ReserveAnswer(granted, holder, None, f"{holder} drives there")
+            # Others that hold some of its way aside get no more of it from their next question on.
+            self._leases[request.robot] = replace(lease, held=aside.way)
+            free = _free(aside.way, radius, others)[0] == len(aside.way) - 1
+            return ReserveAnswer(0, holder, aside.node if free else None, f"{holder} drives there")
 
-    def _yields(self, robot: str) -> bool:
-        """Whether robots wait for each other in a circle, of which this one came last."""
+    def _yields(self, robot: str, router: Router) -> _Aside | None:
+        """Where a robot steps aside; None if robots do not wait for each other in a circle, or another does.
+
+        It is the one with the shortest way to a place where it is in no other's way: one that is past its
+        last such place cannot yield, however late it came.
+        """
         circle, name = [robot], self._leases[robot].waits_for
         while name in self._leases and name not in circle:
             circle.append(name)
             name = self._leases[name].waits_for
-        return name == robot and robot == max(circle, key=lambda one: (self._leases[one].since, one))
+        best: tuple[tuple[bool, int], str, _Aside] | None = None
+        if name == robot:
+            for one in sorted(circle, reverse=True):
+                others = [self._leases[other] for other in circle if other != one]
+                aside = _place_aside(self._leases[one], others, router)
+                if aside is not None and (best is None or (aside.boxed_in, len(aside.way)) < best[0]):
+                    best = (aside.boxed_in, len(aside.way)), one, aside
+        return best[2] if best is not None and best[1] == robot else None
 
 
 def _points(a: Points, b: Points) -> Points:
@@ -151,21 +177,43 @@ def _touches(part: Points, here: Points, tree: cKDTree, other: _Lease, width: fl
     return bool((close & ~(stands & leaves)).any())
 
 
-def _place_aside(
-    request: ReserveRequest, lease: _Lease, other: _Lease, router: Router
-) -> tuple[NodeId | None, Points]:
-    """The nearest node off another's way that is reached without passing it, and the points up to it."""
-    poses, tree = router.roads.active_poses, cKDTree(other.way)
-    members = [node for node in router.merged.components[lease.component] if node in poses]
+def _place_aside(lease: _Lease, others: Sequence[_Lease], router: Router) -> _Aside | None:
+    """The nearest node off the others' ways that is reached without passing them.
+
+    One from which the goal is reached when they are at theirs comes first: behind them it would be boxed in.
+    """
+    request, poses = lease.request, router.roads.active_poses
+    component = router.merged.component_of(request.start)  # the map may be newer than the lease
+    members = [n for n in router.merged.components[component] if n in poses] if component is not None else []
+    if not members:
+        return None
     places = np.array([[poses[node].x, poses[node].y] for node in members])
     away = np.linalg.norm(places - lease.here, axis=1)
-    clear = np.flatnonzero(tree.query(places)[0] > lease.radius + other.radius + MARGIN)
-    standing = {"": replace(other, held=other.here[None])}
-    for k in clear[np.argsort(away[clear], kind="stable")][:ASIDE]:
-        legs = router.route(request.start, members[k], start_from_robot=request.start_from_robot).legs
-        ids = [leg.node.id for leg in legs if leg.node.id in poses]
-        stops = np.array([lease.here, *([poses[node].x, poses[node].y] for node in ids)])
-        way = np.vstack([lease.here[None], *(_points(a, b) for a, b in pairwise(stops))])
-        if legs and _free(way, lease.radius, standing)[0] == len(way) - 1:
-            return NodeId(*members[k]), way
-    return None, lease.here[None]
+    off = [cKDTree(one.way).query(places)[0] > lease.radius + one.radius + MARGIN for one in others]
+    clear = np.flatnonzero(np.all(off, axis=0))
+    now = {str(k): replace(one, held=one.here[None]) for k, one in enumerate(others)}
+    then = {str(k): replace(one, here=one.way[-1], held=one.way[-1:]) for k, one in enumerate(others)}
+    boxed_in: _Aside | None = None
+    tried: list[int] = []
+    for k in clear[np.argsort(away[clear], kind="stable")]:
+        if len(tried) == ASIDE:
+            break
+        if tried and np.linalg.norm(places[tried] - places[k], axis=1).min() < APART:
+            continue
+        tried.append(int(k))
+        node = NodeId(*members[k])
+        way = _way(lease.here, router.route(request.start, node, (), (), request.start_from_robot), poses)
+        if way is None or _free(way, lease.radius, now)[0] < len(way) - 1:
+            continue
+        onward = _way(places[k], router.route(node, request.route[-1]), poses)
+        if onward is not None and _free(onward, lease.radius, then)[0] == len(onward) - 1:
+            return _Aside(node, way, False)
+        boxed_in = boxed_in or _Aside(node, way, True)
+    return boxed_in
+
+
+def _way(here: Points, answer: RouteAnswer, poses: Mapping[NodeId, Pose2]) -> Points | None:
+    """(N, 2) points from a place along a route; None without one."""
+    nodes = [leg.node.id for leg in answer.legs if leg.node.id in poses]
+    stops = np.array([here, *([poses[node].x, poses[node].y] for node in nodes)])
+    return np.vstack([here[None], *(_points(a, b) for a, b in pairwise(stops))]) if nodes else None

@@ -14,10 +14,11 @@ from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 
-from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
@@ -36,6 +37,7 @@ from mapweave.mapserver.merging.verification_cache_keeper import VerificationCac
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.places import Places
+from mapweave.mapserver.plan_service import PlanService
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.roster import Roster
@@ -117,7 +119,10 @@ class MapServer:
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
         self._constraints = ConstraintRecord(self._store, self._base)
         self._worker.constrain(self._constraints.constraints)
-        self._annotations = AnnotationRecord(self._store)
+        self._annotations = AnnotationRecord(self._store, self._base.annotations)
+        self._pins = self._annotations.annotations.pins
+        self._worker.pin(self._pins)
+        self._path = path
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
@@ -132,13 +137,17 @@ class MapServer:
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
         )  # fmt: skip
+        self._plans = PlanService(
+            self._bus, self._keys, self._name, lambda: worker.current().merged,
+            lambda: self._annotations.annotations, self._path, base.images,
+        )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
-        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._missions.hear)
+        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear)
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
             self._events, self._missions, self._roster,
-            clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places,
+            clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places, self._plans.files,
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
@@ -146,7 +155,10 @@ class MapServer:
             lambda: self._blockages.known(clock.monotonic()), self._events,
             lambda: self._annotations.annotations,
         )  # fmt: skip
-        self._annotator = Annotator(self._bus, self._keys, self._name, self._named_places, self._annotations)
+        self._annotator = Annotator(
+            self._bus, self._keys, self._name, self._named_places, self._annotations, self._plans.check,
+            self._apply_annotations,
+        )  # fmt: skip
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
@@ -161,6 +173,7 @@ class MapServer:
         self._roster.close()
         self._explainer.close()
         self._annotator.close()
+        self._plans.close()
         self._admission.close()
         self._ingest.close()
         self._broadcast.close()
@@ -237,6 +250,27 @@ class MapServer:
         """
         return self._annotator.annotate(annotation)
 
+    def plans(self) -> PlacedPlans:
+        """Floor plans under the newest merged map, from any thread."""
+        return self._plans.plans()
+
+    def plan_image(self, name: str) -> bytes:
+        """The PNG file of a floor plan, from any thread.
+
+        Raises:
+            InvalidValue: there is none of this name.
+            InvalidFile: its image is lost.
+        """
+        return self._plans.image(name)
+
+    def put_plan_image(self, data: bytes) -> PlanImage:
+        """Keep the image of a floor plan, from any thread; an annotation names it afterwards.
+
+        Raises:
+            InvalidValue: it is no image, or too large.
+        """
+        return self._plans.put(data)
+
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words, from any thread.
 
@@ -288,6 +322,16 @@ class MapServer:
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file."""
         return self._services.map_file()
+
+    def _hear(self, status: AgentStatus) -> None:
+        self._schedule.observe(status.stamp_ns)
+        self._missions.hear(status)
+
+    def _apply_annotations(self, annotations: Annotations) -> None:
+        # A merge takes its time: only what moves a frame is worth one.
+        if annotations.pins != self._pins:
+            self._pins = annotations.pins
+            self._worker.pin(self._pins)
 
     def _answers(self) -> Answers:
         """The newest ones, with routes by what is closed now."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 
@@ -58,6 +58,7 @@ class Services:
         clock: Callable[[], float],
         executor: Executor,
         places: Callable[[], Places],
+        images: Callable[[], Mapping[str, bytes]],
     ) -> None:
         """Begin to answer.
 
@@ -76,6 +77,7 @@ class Services:
             clock: only grows, s.
             executor: packs the whole map; it is shut down with this.
             places: named places of the newest merged map. May wait for it.
+            images: of the plans, for the map's file.
         """
         self._places = places
         self._clock = clock
@@ -89,7 +91,7 @@ class Services:
         self._reservations = Reservations()
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
-            lambda: places().annotations,
+            lambda: places().annotations, images,
         )  # fmt: skip
         self._closing: list[Closing] = [
             bus.serve(keys.relocalize(name), self._relocalize_later),

@@ -20,12 +20,22 @@ if TYPE_CHECKING:
     from mapweave.agent.observation import RobotDescription as RobotDescription
     from mapweave.agent.recordings.camera_file import read_camera as read_camera
     from mapweave.fleet import Fleet as Fleet
+    from mapweave.fleet import connect as connect
+    from mapweave.fleet_events import FleetEvent as FleetEvent
+    from mapweave.fleet_events import MapChanged as MapChanged
     from mapweave.hybridmap.agent_status import AgentStatus as AgentStatus
     from mapweave.hybridmap.agent_status import FleetStatus as FleetStatus
     from mapweave.hybridmap.agent_status import RobotEntry as RobotEntry
+    from mapweave.hybridmap.area import Area as Area
     from mapweave.hybridmap.camera import Camera as Camera
     from mapweave.hybridmap.errors import MapweaveError as MapweaveError
+    from mapweave.hybridmap.explanation import MapsExplanation as MapsExplanation
+    from mapweave.hybridmap.explanation import PairExplanation as PairExplanation
+    from mapweave.hybridmap.explanation import RouteExplanation as RouteExplanation
     from mapweave.hybridmap.hybrid_map import HybridMap as HybridMap
+    from mapweave.hybridmap.manual_constraint import ManualConstraint as ManualConstraint
+    from mapweave.hybridmap.map_event import MapEvent as MapEvent
+    from mapweave.hybridmap.map_event import MapEventKind as MapEventKind
     from mapweave.hybridmap.mission_order import MissionKind as MissionKind
     from mapweave.hybridmap.mission_order import MissionReport as MissionReport
     from mapweave.hybridmap.mission_order import MissionState as MissionState
@@ -40,8 +50,12 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.query import Certainty as Certainty
     from mapweave.hybridmap.query import RelocalizeAnswer as RelocalizeAnswer
     from mapweave.hybridmap.query import View as View
+    from mapweave.map import FileMap as FileMap
+    from mapweave.map import Map as Map
+    from mapweave.map import open as open
     from mapweave.mapserver.own_maps import maps_of as maps_of
     from mapweave.mapserver.relocalization.relocalizer import Relocalizer as Relocalizer
+    from mapweave.node_table import NodeTable as NodeTable
     from mapweave.offline_merge import merge_map_files as merge_map_files
     from mapweave.offline_relocalization import relocalizer_of as relocalizer_of
     from mapweave.offline_relocalization import view_of as view_of
@@ -56,17 +70,24 @@ else:
         "mapweave.agent.drivers.robot": ("Robot",),
         "mapweave.agent.observation": ("Command", "Observation", "Odometry", "RobotDescription"),
         "mapweave.agent.recordings.camera_file": ("read_camera",),
-        "mapweave.fleet": ("Fleet",),
+        "mapweave.fleet": ("Fleet", "connect"),
+        "mapweave.fleet_events": ("FleetEvent", "MapChanged"),
         "mapweave.hybridmap.agent_status": ("AgentStatus", "FleetStatus", "RobotEntry"),
+        "mapweave.hybridmap.area": ("Area",),
         "mapweave.hybridmap.camera": ("Camera",),
         "mapweave.hybridmap.errors": ("MapweaveError",),
+        "mapweave.hybridmap.explanation": ("MapsExplanation", "PairExplanation", "RouteExplanation"),
         "mapweave.hybridmap.hybrid_map": ("HybridMap",),
+        "mapweave.hybridmap.manual_constraint": ("ManualConstraint",),
+        "mapweave.hybridmap.map_event": ("MapEvent", "MapEventKind"),
         "mapweave.hybridmap.mission_order": ("MissionKind", "MissionReport", "MissionState"),
         "mapweave.hybridmap.node": ("Edge", "EdgeKind", "Landmarks", "MapId", "Node", "NodeId"),
         "mapweave.hybridmap.pose": ("Pose2", "PoseGaussian"),
         "mapweave.hybridmap.query": ("Certainty", "RelocalizeAnswer", "View"),
+        "mapweave.map": ("FileMap", "Map", "open"),
         "mapweave.mapserver.own_maps": ("maps_of",),
         "mapweave.mapserver.relocalization.relocalizer": ("Relocalizer",),
+        "mapweave.node_table": ("NodeTable",),
         "mapweave.offline_merge": ("merge_map_files",),
         "mapweave.offline_relocalization": ("relocalizer_of", "view_of"),
         "mapweave.storage.image_file": ("read_grey",),

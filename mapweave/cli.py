@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +13,7 @@ from mapweave.commands import (
     agent,
     calibrate,
     closures,
+    completion,
     demo,
     doctor,
     drive,
@@ -23,6 +26,7 @@ from mapweave.commands import (
     missions,
     open_map,
     place,
+    plan,
     record,
     relocalize,
     replay,
@@ -33,12 +37,14 @@ from mapweave.commands import (
     sim,
     status,
 )
+from mapweave.commands.examples import add_examples
+from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
 
-EPILOG = "Start with `mapweave demo`. Each command has its own --help."
-MISSING_EXTRA = 3
-"""Exit status of a command whose libraries are not installed."""
+EPILOG = "Start with `mapweave demo`. Each command has its own --help, with examples."
+NEGATIVE = re.compile(r"-[0-9.][0-9.,=e+-]*$")
+"""Positions and poses begin with a minus as well: -3.1,2 and -3.1,2=40,50."""
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -48,6 +54,8 @@ class CommandParser(argparse.ArgumentParser):
         """Make a parser; those of its commands are of this class, too."""
         super().__init__(*args, **kwargs)
         self.set_defaults(command=self.prog)
+        # Positions begin with a minus as well, and are no options: -3.1,2 and -3.1,2=40,50.
+        self._negative_number_matcher = NEGATIVE
 
 
 class PrintVersion(argparse.Action):
@@ -71,11 +79,12 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, drive, status, missions, place, closures, keys, robots, doctor,
-        find_port, find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize, evaluate,
-        settings,
+        demo, server, router, sim, agent, drive, status, missions, place, plan, closures, keys, robots,
+        doctor, find_port, find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize,
+        evaluate, settings, completion,
     ):  # fmt: skip
         command.add_to(commands)
+    add_examples(top)
     return top
 
 
@@ -83,10 +92,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Returns:
-        0 if it did what was asked, 1 if it could not (one line on stderr says why), 3 if it needs an extra
-        that is not installed, 130 if interrupted. What 2 means is in the command's own help.
+        See `mapweave.exit_status`; argparse itself exits with 2 on a wrong command line.
     """
-    arguments = parser().parse_args(argv)
+    commands = parser()
+    if "_ARGCOMPLETE" in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(commands)
+    arguments = commands.parse_args(argv)
     try:
         return int(arguments.run(arguments))
     except MissingExtra as error:
@@ -100,12 +113,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return MISSING_EXTRA
     except MapweaveError as error:
         print(f"mapweave: {error}", file=sys.stderr)
-        return 1
+        return FAILED
     except KeyboardInterrupt:
         print("mapweave: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:
-        return 1
+        return FAILED
     except OSError as error:
         # A disk that is full, a folder that may not be written: the system's words say it best, but for one.
         reason = error.strerror or error
@@ -115,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             reason = "cannot be made: what it should be in is a file"
         where = f"{error.filename}: " if error.filename else ""
         print(f"mapweave: {where}{reason}", file=sys.stderr)
-        return 1
+        return FAILED
 
 
 if __name__ == "__main__":

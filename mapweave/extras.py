@@ -22,6 +22,7 @@ MODULES = {
     "sim": ("pybullet",),
     "eval": ("evo",),
     "viz": ("matplotlib",),
+    "rerun": ("rerun",),
 }
 """What each extra installs, by the names that are imported. No command needs `fast` or `gym`."""
 TRIAL = ("server", "sim", "eval", "viz")

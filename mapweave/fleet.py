@@ -1,9 +1,10 @@
-"""A running fleet, from Python: who is doing what, missions, the merged map.
+"""A running fleet, from Python: its merged map, who is doing what, missions, events.
 
-with mapweave.Fleet() as fleet:
+with mapweave.connect("tcp/127.0.0.1:7447") as fleet:
     for robot in fleet.status().robots:
         print(robot.robot, robot.status.status.doing)
     fleet.go("r0", "r1.1.5", wait=120.0)
+    fleet.plot()
 """
 
 from __future__ import annotations
@@ -11,15 +12,17 @@ from __future__ import annotations
 import getpass
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
-from mapweave.fleet_constraints import SOON, FleetConstraints
+from mapweave.connection import ANSWERED, no_server, reach
+from mapweave.fleet_annotations import FleetAnnotations
+from mapweave.fleet_constraints import FleetConstraints
+from mapweave.fleet_map import FleetMap
+from mapweave.fleet_plans import FleetPlans
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
-from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import (
     MissionKind,
@@ -31,24 +34,30 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
-from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.identities.key_file import read_key_file
-from mapweave.mapserver.annotation_words import annotation_of_words
-from mapweave.storage.map_file import MapFile, unpack_map_file
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-ANSWER = 10.0
-"""A server that merges answers questions about its map late, s."""
-PACKING = 120.0
-"""How long a server may take to pack a large map, s."""
 TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
+
+
+def connect(
+    endpoint: str | Sequence[str] = "tcp/127.0.0.1:7447",
+    fleet: str = "demo",
+    by: str = "",
+    keys: str | Path = "",
+) -> Fleet:
+    """Connect to a running fleet; see Fleet.
+
+    Raises:
+        NotConnected: there is no router.
+    """
+    return Fleet(endpoint, fleet, by, keys)
 
 
 def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0) -> MissionReport:
@@ -58,9 +67,12 @@ def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0)
         NotConnected: the robot does not answer, or does not take it.
     """
     replies = bus.ask(keys.mission(order.robot), encode(order), timeout)
-    if not replies or replies[0].error:
-        why = replies[0].error if replies else "no answer"
-        raise NotConnected(f"robot {order.robot} did not take its mission: {why}")
+    if not replies:
+        raise NotConnected(
+            f"robot {order.robot} does not answer: is its agent running? `mapweave status` lists the robots"
+        )
+    if replies[0].error:
+        raise NotConnected(f"robot {order.robot} did not take its mission: {replies[0].error}")
     return decode(replies[0].payload, MissionReport)
 
 
@@ -72,8 +84,12 @@ def login() -> str:
         return "a person"
 
 
-class Fleet(FleetConstraints):
-    """A connection to a fleet. A context manager; its methods may be called from any thread."""
+class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
+    """A connection to a fleet, and its merged map. A context manager; it may be used from any thread.
+
+    The merged map is fetched when it is first looked at, and again by `refresh`. Whereabouts, routes and
+    explanations are the map server's, so they are of its newest map and need no extra here.
+    """
 
     def __init__(
         self,
@@ -95,7 +111,7 @@ class Fleet(FleetConstraints):
         Raises:
             NotConnected: there is no router.
         """
-        self._keys = Keys(check_name(fleet))
+        checked = Keys(check_name(fleet))
         self._by = (by or login())[:64]
         self._own: ZenohBus | None = None
         self._role: Role | None = None
@@ -103,13 +119,8 @@ class Fleet(FleetConstraints):
             credentials = read_key_file(Path(keys)).credentials if keys else None
             self._role = None if credentials is None else credentials.role
             endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-            bus = self._own = ZenohBus(BusSettings(endpoints=endpoints, credentials=credentials))
-            if not self._own.wait_connected(SOON):
-                self._own.close()
-                raise NotConnected(
-                    f"no router at {', '.join(endpoints)}: start `mapweave server`, or give --connect"
-                )
-        self._bus = bus
+            bus = self._own = reach(BusSettings(endpoints=endpoints, credentials=credentials))
+        super().__init__(bus, checked)
 
     def __enter__(self) -> Fleet:
         """Nothing more to do."""
@@ -123,17 +134,24 @@ class Fleet(FleetConstraints):
 
     def close(self) -> None:
         """Disconnect. Idempotent."""
+        self._closed = True
         if self._own is not None:
             self._own.close()
 
     def status(self) -> FleetStatus:
-        """All robots, as the map server sees them; without one, those that answer themselves."""
-        for reply in self._ask(self._keys.any_robots(), b"", SOON):
+        """All robots, as the map server sees them; without one, those that answer themselves.
+
+        Raises:
+            NotConnected: no map server and no robot answers.
+        """
+        for reply in self._ask(self._keys.any_robots(), b"", ANSWERED):
             return decode(reply.payload, FleetStatus)
         robots = []
-        for reply in self._ask(self._keys.agent_statuses(), b"", SOON):
+        for reply in self._ask(self._keys.agent_statuses(), b"", ANSWERED):
             status = decode(reply.payload, AgentStatus)
             robots.append(RobotEntry(status.robot, True, 0.0, status))
+        if not robots:
+            raise no_server(self._keys.fleet)
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
@@ -145,10 +163,7 @@ class Fleet(FleetConstraints):
         Raises:
             NotConnected: no map server answers.
         """
-        replies = self._ask(self._keys.any_missions(), b"", SOON)
-        if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
-        reports = decode(replies[0].payload, Missions).reports
+        reports = decode(self._question(self._keys.any_missions(), b"", ANSWERED), Missions).reports
         return tuple(report for report in reports if robot in ("", report.order.robot))
 
     def go(self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = ()) -> MissionReport:
@@ -229,84 +244,6 @@ class Fleet(FleetConstraints):
             listening.close()
         return last[0]
 
-    def map_bytes(self) -> bytes:
-        """The merged map as the bytes of a map file.
-
-        Raises:
-            NotConnected: no map server answers.
-        """
-        replies = self._ask(self._keys.any_server_map(), b"", PACKING)
-        if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
-        unpack_map_file(replies[0].payload)
-        return replies[0].payload
-
-    def map(self) -> MapFile:
-        """The merged map; see `map_bytes`."""
-        return unpack_map_file(self.map_bytes())
-
-    def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
-        """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
-
-        Args:
-            kind: of the annotation: place, closure, preference.
-            name: for the same kind and name the last one holds.
-            because: why.
-            fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a
-                place, a position `3.1,-2.0` in the merged map. An area is `corners`, positions in the merged
-                map (in the component of the place or node `near`), or `radius`, m, around `node`.
-
-        Returns:
-            What it says, in words.
-
-        Raises:
-            MapweaveError: it says nothing new, is about something that is not there, or no server answers.
-        """
-        return self._annotate(name, {"kind": kind, **fields}, False, because)
-
-    def withdraw(self, kind: str, name: str, because: str = "") -> str:
-        """Withdraw what was said about the map; see `annotate`."""
-        return self._annotate(name, {"kind": kind}, True, because)
-
-    def annotations(self) -> Annotations:
-        """What people say about the map.
-
-        Raises:
-            NotConnected: no map server answers.
-        """
-        return decode(self._of_server(self._keys.any_annotations(), b""), Annotations)
-
-    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
-        """Nodes for words: names of places, and positions in the merged map.
-
-        Raises:
-            InvalidValue: a word is none, with the reason.
-            NotConnected: no map server answers.
-        """
-        return decode(self._of_server(self._keys.any_resolve(), encode(request)), ResolveAnswer)
-
-    def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
-        annotation = annotation_of_words(
-            name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
-        )
-        said = decode_record(self._of_server(self._keys.any_annotate(), encode(annotation)))["said"]
-        return str(said)
-
-    def _of_server(self, key: str, payload: bytes) -> bytes:
-        """The answer of a map server.
-
-        Raises:
-            InvalidValue: it refuses.
-            NotConnected: none answers.
-        """
-        replies = self._bus.ask(key, payload, ANSWER)
-        for reply in replies:
-            if not reply.error:
-                return reply.payload
-        if replies:
-            raise InvalidValue(replies[0].error.removeprefix("refused: "))
-        raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
-
     def _give(
         self, robot: str, kind: MissionKind, goal: str, wait: float, via: tuple[str, ...] = ()
     ) -> MissionReport:
@@ -317,7 +254,7 @@ class Fleet(FleetConstraints):
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
             request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via)
-            replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * SOON)
+            replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * ANSWERED)
             taken = [reply for reply in replies if not reply.error]
             if not taken and replies:
                 raise InvalidValue(replies[0].error.removeprefix("refused: "))
@@ -343,7 +280,7 @@ class Fleet(FleetConstraints):
         after_ns = 0
         for _ in range(TRIES):
             order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal, via=via)
-            report = send_order(self._bus, self._keys, order, SOON)
+            report = send_order(self._bus, self._keys, order, ANSWERED)
             if report.state is not MissionState.REPLACED:
                 break
             after_ns = self._newest(robot)
@@ -351,7 +288,7 @@ class Fleet(FleetConstraints):
 
     def _newest(self, robot: str) -> int:
         """Stamp of the mission that holds a robot."""
-        for reply in self._ask(self._keys.agent_status(robot), b"", SOON):
+        for reply in self._ask(self._keys.agent_status(robot), b"", ANSWERED):
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+from mapweave.connection import ANSWERED
+from mapweave.fleet_questions import FleetQuestions
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.constraint_subject import (
     Apart,
@@ -15,27 +17,19 @@ from mapweave.hybridmap.constraint_subject import (
     read_retired,
     read_window,
 )
-from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.wire.bus import Bus, Reply
-from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 
-SOON = 2.0
-"""s; a router that is there is found sooner, and a robot that is there answers sooner."""
 CHECKING = 20.0
 """How long a server may take to check a manual constraint against a large map, s."""
 
 
-class FleetConstraints:
+class FleetConstraints(FleetQuestions):
     """The part of `mapweave.fleet.Fleet` by which people correct the merge."""
-
-    _bus: Bus
-    _keys: Keys
-    _by: str
 
     def link(
         self, a: str, b: str, pose: Pose2 | None = None, because: str = "", *, check: bool = False
@@ -76,7 +70,7 @@ class FleetConstraints:
         Args:
             which: one map, `r0.1`, or nodes, `r0.1.17`; none with an area.
             area: where all nodes are retired, of all maps.
-            begin: of one map alone nodes from then on: ns since 1970, or `2026-03-01T12:00` (UTC).
+            begin: of one map alone nodes from then on: ns since 1970, or `2026-03-01 12:00` (UTC).
             end: and until then.
             because: why.
             check: only say what it would do.
@@ -91,7 +85,7 @@ class FleetConstraints:
             if begin or end:
                 if not isinstance(about, RetiredMap):
                     raise InvalidValue("a time window is of one map")
-                about = read_window(about.map, begin, end)
+                about = read_window(about.map, begin, end, time.time_ns())
         return self.constrain(about, True, because, check=check)
 
     def undo(self, what: int | ManualConstraint, because: str = "", *, check: bool = False) -> str:
@@ -115,28 +109,11 @@ class FleetConstraints:
         Raises:
             NotConnected: no map server answers.
         """
-        replies = self._ask(self._keys.any_constraints(), b"", SOON)
-        if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
-        return decode(replies[0].payload, ConstraintList).made
+        return decode(self._question(self._keys.any_constraints(), b"", ANSWERED), ConstraintList).made
 
     def constrain(self, about: Subject, holds: bool, because: str = "", *, check: bool = False) -> str:
         """Set a manual constraint of any kind, or take it back; see `link`."""
         constraint = ManualConstraint(about, holds, self._by, time.time_ns(), because)
         request = encode(ConstraintRequest(constraint, check))
-        end = time.monotonic() + CHECKING
-        while True:
-            replies = self._bus.ask(self._keys.any_constrain(), request, CHECKING)
-            pause = max((reply.retry_after for reply in replies), default=0.0)
-            if pause <= 0.0 or time.monotonic() + pause > end:
-                break
-            time.sleep(pause)
-        if not replies:
-            raise NotConnected(f"no map server of fleet {self._keys.fleet} answers")
-        taken = [reply for reply in replies if not reply.error]
-        if not taken:
-            raise InvalidValue(replies[0].error.removeprefix("refused: "))
-        return str(decode_record(taken[0].payload)["said"])
-
-    def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
-        return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
+        answer = self._question(self._keys.any_constrain(), request, CHECKING)
+        return str(decode_record(answer)["said"])

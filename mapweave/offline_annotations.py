@@ -10,16 +10,21 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.annotation import Annotations
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.annotator import check_annotation
+from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.opened_map import MapSource, open_map
 from mapweave.storage.atomic_file import check_place
 from mapweave.storage.map_file import write_map_file
+from mapweave.storage.plan_image import check_plan_png
 
 
 class OfflineAnnotations:
@@ -43,6 +48,7 @@ class OfflineAnnotations:
         self._opened = open_map(path)
         self._out = path if out is None and self._opened.source is MapSource.FILE else out
         self._made = Annotations(self._opened.content.annotations)
+        self._images = dict(self._opened.content.images)
 
     def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
         """See Fleet.annotate; the file is written.
@@ -68,6 +74,31 @@ class OfflineAnnotations:
         """
         return Places(self._router, self.annotations()).answer(request)
 
+    def plans(self) -> PlacedPlans:
+        """Floor plans under the map."""
+        return placed_plans(self.annotations(), self.merged)
+
+    def plan_image(self, sha256: str) -> bytes:
+        """The PNG file of a plan.
+
+        Raises:
+            InvalidFile: it is not in the file.
+        """
+        if sha256 not in self._images:
+            raise InvalidFile(f"the image {sha256[:12]} of a plan is not in the file: add the plan again")
+        return self._images[sha256]
+
+    def put_plan_image(self, png: bytes) -> PlanImage:
+        """See Fleet.put_plan_image; the file is written with the annotation that names the image."""
+        image = check_plan_png(png)
+        self._images[image.sha256] = png
+        return image
+
+    @property
+    def merged(self) -> MergedMap:
+        """The merged map of the file."""
+        return self._router.merged
+
     @cached_property
     def _router(self) -> Router:
         return Router(self._opened.merged(self._settings))
@@ -82,7 +113,18 @@ class OfflineAnnotations:
             name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
         )
         check_annotation(self._router.merged, self.annotations(), annotation)
+        body = annotation.body
+        if isinstance(body, FloorPlan) and not annotation.removed:
+            self.plan_image(body.image.sha256)
         self._made = Annotations((*self._made.made, annotation))
-        content = self._opened.file(self._router.merged)
-        write_map_file(self._out, replace(content, annotations=self._made.made))
+        used = {plan.image.sha256 for _, plan in self._made.in_force(FloorPlan)}
+        images = {name: png for name, png in self._images.items() if name in used}
+        content = replace(self._opened.content, annotations=self._made.made, images=images)
+        self._opened = replace(self._opened, content=content)
+        if isinstance(body, Pin):
+            del self._router
+        content = self._opened.file(self.merged)
+        if isinstance(body, Pin) and content.poses:
+            content = replace(content, poses=dict(self.merged.poses))
+        write_map_file(self._out, content)
         return annotation.words

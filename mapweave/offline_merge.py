@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 
 from mapweave.hybridmap.annotation import Annotations
@@ -12,6 +13,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
@@ -35,6 +37,7 @@ class Parts:
         notes: what was left out, one sentence each.
         history: history of the maps in any of the files, in order.
         annotations: what people say about them in any of the files.
+        images: of floor plans, by their names, in any of the files.
     """
 
     maps: dict[MapId, HybridMap]
@@ -42,6 +45,7 @@ class Parts:
     notes: tuple[str, ...] = ()
     history: tuple[MapEvent, ...] = ()
     annotations: Annotations = field(default_factory=Annotations)
+    images: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def parts_of(files: Mapping[Path, MapFile]) -> Parts:
@@ -74,7 +78,8 @@ def parts_of(files: Mapping[Path, MapFile]) -> Parts:
     events = {hybrid_map for content in files.values() for hybrid_map in content.history}
     history = sorted(events, key=lambda hybrid_map: (hybrid_map.stamp_ns, hybrid_map.kind, hybrid_map.words))
     said = sum((Annotations(content.annotations) for content in files.values()), Annotations())
-    return Parts(maps, constraints, tuple(notes), tuple(history), said)
+    images = {name: png for content in files.values() for name, png in content.images.items()}
+    return Parts(maps, constraints, tuple(notes), tuple(history), said, images)
 
 
 def _length(hybrid_map: HybridMap) -> int:
@@ -102,6 +107,7 @@ def merge_parts(
     progress: Progress = lambda done, of: None,
     settings: MergeSettings | None = None,
     store: Path | None = None,
+    pins: Sequence[Pin] = (),
 ) -> MergedMap:
     """Merge robots' maps as the map server does.
 
@@ -111,12 +117,14 @@ def merge_parts(
         progress: see `Progress`.
         settings: how they are merged.
         store: the server's store from which they come: what that server has compared is not compared again.
+        pins: that hold frames, oldest first.
 
     Raises:
         InvalidValue: a map cannot be merged; writing the others would lose it.
     """
     merger = Merger(settings=settings)
     merger.constrain(constraints)
+    merger.pin(pins)
     changes = [
         (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()
     ]
@@ -134,7 +142,7 @@ def merge_parts(
     return merged
 
 
-def merge_map_files(paths: Iterable[Path]) -> MapFile:
+def merge_map_files(paths: Iterable[str | PathLike[str]]) -> MapFile:
     """Merge map files as `mapweave map merge` does.
 
     Returns:
@@ -144,5 +152,6 @@ def merge_map_files(paths: Iterable[Path]) -> MapFile:
         InvalidFile: a file cannot be read, or two hold different maps of one name.
         InvalidValue: a map cannot be merged.
     """
-    parts = parts_of({path: read_map_file(path) for path in paths})
-    return map_file_of(merge_parts(parts.maps, parts.constraints), parts.history, parts.annotations)
+    parts = parts_of({Path(path): read_map_file(Path(path)) for path in paths})
+    merged = merge_parts(parts.maps, parts.constraints, pins=parts.annotations.pins)
+    return map_file_of(merged, parts.history, parts.annotations, parts.images)

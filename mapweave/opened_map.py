@@ -23,6 +23,7 @@ from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log import store
 from mapweave.mapserver.log.salvage import Salvage, salvage
 from mapweave.mapserver.own_maps import maps_of
+from mapweave.mapserver.plan_images import kept_images
 from mapweave.storage.database_reader import MAGIC as SQLITE
 from mapweave.storage.database_reader import reading
 from mapweave.storage.map_file import MAGIC, MapFile, read_map_file
@@ -82,11 +83,12 @@ class OpenedMap:
         from mapweave.offline_merge import merge_parts
 
         maps = maps_of(self.content)
-        if self.source is MapSource.FILE or len(maps) < 2:
-            return merged_of(self.content, settings)
         constraints = ManualConstraints(self.content.constraints)
+        if self.source is MapSource.FILE or (len(maps) < 2 and not constraints.in_force):
+            return merged_of(self.content, settings)
         of_store = self.path if self.source is MapSource.STORE else None
-        return merge_parts(maps, constraints, progress, settings, of_store)
+        pins = Annotations(self.content.annotations).pins
+        return merge_parts(maps, constraints, progress, settings, of_store, pins)
 
     def file(self, merged: MergedMap) -> MapFile:
         """The content of a map file that holds the whole map.
@@ -94,11 +96,12 @@ class OpenedMap:
         Args:
             merged: see `merged`.
         """
-        if self.source is MapSource.FILE or len(merged.maps) < 2:
+        if self.source is MapSource.FILE or (len(merged.maps) < 2 and not merged.constraints.in_force):
             return self.content
         from mapweave.mapserver.map_files import map_file_of
 
-        return map_file_of(merged, self.content.history, Annotations(self.content.annotations))
+        said = Annotations(self.content.annotations)
+        return map_file_of(merged, self.content.history, said, self.content.images)
 
 
 def open_map(path: Path) -> OpenedMap:
@@ -176,6 +179,7 @@ def _of_store(path: Path) -> OpenedMap:
         constraints=tuple(constraints),
         history=tuple(event for record in history for event in record.events),
         annotations=tuple(annotations),
+        images=kept_images(path, Annotations(tuple(annotations))),
     )
     complaint = _lost(path, salvaged, bad + worse + worst)
     maps = tuple(sorted(salvaged.maps))

@@ -14,6 +14,7 @@ from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
@@ -21,6 +22,7 @@ from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAn
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.mapserver.explanations import explained
+from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -120,6 +122,29 @@ class ReadOnlyServer:
             InvalidValue: always.
         """
         self._refuse("`mapweave place add --map FILE -o OUT` and the like write an annotated copy")
+
+    def plans(self) -> PlacedPlans:
+        """Floor plans under the map."""
+        return placed_plans(self._annotations, self._merged)
+
+    def plan_image(self, name: str) -> bytes:
+        """The PNG file of a floor plan.
+
+        Raises:
+            InvalidValue: there is none of this name, or its image is not in the file.
+        """
+        image = self.plans().plan(name).plan.image
+        if image.sha256 not in self._opened.content.images:
+            raise InvalidValue(f"the image of plan {name} is not in {self._opened.path.name}")
+        return self._opened.content.images[image.sha256]
+
+    def put_plan_image(self, data: bytes) -> PlanImage:
+        """Refuse an image.
+
+        Raises:
+            InvalidValue: always.
+        """
+        self._refuse("`mapweave plan add --map FILE -o OUT` writes a copy with a plan")
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words.

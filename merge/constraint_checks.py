@@ -17,7 +17,7 @@ from mapweave.hybridmap.constraint_subject import (
 )
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of, verb_of
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.link_checks import checked_link
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
@@ -67,9 +67,8 @@ def check_manual_constraint(
     if isinstance(about, Linked):
         return Checked(*checked_link(merged, constraints, constraint, settings or MergeSettings()))
     if standing is not None:
-        already = "apart" if isinstance(about, Apart) else "retired"
-        verb = "are" if isinstance(about, Apart | RetiredNodes) else "is"
-        raise InvalidValue(f"{about} {verb} {already} already: {reason_of(standing)}")
+        already = "are apart" if isinstance(about, Apart) else f"{verb_of(about)} retired"
+        raise InvalidValue(f"{about} {already} already: {reason_of(standing)}")
     match about:
         case Apart():
             return Checked(constraint, _checked_separation(merged, about))

@@ -2,6 +2,9 @@
 
 Maps that links tie together, directly or by way of others, are an island. Nothing in one island bears on
 another, so an island that nothing has touched is kept as it is.
+
+Two sorts of manual constraints need a second merge of their islands: which nodes lie in a retired area says
+the merge without retired areas, and whether a link by hand is contradicted the merge without links by hand.
 """
 
 from __future__ import annotations
@@ -10,13 +13,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import networkx as nx
+import numpy as np
 
-from mapweave.hybridmap.constraint_subject import RetiredArea
+from mapweave.hybridmap.constraint_subject import Linked, RetiredArea
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.manual_constraints import CutMaps, apply_constraints
 from mapweave.merge.merging import MergeCache, decide
+from mapweave.merge.outlier_rejection.loop_closures import distance2_of
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
@@ -49,6 +55,7 @@ class Islands:
         self._constraints = ManualConstraints()
         self._cut_maps = CutMaps()
         self._without_areas: Islands | None = None
+        self._without_hand: Islands | None = None
 
     def merge(
         self,
@@ -84,9 +91,11 @@ class Islands:
             merged_islands[island] = self._decided(inside, verdicts.among(island), constraints, earlier)
         self._merged_islands, self._constraints = merged_islands, constraints
         island_of = {one: island for island in islands for one in island}
-        return _together(
+        whole = _together(
             [merged for merged, _ in merged_islands.values()], maps, verdicts.across(island_of), constraints
         )
+        contradicted = self._contradicted(_around(maps, islands, constraints), verdicts, touched, constraints)
+        return replace(whole, contradicted={**contradicted, **whole.contradicted}) if contradicted else whole
 
     def _decided(
         self,
@@ -113,14 +122,43 @@ class Islands:
         constraints: ManualConstraints,
     ) -> dict[NodeId, ManualConstraint]:
         """Where a retired area lies the merge without retired areas says, so that it does not say itself."""
-        others = [c for c in constraints.made if not isinstance(c.about, RetiredArea)]
         if not any(isinstance(c.about, RetiredArea) for c in constraints.in_force):
             self._without_areas = None
             return retired_nodes(maps, constraints, ())
-        if self._without_areas is None:
-            self._without_areas = Islands(self._settings, self._exact)
-        graphs = self._without_areas.merge(maps, verdicts, touched, ManualConstraints(others)).graphs
-        return retired_nodes(maps, constraints, graphs)
+        self._without_areas = self._without_areas or _Reference(self._settings, self._exact)
+        others = constraints.without(RetiredArea)
+        others = others.with_nodes(retired_nodes(maps, others, ()))
+        inside = _around(maps, self._ties(maps, verdicts, others), constraints)
+        merged = self._without_areas.merge(inside, verdicts, touched, others)
+        return retired_nodes(maps, constraints, merged.graphs)
+
+    def _contradicted(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        touched: set[MapId],
+        constraints: ManualConstraints,
+    ) -> dict[Pair, str]:
+        """Links by hand that what robots have measured contradicts, and how."""
+        links = constraints.links
+        if not links:
+            self._without_hand = None
+            return {}
+        self._without_hand = self._without_hand or _Reference(self._settings, self._exact)
+        others = constraints.without(Linked).with_nodes(constraints.nodes)
+        merged = self._without_hand.merge(maps, verdicts, touched, others)
+        out, s = {}, self._settings.consistency
+        for pair, linked in links.items():
+            measured = merged.relative(*pair)
+            distance2 = 0.0 if measured is None else distance2_of(linked.a_from_b, measured, s)
+            if measured is not None and distance2 >= s.gate:
+                off = (linked.a_from_b.mean.inverse() @ measured.mean).vector
+                out[pair] = (
+                    f"without it robots' measurements put {linked.b} {np.hypot(off[0], off[1]):.2f} m and "
+                    f"{abs(np.degrees(off[2])):.1f} deg from there: {np.sqrt(distance2):.1f} standard "
+                    "deviations"
+                )
+        return out
 
     def _ties(
         self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, constraints: ManualConstraints
@@ -139,6 +177,41 @@ class Islands:
             ties.add_edges_from((map_id, neighbour) for neighbour in entry[1])
         parts = (frozenset(part & maps.keys()) for part in nx.connected_components(ties))
         return sorted((island for island in parts if island), key=min)
+
+
+class _Reference(Islands):
+    """A merge that another one is compared with."""
+
+    def _retired_nodes(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        touched: set[MapId],
+        constraints: ManualConstraints,
+    ) -> dict[NodeId, ManualConstraint]:
+        return dict(constraints.nodes)
+
+    def _contradicted(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        touched: set[MapId],
+        constraints: ManualConstraints,
+    ) -> dict[Pair, str]:
+        return {}
+
+
+def _around(
+    maps: Mapping[MapId, HybridMap], islands: Iterable[frozenset[MapId]], constraints: ManualConstraints
+) -> dict[MapId, HybridMap]:
+    """Maps of the islands with links by hand or with anchors of retired areas: no others bear on these."""
+    ends = {
+        which
+        for constraint in constraints.in_force
+        if isinstance(constraint.about, Linked | RetiredArea)
+        for which in constraint.about.maps
+    }
+    return {one: maps[one] for island in islands if island & ends for one in sorted(island)}
 
 
 def _touched_by(before: ManualConstraints, now: ManualConstraints) -> set[MapId]:

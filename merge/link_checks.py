@@ -8,7 +8,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import networkx as nx
-import numpy as np
 
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.errors import InvalidValue
@@ -17,6 +16,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.manual_constraints import apply_constraints, link_by_hand
 from mapweave.merge.mutual_exclusion.refutation import Refutation
+from mapweave.merge.outlier_rejection.loop_closures import distance2_of
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link
@@ -57,7 +57,7 @@ def checked_link(
         raise InvalidValue(f"{asked} are {reason_of(standing)} already")
     known = next((link for link in merged.links if link.pair == (asked.a, asked.b)), None)
     if known is not None:
-        raise InvalidValue(f"{asked} are linked already: {known.weight} landmarks agree on one pose")
+        raise InvalidValue(f"{asked} are linked already: {_landmarks(known)} of the images agree on one pose")
     linked, words = _by_images(merged, asked, constraint.because, settings.consistency)
     _check_geometry(merged, linked, settings.consistency)
     _check_exclusion(merged, linked, settings)
@@ -70,15 +70,17 @@ def _by_images(merged: MergedMap, asked: Linked, because: str, s: ConsistencySet
     verdict = verify(a, b)
     if isinstance(verdict, Link):
         pose, inliers = verdict.a_from_b, int(verdict.evidence["inliers"])
-        if asked.pose is not None and not _agree(_by_person(asked.pose), pose, s):
+        if asked.pose is not None and distance2_of(_by_person(asked.pose), pose, s) >= s.gate:
             raise InvalidValue(
                 f"{asked} cannot be linked so: {inliers} landmarks of the images agree on another pose, "
                 f"{_words(pose.mean)}, {_off(pose.mean, asked.pose)} from yours; leave --pose out"
             )
-        words = f"{inliers} landmarks of the images agree on one pose"
+        words = f"{_landmarks(verdict)} of the images agree on one pose"
         return Linked.of(asked.a, asked.b, pose, verdict.shared, verdict.evidence), words
     found = examine(a, b)
-    evidence = f"{found.matches} features match, {found.inliers} of them agree on a pose: {verdict.reason}"
+    evidence = verdict.reason
+    if found.inliers:
+        evidence = f"{found.matches} features match, {found.inliers} of them agree on a pose: {evidence}"
     if asked.pose is None:
         raise InvalidValue(
             f"the images of {asked} do not show one place: {evidence}. If you know that they do, give the "
@@ -93,22 +95,12 @@ def _by_person(pose: Pose2) -> PoseGaussian:
     return PoseGaussian.from_sigmas(pose, MOST_SIGMA_XY, MOST_SIGMA_HEADING)
 
 
-def _agree(one: PoseGaussian, other: PoseGaussian, s: ConsistencySettings) -> bool:
-    return _distance2(one, other, s) < s.gate
-
-
-def _distance2(one: PoseGaussian, other: PoseGaussian, s: ConsistencySettings) -> float:
-    """Squared Mahalanobis distance of two estimates of one pose, 3 degrees of freedom."""
-    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
-    return PoseGaussian(one.mean, one.covariance + other.covariance + floor).mahalanobis2(other.mean)
-
-
 def _check_geometry(merged: MergedMap, linked: Linked, s: ConsistencySettings) -> None:
     """Refuse a link that the optimised poses contradict."""
     relative = merged.relative(linked.a, linked.b)
     if relative is None:
         return
-    distance2 = _distance2(linked.a_from_b, relative, s)
+    distance2 = distance2_of(linked.a_from_b, relative, s)
     if distance2 < s.gate:
         return
     assert linked.pose is not None
@@ -187,6 +179,10 @@ def _check_exclusion(merged: MergedMap, linked: Linked, settings: MergeSettings)
     for (first, second), clash in refutation.clashes([solver.graph_of(linked.a)]):
         if any(first in graph.rows and second not in graph.rows for graph in graphs):
             raise InvalidValue(f"{linked} cannot be linked: {clash.reason}")
+
+
+def _landmarks(link: Link) -> str:
+    return f"{int(link.evidence.get('inliers', 0.0))} landmarks"
 
 
 def _words(pose: Pose2) -> str:

@@ -14,7 +14,6 @@ Links by hand join pieces before all others, and never fall. What contradicts th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
@@ -27,7 +26,6 @@ from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
-from mapweave.merge.outlier_rejection.link_probability import standpoints
 from mapweave.merge.outlier_rejection.readmission import readmitted
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
@@ -35,7 +33,7 @@ from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
-from mapweave.merge.settings import ConsistencySettings, MergeSettings
+from mapweave.merge.settings import MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
 
 
@@ -150,7 +148,7 @@ def decide(
         tuple(frozenset(graph.nodes) for graph in solved),
         Poses(solved),
         tuple(solved),
-        contradicted=_contradicted(solved, list(by_hand.values()), s.consistency) | contradicted,
+        contradicted=contradicted,
     )
     return merged, StandingDecisions(
         given,
@@ -164,20 +162,6 @@ def decide(
         len(given) if before is None else standing.size,
         0 if before is None else standing.changed + len(news),
     )
-
-
-def _contradicted(
-    solved: Sequence[PoseGraph], by_hand: Sequence[Link], s: ConsistencySettings
-) -> dict[Pair, str]:
-    """Links by hand that the rest of the map puts elsewhere, and where."""
-    out = {}
-    for graph in solved if by_hand else ():
-        inside = [link for link in by_hand if link.a in graph.rows]
-        for link, standpoint in zip(inside, standpoints(inside, graph, kept=True), strict=True):
-            if standpoint.distance2 > s.gate:
-                sigmas = math.sqrt(standpoint.distance2)
-                out[link.pair] = f"the rest of the map contradicts it by {sigmas:.1f} standard deviations"
-    return out
 
 
 def _joined(

@@ -79,8 +79,11 @@ class MapFile:
         constraints: manual constraints, in order.
         superseded: of a merged map: superseded nodes.
         faded: of a merged map: (N,) which of a node's N landmarks are faded.
+        retired: of a merged map: retired nodes, and which of the constraints retires each, from 0; of retired
+            maps none.
         history: of a merged map: what has become of its maps by itself, in order.
         annotations: what people say about the map, in order.
+        images: PNG files of floor plans, by their SHA-256.
     """
 
     kind: Kind
@@ -93,9 +96,13 @@ class MapFile:
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     history: tuple[MapEvent, ...] = ()
     annotations: tuple[Annotation, ...] = ()
+    retired: Mapping[NodeId, Number] = field(default_factory=dict)
+    images: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse faded landmarks that the nodes do not have (InvalidValue)."""
+        """Refuse faded landmarks that the nodes do not have, and unknown constraints (InvalidValue)."""
+        if any(number >= len(self.constraints) for number in self.retired.values()):
+            raise InvalidValue("a node is retired by a constraint that is not there")
         if not self.faded:
             return
         sizes = {body.node.id: len(body.node.landmarks) for body in self.changes if isinstance(body, NodePut)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import http.client
 import json
 import shutil
@@ -39,7 +40,13 @@ class Browser:
         try:
             eventually(self._ready)
             options = {"binary": shutil.which("chromium"), "args": [*FLAGS, f"--user-data-dir={folder}"]}
-            wanted = {"alwaysMatch": {"browserName": "chrome", "goog:chromeOptions": options}}
+            wanted = {
+                "alwaysMatch": {
+                    "browserName": "chrome",
+                    "goog:chromeOptions": options,
+                    "goog:loggingPrefs": {"browser": "ALL"},
+                }
+            }
             self._session = f"/session/{self._ask('POST', '/session', {'capabilities': wanted})['sessionId']}"
         except BaseException:
             self._end()
@@ -66,6 +73,30 @@ class Browser:
     def run(self, script: str) -> Any:
         """What a function body in JavaScript returns."""
         return self._ask("POST", f"{self._session}/execute/sync", {"script": script, "args": []})
+
+    def devtools(self, command: str, **parameters: object) -> Any:
+        """What a command of the Chrome DevTools protocol returns."""
+        body = {"cmd": command, "params": parameters}
+        return self._ask("POST", f"{self._session}/goog/cdp/execute", body)
+
+    def look(self, width: int, height: int, scheme: str = "light", mobile: bool = False) -> None:
+        """Show pages in a window of some size, px, light or dark, or on a phone."""
+        self.devtools(
+            "Emulation.setDeviceMetricsOverride",
+            width=width, height=height, deviceScaleFactor=2 if mobile else 1, mobile=mobile,
+        )  # fmt: skip
+        self.devtools("Emulation.setTouchEmulationEnabled", enabled=mobile)
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self.devtools("Emulation.setEmulatedMedia", features=features)
+
+    def screenshot(self, path: Path) -> None:
+        """Write what is seen into a PNG file."""
+        path.write_bytes(base64.b64decode(self._ask("GET", f"{self._session}/screenshot")))
+
+    def errors(self) -> list[str]:
+        """What the page has complained of since the last call."""
+        entries = self._ask("POST", f"{self._session}/se/log", {"type": "browser"})
+        return [entry["message"] for entry in entries if entry["level"] == "SEVERE"]
 
     def _ready(self) -> bool:
         try:

@@ -37,12 +37,16 @@ EXACT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-10)
 
 
 class Lens:
-    """Maps pixels of the real image to pixels of the ideal pinhole camera and back."""
+    """Maps pixels of the real image to pixels of the ideal pinhole camera and back.
+
+    Attributes:
+        camera: the ideal one.
+    """
 
     def __init__(self, camera: Camera, distortion: Distortion = NO_DISTORTION) -> None:
         """Take the ideal camera's intrinsics and the lens."""
         self._matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        self._camera = camera
+        self.camera = camera
         self._fisheye = distortion if isinstance(distortion, Equidistant) else None
         self._distortion = np.array([0.0] if isinstance(distortion, Equidistant) else distortion)
         self._maps: Any = None
@@ -54,7 +58,7 @@ class Lens:
         if self._ideal or not len(raw):
             return raw.copy()
         if self._fisheye is not None:
-            c = self._camera
+            c = self.camera
             return np.asarray(self._fisheye.rays(raw) * [c.fx, c.fy] + [c.cx, c.cy])
         out = cv2.undistortPoints(
             raw[:, None], self._matrix, self._distortion, P=self._matrix, criteria=EXACT
@@ -88,7 +92,7 @@ class Lens:
         if self._fisheye is None:
             return image
         if self._maps is None:
-            width, height = self._camera.width, self._camera.height
+            width, height = self.camera.width, self.camera.height
             pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
             at = self.distort(pixels).astype(np.float32).reshape(height, width, 2)
             self._maps = cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)

@@ -101,34 +101,42 @@ class Sift:
 
     def describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]:
         """The same before they are coded: keypoints, strongest first, and (N, 128) SIFT."""
-        keypoints = self._detector.detect(image, None)
-        keypoints = self._spread(self._trackable(list(keypoints), image), image.shape[1], image.shape[0])
-        if not keypoints:
+        # In one call: descriptors of those that are left out cost less than a second image pyramid.
+        found, descriptors = self._detector.detectAndCompute(image, None)
+        if not found:
             return [], np.zeros((0, 128), np.float32)
-        keypoints, descriptors = self._detector.compute(image, keypoints)
-        return keypoints, np.asarray(descriptors, np.float32)
+        kept = self._spread(found, self._trackable(found, image), image.shape[1], image.shape[0])
+        return [found[k] for k in kept], np.asarray(descriptors, np.float32)[kept]
 
-    def _trackable(self, keypoints: list[cv2.KeyPoint], image: NDArray[np.uint8]) -> list[cv2.KeyPoint]:
-        """Those that are held in both directions by the image around them (Shi and Tomasi 1994)."""
-        if not keypoints:
-            return []
+    def _trackable(self, keypoints: Sequence[cv2.KeyPoint], image: NDArray[np.uint8]) -> list[int]:
+        """Numbers of those that the image around them holds in both directions (Shi and Tomasi 1994)."""
         smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
-        # OpenCV sums (2 * gradient / block)^2 over the block: four times the mean.
-        strengths = cv2.cornerEigenValsAndVecs(smooth, TEXTURE_BLOCK_PX, ksize=3)[..., :2] / 4.0
         at = np.array([k.pt for k in keypoints]).round().astype(int)
-        strong, weak = strengths[at[:, 1], at[:, 0]].T
+        # The structure tensor of the whole image, and its eigenvalues at the keypoints alone.
+        scale = 0.25 / TEXTURE_BLOCK_PX
+        x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=scale)
+        y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=scale)
+        size = (TEXTURE_BLOCK_PX, TEXTURE_BLOCK_PX)
+        xx, xy, yy = (
+            cv2.boxFilter(product, cv2.CV_32F, size, normalize=False)[at[:, 1], at[:, 0]].astype(float) / 4.0
+            for product in (x * x, x * y, y * y)
+        )
+        middle, half = (xx + yy) / 2.0, np.hypot((xx - yy) / 2.0, xy)
+        weak, strong = middle - half, middle + half
         enough = (weak >= LEAST_TEXTURE) & (weak >= LEAST_ROUNDNESS * strong)
-        return [k for k, good in zip(keypoints, enough.tolist(), strict=True) if good]
+        return [int(k) for k in np.flatnonzero(enough)]
 
-    def _spread(self, keypoints: list[cv2.KeyPoint], width: int, height: int) -> list[cv2.KeyPoint]:
+    def _spread(
+        self, keypoints: Sequence[cv2.KeyPoint], chosen: Sequence[int], width: int, height: int
+    ) -> list[int]:
         """Strongest first, one a place (SIFT repeats a place for each orientation), no cell crowded."""
         s = self._settings
         quota = int(np.ceil(CROWDING * s.most / CELLS**2))
         taken: dict[tuple[int, int], int] = {}
         places: set[tuple[int, int]] = set()
-        kept: list[cv2.KeyPoint] = []
-        for k in sorted(keypoints, key=lambda k: (-k.response, k.pt)):
-            x, y = k.pt
+        kept: list[int] = []
+        for k in sorted(chosen, key=lambda k: (-keypoints[k].response, keypoints[k].pt)):
+            x, y = keypoints[k].pt
             if not (BORDER_PX <= x < width - BORDER_PX and BORDER_PX <= y < height - BORDER_PX):
                 continue
             place = (round(x), round(y))

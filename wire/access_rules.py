@@ -14,10 +14,11 @@ from mapweave.wire.keys import Keys
 
 ASKS = (
     "relocalize", "route", "known", "reserve", "mission", "missions", "robots", "map", "explain", "constrain",
-    "annotate", "annotations", "resolve", "history", "status",
+    "constraints", "annotate", "annotations", "resolve", "plans", "plan_image", "put_plan_image", "history",
+    "status",
 )  # fmt: skip
 """Every question to a server, by the last part of its key."""
-COMMANDS = frozenset({"constrain", "annotate", "mission"})
+COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})
 """Those that change something."""
 WATCHES = ("liveliness_query", "declare_liveliness_subscriber")
 OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve", "status"})

@@ -46,6 +46,8 @@ class BusSettings:
         listen: where a router waits for clients.
         session: id of the Zenoh session, hexadecimal; empty for a random one.
         timestamps: whether what is published gets a time, without which nothing is kept for late subscribers.
+        attempt: of a client to open a connection, s: so long a host that does not answer holds up the next
+            endpoint, and the end of the process. Zenoh's own default is 10.
         credentials: prove who this is; None on this machine alone.
         access: who is admitted by a router, and to what; None: all clients to everything.
         fleet: of the rules of `access`.
@@ -56,6 +58,7 @@ class BusSettings:
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     session: str = ""
     timestamps: bool = False
+    attempt: float = 10.0
     credentials: Credentials | None = None
     access: Access | None = None
     fleet: str = "demo"

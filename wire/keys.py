@@ -10,7 +10,8 @@
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain,
-                                                      constraints, annotate, annotations, resolve and history
+                                                      constraints, annotate, annotations, resolve, history,
+                                                      plans, plan_image and put_plan_image
     mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
@@ -232,6 +233,30 @@ class Keys:
     def any_resolve(self) -> str:
         """Pattern: every server of the fleet."""
         return f"{self.root}/server/*/resolve"
+
+    def plans(self, server: str) -> str:
+        """Floor plans under the merged map, from a server."""
+        return self._of_server("plans", server)
+
+    def any_plans(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/plans"
+
+    def plan_image(self, server: str) -> str:
+        """Images of floor plans, from a server."""
+        return self._of_server("plan_image", server)
+
+    def any_plan_image(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/plan_image"
+
+    def put_plan_image(self, server: str) -> str:
+        """Images of floor plans to a server."""
+        return self._of_server("put_plan_image", server)
+
+    def any_put_plan_image(self) -> str:
+        """Pattern: every server of the fleet."""
+        return f"{self.root}/server/*/put_plan_image"
 
     def constraints(self, server: str) -> str:
         """The record of manual constraints of a server."""

@@ -15,6 +15,7 @@ from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
+from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanPiece, PlanReceived
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
@@ -53,6 +54,8 @@ class KeptHistory:
         apart: pairs of maps that are reported as kept apart.
         set_apart: maps that are reported as set apart.
         contradicted: links by hand that are reported as contradicted.
+        frames: pins that are reported as not holding their component's frame, with the node of the older pin
+            that does; a pin whose node is not in the merged map with its own.
     """
 
     events: tuple[MapEvent, ...] = ()
@@ -60,6 +63,7 @@ class KeptHistory:
     apart: frozenset[tuple[MapId, MapId]] = frozenset()
     set_apart: frozenset[MapId] = frozenset()
     contradicted: frozenset[tuple[NodeId, NodeId]] = frozenset()
+    frames: frozenset[tuple[NodeId, NodeId]] = frozenset()
 
 
 VIEW = Limit("view", MAX_LANDMARKS_BYTES + 256)
@@ -93,6 +97,9 @@ LIMITS: dict[type, Limit] = {
     MissionReport: Limit("mission report", 2**15),
     MissionRequest: Limit("mission request", 2048),
     Missions: Limit("missions", 2**22, 50_000),
+    PlacedPlans: Limit("plans", 2**24, 1_000_000),
+    PlanPiece: Limit("piece of a plan", PIECE + 1024),
+    PlanReceived: Limit("plan image", 2048),
     KeptHistory: Limit("history", 2**26, 2_000_000),
 }
 """Kinds of messages."""

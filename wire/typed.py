@@ -4,8 +4,8 @@
 value. `msgspec.convert` checks every type and range; a value checks what else it requires when it is created.
 
 Some types have their own form, see docs/wire.md: poses are 36 bytes, a node is the body of its change, an
-array is `[kind, shape, bytes]`, a map with node ids as keys is a list of pairs. Of dataclasses that represent
-each other (`A | B`) each has a `TAG`, which travels as the field `kind`.
+array is `[kind, shape, bytes]`, a map with node ids as keys is a list of pairs. Where a value may be one of
+several dataclasses (`A | B`), each has a `TAG`, which travels as the field `kind`.
 """
 
 from __future__ import annotations

@@ -38,6 +38,7 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         # With Zenoh's own 100 and 10 s, a hundred idle connections keep all others out for 10 s.
         "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT * 1e3),
+        "transport/unicast/open_timeout": round(settings.attempt * 1e3),
         "transport/link/tx/lease": round(LEASE * 1e3),
         "transport/link/tx/queue/size/data": ROUTER_QUEUE if settings.mode == "router" else 2,
         "transport/shared_memory/enabled": False,

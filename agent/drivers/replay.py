@@ -100,7 +100,9 @@ class Replay:
             before, self._before = frame if self._before is None else self._before, frame
             forward, turn = self.recording.increments[before + 1 : frame + 1].sum(axis=0)
             stamp_ns = int(self.recording.stamps_ns[frame])
-            return Observation(stamp_ns, Odometry(float(forward), float(turn)), image)
+            flags = self.recording.kidnapped
+            kidnapped = flags is not None and bool(flags[min(before + 1, frame) : frame + 1].any())
+            return Observation(stamp_ns, Odometry(float(forward), float(turn)), image, kidnapped=kidnapped)
         if self._before is None:
             raise DeviceError(self._unreadable[0])
         return None

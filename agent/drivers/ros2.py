@@ -22,7 +22,7 @@ from mapweave.agent.drivers.wheeled import STALE, WheeledRobot
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.images import grey_of
-from mapweave.agent.ros_messages.values import BASE, CAMERA_TYPE, IMAGE_TYPES, camera_of
+from mapweave.agent.ros_messages.values import BASE, CAMERA_TYPE, IMAGE_TYPES, KIDNAP_TYPE, camera_of
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, SettingsError
 from mapweave.storage.settings_file import build
 from mapweave.wire.ros2.messages import encode, make
@@ -36,7 +36,6 @@ KNOWN = Geometry(max_forward=0.2, max_turn=0.8)
 """Slow enough for all common robots; a TurtleBot 3 Burger drives 0.22 m/s."""
 PATIENCE = 1.0
 """s that a first message of each topic is waited for, in each attempt to begin."""
-KIDNAP_TYPE = "irobot_create_msgs/msg/KidnapStatus"
 HAZARDS_TYPE = "irobot_create_msgs/msg/HazardDetectionVector"
 BATTERY_TYPE = "sensor_msgs/msg/BatteryState"
 BUMP, STALL = 1, 3

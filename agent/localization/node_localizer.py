@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.ekf.landmark_estimates import NodeLandmarks
 from mapweave.agent.ekf.localization_filter import LocalizationFilter
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
@@ -61,6 +62,11 @@ class NodeLocalizer:
     def pixels(self) -> Array:
         """(N, 2) px, where they are seen."""
         return self._tracks.pixels
+
+    @property
+    def landmarks(self) -> NodeLandmarks:
+        """The landmarks that are followed, as they are known now, in the node's robot frame."""
+        return self._filter.landmarks_in_node()
 
     @property
     def in_sight(self) -> bool:

@@ -51,6 +51,8 @@ class Stage(StrEnum):
     GIVEN_UP = "gave up its goal"
 
 
+UNDERWAY = (RouteProgress.DRIVING, RouteProgress.PARKING)
+
 RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
 """Edges between places that look alike, which no robot need have driven. A robot without proximity sensors
 avoids those that are longer than its radius."""
@@ -64,8 +66,8 @@ REFUSED = 20.0
 """A fleet that answers for so long that there is no way is believed, s: it may first have to merge."""
 YIELDED = 30.0
 """How long it waits for another robot before it looks for another way, s."""
-THERE = 0.3
-"""It has stepped aside within this distance of the node, m."""
+THERE = 0.05
+"""It has stepped aside within this distance of the node, m: others pass with a margin of 0.1 m."""
 TRUSTED = 1.0
 """After a block it still knows where it is if it has driven less than this blindly, m."""
 
@@ -297,7 +299,7 @@ class Navigator:
                 return
             if self._touched:
                 follower.progress = RouteProgress.BLOCKED
-            if follower.progress not in (RouteProgress.DRIVING, RouteProgress.PARKING):
+            if follower.progress not in UNDERWAY:
                 break
             yield command
         self._following = False
@@ -356,7 +358,7 @@ class Navigator:
             return
         follower = self._follower(route, fix)
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
-        while follower.to_goal > THERE and follower.progress is RouteProgress.DRIVING:
+        while follower.to_goal > THERE and follower.progress in UNDERWAY:
             if not (yield from self._let_pass(right_of_way, follower)):
                 return
             command = follower.step(self._motion.observation)

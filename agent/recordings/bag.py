@@ -6,6 +6,7 @@ import math
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import (
     CAMERA_TYPE,
     IMAGE_TYPES,
+    KIDNAP_TYPE,
     ODOMETRY_TYPE,
     TF_TYPE,
     FixedTransforms,
@@ -141,9 +143,10 @@ class WholeBag:
             Exception: whatever a damaged file leads to.
         """
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
 
-        self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        from mapweave.wire.ros2.messages import typestore
+
+        self._reader = AnyReader([path], default_typestore=typestore())
         self._reader.open()
         weakref.finalize(owner, self._reader.close)
         self.topics: dict[str, tuple[str, int]] = {}
@@ -213,7 +216,11 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
     else:
         message, lost = f"{NO_ODOMETRY}; topics: {_names(opened.topics)}", tuple(opened.damage)
         raise without_odometry(path, kind, camera, distortion, images, message, tuple(notes), lost)
-    return assembled(path, kind, camera, distortion, images, odometry, tuple(notes), tuple(opened.damage))
+    whole = assembled(path, kind, camera, distortion, images, odometry, tuple(notes), tuple(opened.damage))
+    kidnapped = _kidnapped(opened, whole.stamps_ns)
+    begins = int(np.diff(kidnapped, prepend=False)[kidnapped].sum())
+    lifted = (f"the robot was lifted {begins} times",) if begins else ()
+    return replace(whole, kidnapped=kidnapped, notes=(*whole.notes, *lifted), damage=tuple(opened.damage))
 
 
 def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, option: str) -> Topic:
@@ -264,6 +271,23 @@ def _poses(opened: Bag, topic: str) -> StampedPoses:
         why = f" ({opened.damage[-1]})" if opened.damage else ""
         raise DeviceError(f"{opened.path}: {topic} has {int(kept.sum())} poses; there must be two{why}")
     return StampedPoses(stamps[kept], poses[kept])
+
+
+def _kidnapped(opened: Bag, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(N,) whether the robot was lifted at an image, or shortly before it and at no image.
+
+    A base says it when it changes, or at a rate of its own: it holds until the next message.
+    """
+    kidnapped = np.zeros(len(stamps_ns), np.bool_)
+    for topic in opened.topics:
+        if topic.kind != KIDNAP_TYPE:
+            continue
+        said = [(stamp, bool(message.is_kidnapped)) for stamp, message in opened.messages(topic.name)]
+        for (begin, lifted), (end, _) in pairwise([*said, (stamps_ns[-1] + 1, False)]):
+            if lifted:
+                first, last = np.searchsorted(stamps_ns, (begin, end))
+                kidnapped[first : max(last, first + 1)] = True
+    return kidnapped
 
 
 def _camera(

@@ -39,9 +39,11 @@ class DamagedBag:
         """
         from rosbags.typesys import Stores, get_typestore
 
+        from mapweave.wire.ros2.messages import typestore
+
         self._path = path
         self._items, ros1 = _format_of(path)
-        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+        store = get_typestore(Stores.ROS1_NOETIC) if ros1 else typestore()
         self._decode: Callable[[bytes, str], Any] = store.deserialize_ros1 if ros1 else store.deserialize_cdr
         topics: dict[int, tuple[str, str]] = {}
         counts: Counter[int] = Counter()

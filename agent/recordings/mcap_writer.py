@@ -17,6 +17,7 @@ import numpy as np
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.values import FOOTPRINT as BASE
+from mapweave.agent.ros_messages.values import KIDNAP_TYPE
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.equidistant import Equidistant
@@ -51,7 +52,8 @@ def check_new(folder: Path) -> None:
 class McapWriter:
     """Writes a robot's observations and commands, in a thread of its own.
 
-    Topics: /camera/image/compressed, /camera/camera_info, /odom, /tf_static, /cmd_vel, /bumper, /proximity/N.
+    Topics: /camera/image/compressed, /camera/camera_info, /odom, /tf_static, /cmd_vel, /bumper,
+    /kidnap_status (when it changes), /proximity/N.
     """
 
     def __init__(
@@ -141,11 +143,13 @@ class _Part:
 
     def __init__(self, path: Path, description: RobotDescription, begun_ns: int, lossless: bool) -> None:
         from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
+
+        from mapweave.wire.ros2.messages import typestore
 
         self.begun_ns = self._flushed_ns = begun_ns
         self._lossless = lossless
-        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._kidnapped: bool | None = None
+        self._store = typestore()
         self._types = self._store.types
         self._header, self._pose, self._twist = (
             partial(function, self._make) for function in (making.header, making.pose, making.twist)
@@ -181,6 +185,10 @@ class _Part:
         self._put("/cmd_vel", name, stamp, header=self._header(stamp, BASE), twist=self._twist(command))
         if observation.bumped:
             self._put("/bumper", "std_msgs/msg/Bool", stamp, data=True)
+        if observation.kidnapped != self._kidnapped:
+            self._kidnapped = observation.kidnapped
+            header = self._header(stamp, BASE)
+            self._put("/kidnap_status", KIDNAP_TYPE, stamp, header=header, is_kidnapped=self._kidnapped)
         d = self._description
         for k, (distance, _) in enumerate(zip(observation.proximity, d.ranger_bearings, strict=True)):
             self._put(

@@ -40,6 +40,7 @@ class Recording:
         increments: (N, 2) way of the middle of the axle, m, and turn, rad, since the image before.
         notes: what was guessed or left out, a line each.
         damage: what cannot be read of it, a line each; what comes before is used.
+        kidnapped: (N,) whether the robot was lifted since the image before; None if the format does not say.
     """
 
     path: Path
@@ -51,6 +52,7 @@ class Recording:
     increments: Array
     notes: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
+    kidnapped: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         """How many images there are."""
@@ -64,10 +66,12 @@ class Images:
     Attributes:
         stamps_ns: (N,) ascending.
         read: gives an image by its number, (H, W) grey.
+        damage: what follows and cannot be read, in one line; empty if nothing does.
     """
 
     stamps_ns: Stamps
     read: Callable[[int], NDArray[np.uint8]]
+    damage: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +167,7 @@ def assembled(
         DeviceError: they do not fit together.
     """
     stamps, read = images.stamps_ns, images.read
+    damage = (images.damage, *damage) if images.damage else damage
     if len(stamps) < 2:
         raise DeviceError(f"{path}: {len(stamps)} images are no drive")
     if (np.diff(stamps) <= 0).any():

@@ -19,6 +19,8 @@ SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 
 INDEXED = {".mp4", ".mov", ".m4v"}
 """Their index stands at the end."""
+OTHER_TRACK = 1.0
+"""An AVI says how many frames it has; others how long they are, to which sound may add this, s."""
 
 
 def video(path: Path, options: RecordingOptions) -> Recording:
@@ -50,11 +52,28 @@ def video_images(path: Path) -> Images:
     if len(stamps) < 2:
         lost = "; an MP4 that was cut off has lost its index" if path.suffix.lower() in INDEXED else ""
         raise DeviceError(f"{path}: no video that can be read{lost}")
+    damage = _cut_off(path, capture, len(stamps), stamps[-1] * 1e-9)
     if not all(before < after for before, after in itertools.pairwise(stamps)):
         # Some containers give no stamps for each frame.
         rate = capture.get(cv2.CAP_PROP_FPS)
         stamps = [round(1e9 * k / (rate if rate > 0 else 30.0)) for k in range(len(stamps))]
-    return Images(np.array(stamps, np.int64), _sequential(path))
+    return Images(np.array(stamps, np.int64), _sequential(path), damage)
+
+
+def _cut_off(path: Path, capture: cv2.VideoCapture, frames: int, last_s: float) -> str:
+    """What a video lacks of what its header says, in one line; empty if nothing.
+
+    Stamps are compared, not counts: a recorder may skip frames and leave their places empty.
+    """
+    rate, stated = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    with path.open("rb") as file:
+        kind, size = file.read(4), int.from_bytes(file.read(4), "little")
+    avi = kind == b"RIFF"
+    if avi and not 0 < size <= path.stat().st_size - 8:
+        return f"{path}: cut off after {frames} frames, {last_s:.1f} s: the file ends before its index"
+    if rate > 0.0 and stated / rate - (last_s + 1.0 / rate) > (0.5 / rate if avi else OTHER_TRACK):
+        return f"{path}: cut off after {frames} frames, {last_s:.1f} s: its header says {stated / rate:.1f} s"
+    return ""
 
 
 def _sequential(path: Path) -> Callable[[int], NDArray[np.uint8]]:

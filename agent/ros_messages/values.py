@@ -23,6 +23,7 @@ LENS_MODELS = {
 ODOMETRY_TYPE, CAMERA_TYPE, TF_TYPE = (
     "nav_msgs/msg/Odometry", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage",
 )  # fmt: skip
+KIDNAP_TYPE = "irobot_create_msgs/msg/KidnapStatus"
 IMAGE_TYPES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 FOOTPRINT, BASE = BASES = ("base_footprint", "base_link")
 """Frames of a robot on the floor, and above it (REP 105)."""

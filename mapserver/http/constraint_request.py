@@ -83,7 +83,7 @@ def read_request(body: bytes, by: str, now_ns: int, record: Sequence[ManualConst
     ]
     if len(given) + numbered != 1:
         raise InvalidValue(f"give one of {ONE}")
-    about = _numbered(asked.undo, record) if numbered else _subject(asked)
+    about = _numbered(asked.undo, record) if numbered else _subject(asked, now_ns)
     constraint = ManualConstraint(about, asked.undo is False, asked.by or by, now_ns, asked.because)
     return ConstraintRequest(constraint, asked.check)
 
@@ -94,7 +94,7 @@ def _numbered(number: int, record: Sequence[ManualConstraint]) -> Subject:
     return record[number - 1].about
 
 
-def _subject(asked: _Body) -> Subject:
+def _subject(asked: _Body, now_ns: int) -> Subject:
     if asked.link is not None:
         a, b = map(NodeId.parse, asked.link)
         return Linked(a, b, None if asked.pose is None else read_pose(asked.pose))
@@ -106,5 +106,5 @@ def _subject(asked: _Body) -> Subject:
         which = read_retired([asked.window.map])
         if not isinstance(which, RetiredMap):
             raise InvalidValue(f"{asked.window.map} is no map")
-        return read_window(which.map, asked.window.begin, asked.window.end)
+        return read_window(which.map, asked.window.begin, asked.window.end, now_ns)
     return read_retired(asked.retire or ())

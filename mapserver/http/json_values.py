@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, event_words
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -17,8 +18,8 @@ from mapweave.wire.typed import Packers, packed
 
 def json_values(value: Any) -> dict[str, Any]:
     """What `json.dumps` takes: the fields of a value by name."""
-    fields: dict[str, Any] = packed(value, AS_JSON)
-    return fields
+    values: dict[str, Any] = packed(value, AS_JSON)
+    return values
 
 
 def constraint_values(record: ManualConstraints) -> dict[str, Any]:
@@ -29,7 +30,6 @@ def constraint_values(record: ManualConstraints) -> dict[str, Any]:
             {
                 "number": number,
                 "in_force": constraint in holding,
-                "words": event_words(constraint),
                 "time": time_of(constraint.stamp_ns),
                 **json_values(constraint),
             }
@@ -78,7 +78,13 @@ def _event(event: MapEvent) -> dict[str, Any]:
     }
 
 
+def _constraint(constraint: ManualConstraint) -> dict[str, Any]:
+    values = {field.name: packed(getattr(constraint, field.name), AS_JSON) for field in fields(constraint)}
+    return {**values, "words": event_words(constraint)}
+
+
 AS_JSON: Packers = {
+    ManualConstraint: _constraint,
     MapId: str,
     NodeId: str,
     Pose2: lambda pose: pose.vector.tolist(),

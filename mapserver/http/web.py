@@ -13,6 +13,8 @@
     GET /map          the merged map, a map file
     GET /annotations  what people say about the map: named places and so on, JSON
     POST /annotations JSON: adds an annotation, or withdraws one
+    GET /plans        floor plans, and where they lie under the merged map, JSON; /plans/NAME.png is the image
+    POST /plans       an image: keeps it for a plan that an annotation adds; JSON: its name and size
     GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
@@ -26,7 +28,6 @@ Retry-After in whole seconds and `retry_after` exactly. The pages are in `static
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
 import math
 import time
@@ -59,7 +60,8 @@ from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.live import Live
 from mapweave.mapserver.http.node_details import node_details
-from mapweave.mapserver.http.same_site import SameSite
+from mapweave.mapserver.http.plans import plan_routes
+from mapweave.mapserver.http.same_site import SameSite, is_loopback
 from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
 
 log = logging.getLogger(__name__)
@@ -75,14 +77,14 @@ MOST_AT_ONCE = 32
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
-METHODS = (
-    dict.fromkeys(
-        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map", "/nodes/NODE"),
-        "GET",
-    )
-    | dict.fromkeys(("/constraints", "/annotations"), "GET or POST")
-    | dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST")
-)
+METHODS = {
+    **dict.fromkeys(
+        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+    ),
+    **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png"), "GET"),
+    **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
+    **dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST"),
+}
 BY = "http"
 """Gives a mission, if the request does not say."""
 
@@ -199,6 +201,7 @@ class Questions:
             WebSocketRoute("/live", Live(server, self._may_command).serve),
             *(Route(path, self._answering(answer)) for path, answer in answering.items()),
             Route("/annotations", self._answering(self._annotations), methods=["GET", "POST"]),
+            *plan_routes(server, self._answering, self._command_body),
             Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
             Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
             Route("/stop", self._answering(self._stop), methods=["POST"]),
@@ -255,8 +258,7 @@ class Questions:
     async def _annotations(self, request: Request) -> Mapping[str, Any]:
         if request.method != "POST":
             return await run_in_threadpool(annotations_json, self._server)
-        self._check_commands(request)
-        body = await self._body(request, "JSON")
+        body = await self._command_body(request, "JSON")
         return await run_in_threadpool(annotate, self._server, body, request.query_params.get("by", BY))
 
     async def _node(self, request: Request) -> Mapping[str, Any]:
@@ -298,14 +300,17 @@ class Questions:
             return await run_in_threadpool(
                 lambda: constraint_values(ManualConstraints(self._server.constraints().made))
             )
-        self._check_commands(request)
-        body = await self._body(request, "JSON")
+        body = await self._command_body(request, "JSON")
 
         def constrain() -> Mapping[str, Any]:
             record = self._server.constraints().made
             return {"said": self._server.constrain(read_request(body, BY, time.time_ns(), record))}
 
         return await run_in_threadpool(constrain)
+
+    async def _command_body(self, request: Request, what: str = "a JPEG or PNG image") -> bytes:
+        self._check_commands(request)
+        return await self._body(request, what)
 
     def _may_command(self, host: str) -> bool:
         return self._commands or is_loopback(host)
@@ -368,14 +373,6 @@ def _length(request: Request, what: str) -> int:
     if int(text) == 0:
         raise InvalidValue(f"send {what} as the body")
     return int(text)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is of this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _page(name: str) -> Callable[[Request], Awaitable[Response]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -11,21 +11,24 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
 from mapweave.merge.pose_graph.verdicts import Verdicts
 from mapweave.merge.settings import MergeSettings
 
 
 class MergePipeline:
-    """The merge, superseding of nodes and removal of landmarks."""
+    """The merge, pinned frames, superseding of nodes and removal of landmarks."""
 
     def __init__(self, settings: MergeSettings, reaches: ReachabilityCache) -> None:
         """Nothing is merged yet."""
         self._islands = Islands(settings)
+        self._frames = PinnedFrames()
         self._superseder = NodeSuperseder(reaches)
         self._remover = LandmarkRemover()
 
@@ -35,13 +38,14 @@ class MergePipeline:
         verdicts: Verdicts,
         touched: set[MapId],
         constraints: ManualConstraints,
+        pins: Sequence[Pin] = (),
     ) -> MergedMap:
-        """See `Islands.merge`.
+        """See `Islands.merge`; components are where pins hold them, oldest first.
 
         Raises:
             InvalidValue: a node's pose is out of the range of messages.
         """
-        merged = self._islands.merge(maps, verdicts, touched, constraints)
+        merged = self._frames.moved(self._islands.merge(maps, verdicts, touched, constraints), pins)
         for graph in merged.graphs:
             # Written so that NaN fails.
             if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():

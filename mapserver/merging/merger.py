@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
@@ -11,6 +11,7 @@ from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
@@ -24,6 +25,7 @@ from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap, WrongGeometry
+from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
 from mapweave.merge.pose_graph.verdicts import MapPair, Verdict, Verdicts
 from mapweave.merge.retired_nodes import retired_nodes
 from mapweave.merge.settings import MergeSettings
@@ -66,6 +68,7 @@ class Merger:
         self._touched: set[MapId] = set()
         self._changed: set[MapId] = set()
         self._constraints = ManualConstraints()
+        self._pins: tuple[Pin, ...] = ()
         self._merged = MergedMap.empty()
         self._dirty = False
 
@@ -160,6 +163,12 @@ class Merger:
         self._stale |= self._verdicts.at(self.maps.keys())
         self._dirty = True
 
+    def pin(self, pins: Sequence[Pin]) -> None:
+        """Hold the frames of components by exactly these pins from now on, oldest first."""
+        if tuple(pins) != self._pins:
+            self._pins = tuple(pins)
+            self._dirty = True
+
     def suspect(self, maps: Iterable[MapId]) -> None:
         """Maps that another process has set apart: where it is this one or another, it is this one."""
         self._suspects = frozenset(maps)
@@ -216,7 +225,7 @@ class Merger:
         use: Callable[[MergedMap], object] | None,
     ) -> MergedMap:
         kept = {map_id: self._kept[map_id] for map_id in maps}
-        merged = pipeline.merged(kept, verdicts, touched, self._constraints)
+        merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins)
         merged = replace(merged, set_apart=self._isolation.reasons, wrong=self._wrong)
         if use is not None:
             use(merged)
@@ -295,7 +304,7 @@ class Merger:
             inside = {hybrid_map: kept[hybrid_map] for hybrid_map in some}
             return Islands(self.settings).merge(inside, Verdicts(), set(inside), self._constraints)
 
-        return leave_out(sorted(kept), attempt)[0]
+        return PinnedFrames().moved(leave_out(sorted(kept), attempt)[0], self._pins)
 
     def status(self) -> str:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""

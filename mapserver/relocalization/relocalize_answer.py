@@ -74,6 +74,7 @@ def similar_places(verdict: Verdict, least_features: int) -> tuple[SimilarPlace,
             _turn(refusal.node_from_robot),
         )
         for node, refusal in verdict.registration.refusals
+        if refusal.matches
     ]
     ranked = sorted(refused, key=lambda one: (-one.inliers, -one.matches, one.node))
     return tuple([*weak, *ranked][:MOST_SIMILAR])

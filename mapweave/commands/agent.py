@@ -10,21 +10,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import (
-    SOON,
     add_network,
     connect,
     network_of,
+    reach,
     settings_of,
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.connection import SOON
 
 if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
     from mapweave.agent.drivers.settings import RobotSettings
     from mapweave.agent.synchronization import Synchronization
+    from mapweave.settings import NetworkSettings
     from mapweave.wire.bus import Bus
     from mapweave.wire.ros2.settings import Ros2Link
+    from mapweave.wire.zenoh_bus import ZenohBus
 
 
 def add_to(commands: Any) -> None:
@@ -61,12 +64,22 @@ def add_to(commands: Any) -> None:
         help="publish pose, tf, path and map as ROS 2 topics, for rviz and Nav2 (docs/ros2.md), through this "
         "Zenoh router (default: that of the driver ros2, else tcp/127.0.0.1:7447)",
     )  # fmt: skip
+    add_rerun(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
     )
     add_network(parser)
     parser.set_defaults(run=run)
+
+
+def add_rerun(parser: argparse.ArgumentParser) -> None:
+    """Declare the log for the Rerun viewer."""
+    parser.add_argument(
+        "--rerun", nargs="?", const="connect", metavar="FILE|connect",
+        help="show what it senses and estimates in the Rerun viewer: into FILE.rrd, or to the viewer on this "
+        "computer (default), or to that at rerun+http://HOST:PORT/proxy (docs/see-inside.md)",
+    )  # fmt: skip
 
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
@@ -132,6 +145,7 @@ def run(arguments: argparse.Namespace) -> int:
             server=network.server,
             calibration=calibration_of(arguments, name),
             ros2=None if arguments.ros2 is None else ros2_link(arguments, settings.robot),
+            rerun=arguments.rerun,
         )
         agent = settings.agent
         if arguments.without_rangers:
@@ -178,8 +192,10 @@ def ros2_link(arguments: argparse.Namespace, settings: RobotSettings) -> Ros2Lin
 
 
 def print_error(line: str) -> None:
-    """Print a line for people, beside the output proper."""
-    print(line, file=sys.stderr, flush=True)
+    """Print an event for people, with the time, beside the output proper."""
+    from mapweave.terminal import stamped
+
+    print(stamped(line), file=sys.stderr, flush=True)
 
 
 def open_robot(
@@ -208,6 +224,18 @@ def open_robot(
     if lockstep or arguments.body:
         raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
     return find_driver(driver)(settings), FreeRunning()
+
+
+def bus_of(arguments: argparse.Namespace, settings: RobotSettings, network: NetworkSettings) -> ZenohBus:
+    """A connection of a command that needs the network only if the robot's base is behind it.
+
+    Raises:
+        NotConnected: the base is, and there is no router.
+    """
+    from mapweave.agent.drivers.settings import REMOTE
+
+    remote = (arguments.robot or settings.driver) == REMOTE
+    return (reach(network) if remote else connect(network))[0]
 
 
 def close_on(stop: threading.Event, robot: Robot) -> None:

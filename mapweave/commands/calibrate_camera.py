@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.calibrate_target import add_target, size_of, target_of
+from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,7 +26,7 @@ def add_to(actions: Any) -> None:
         description="Calibrate a camera from views of the target of `mapweave calibrate target`: live, with "
         "guidance, until the views suffice; or from a folder of images or a video. The result goes to "
         "[robot.camera] of the robot's settings file.",
-        epilog="Exit status 1: the calibration is not good enough; nothing is written, the output says why.",
+        epilog="Exit status 4: the calibration is not good enough; nothing is written, the output says why.",
     )  # fmt: skip
     parser.add_argument(
         "images", type=Path, nargs="?", help="folder of images or video (default: live from the camera)"
@@ -60,10 +61,9 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Collect views, calibrate, print, write."""
-    from rich.console import Console
-
     from mapweave.agent.drivers.settings_writer import camera_table, write_camera
     from mapweave.hybridmap.errors import InvalidValue, SettingsError
+    from mapweave.terminal import plain_or_terminal
     from mapweave.vision.calibration.camera_calibration import calibrate_camera
     from mapweave.vision.calibration.collection import ViewCollection
     from mapweave.vision.calibration.views import BoardDetector
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     model = None if a.lens is None else LensModel(a.lens)
     collection = ViewCollection(BoardDetector(target_of(a)), model)
-    console = Console(stderr=a.json)
+    console = plain_or_terminal(stderr=a.json)
     source = str(a.source or known.get("source", "0"))
     if a.images is None:
         _live(collection, source, _size(a.size, known), a.http, console)
@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(_report(found, written)))
     for problem in found.problems:
         print(f"mapweave: calibration refused: {problem}", file=sys.stderr)
-    return 1 if found.problems else 0
+    return NO if found.problems else DONE
 
 
 def _size(text: str | None, known: dict[str, object]) -> tuple[int, int]:
@@ -154,20 +154,18 @@ def _live(
 
 def _recorded(collection: ViewCollection, path: Path, console: Console) -> None:
     """Views of a folder's images, or of a video."""
-    from rich.progress import track
-
     from mapweave.agent.recordings.image_folder import images_in
     from mapweave.agent.recordings.video import video_images
     from mapweave.storage.image_file import read_grey
+    from mapweave.terminal import tracked
 
-    quiet = not console.is_terminal
     if not path.exists():
         from mapweave.hybridmap.errors import DeviceError
 
         raise DeviceError(f"{path}: no such folder or video")
     if path.is_dir():
         paths = images_in(path / "images" if (path / "images").is_dir() else path)
-        for image in track(paths, "images", console=console, transient=True, disable=quiet):
+        for image in tracked(paths, "images"):
             view = collection.detector.find(read_grey(image), image.name)
             if view is not None:
                 collection.views.append(view)
@@ -175,7 +173,9 @@ def _recorded(collection: ViewCollection, path: Path, console: Console) -> None:
             console.print(f"{len(collection.views)} of {len(paths)} images show the target", highlight=False)
         return
     images = video_images(path)
-    for k in track(range(len(images.stamps_ns)), "frames", console=console, transient=True, disable=quiet):
+    if images.damage:
+        console.print(images.damage, highlight=False)
+    for k in tracked(range(len(images.stamps_ns)), "frames"):
         collection.see(images.read(k), f"frame {k}")
     if collection.views:
         console.print(f"{len(collection.views)} views in {len(images.stamps_ns)} frames", highlight=False)

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.agent import add_calibration, calibration_of, close_on, open_robot
-from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.agent import add_calibration, bus_of, calibration_of, close_on, open_robot
+from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 from mapweave.commands.replay import add_recording, name_of, options_of
 
 if TYPE_CHECKING:
@@ -53,19 +53,19 @@ def run(arguments: argparse.Namespace) -> int:
 
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import cv2
-    from rich.console import Console
 
     from mapweave.agent.calibration.recorded_drive import calibrate
     from mapweave.agent.recordings.geometry_file import write_geometry
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.processes.agent import measured
+    from mapweave.terminal import plain_or_terminal
 
     if arguments.recording is None and not (arguments.robot and arguments.name):
         raise InvalidValue("give a recording, or --robot DRIVER and --name NAME of a robot")
     cv2.setNumThreads(1)
     name = name_of(arguments)
     file = calibration_of(arguments, name)
-    console = Console(stderr=arguments.json)
+    console = plain_or_terminal(stderr=arguments.json)
     drive = _recorded if arguments.recording is not None else _live
     description, observations = drive(arguments, name, console)
     try:
@@ -89,15 +89,12 @@ def _recorded(
     arguments: argparse.Namespace, name: str, console: Any
 ) -> tuple[RobotDescription, Iterator[Observation]]:
     """A recording."""
-    from rich.progress import track
-
     from mapweave.agent.drivers.replay import Replay
+    from mapweave.terminal import plain_or_terminal, tracked
 
     robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
     observed = iter(robot.sense, None)
-    quiet = not console.is_terminal
-    shown = track(observed, name, total=len(robot), console=console, transient=True, disable=quiet)
-    return robot.describe(), iter(shown)
+    return robot.describe(), tracked(observed, name, len(robot), plain_or_terminal())
 
 
 def _live(
@@ -107,11 +104,12 @@ def _live(
     import threading
 
     from mapweave.agent.drivers.checked import CheckedRobot
+    from mapweave.terminal import Bar
 
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     stop = stop_on_signals()
-    bus, _ = connect(network)
+    bus = bus_of(arguments, settings.robot, network)
     opened, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
     threading.Thread(target=close_on, args=(stop, opened), name="stop", daemon=True).start()
     robot = CheckedRobot(opened)
@@ -119,11 +117,11 @@ def _live(
     def observations() -> Iterator[Observation]:
         began = 0
         try:
-            with console.status(f"{name}: drive it now, with turns to both sides") as status:
+            with Bar(console, f"{name}: drive it, with turns to both sides (s)", arguments.seconds) as bar:
                 while (observation := robot.sense()) is not None and not stop.is_set():
                     began = began or observation.stamp_ns
                     passed = 1e-9 * (observation.stamp_ns - began)
-                    status.update(f"{name}: {passed:.0f} of {arguments.seconds:.0f} s; turn to both sides")
+                    bar.update(round(passed))
                     yield observation
                     if passed >= arguments.seconds:
                         break

@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mapweave.exit_status import DONE, NO
+
 
 def add_to(commands: Any) -> None:
     """Declare the command."""
@@ -15,7 +17,7 @@ def add_to(commands: Any) -> None:
         help="three robots, one map, one lost robot found",
         description="Start a map server, a simulator and several agents as processes. Each robot explores "
         "and maps its part of an office; the server merges the maps; then one robot is kidnapped, asks where "
-        "it is, and drives to a node that another robot mapped. Exit status 0: it arrived; 2: it did not.",
+        "it is, and drives to a node that another robot mapped. Exit status 0: it arrived; 4: it did not.",
     )
     parser.add_argument("--seed", type=int, default=0, help="other seeds, other worlds (default: 0)")
     parser.add_argument("--robots", type=int, default=3, help="how many (default: 3)")
@@ -32,11 +34,10 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.extras import TRIAL, need
 
     need(*TRIAL)
-    from rich.console import Console
-
     from mapweave.demo.options import DemoOptions
     from mapweave.demo.report import summary_table
     from mapweave.demo.run import run_demo
+    from mapweave.terminal import plain_or_terminal
 
     options = DemoOptions(
         seed=arguments.seed,
@@ -49,10 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(report.as_dict()))
     else:
-        console = Console()
+        console = plain_or_terminal(stderr=False)
         console.print(summary_table(report))
         console.print(
             f"in {arguments.out}: map.png, film.webm, report.md, report.json, merged.mapweave, "
             "and a map file of each robot"
         )
-    return 0 if report.goal.reached else 2
+    return DONE if report.goal.reached else NO

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import add_network, network_of
+from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
@@ -26,7 +27,7 @@ def add_to(commands: Any) -> None:
         "doctor",
         help="examine a robot, and name the first thing that is wrong",
         description="Examine libraries, clock, disk, calibration, camera, driver, encoders and server, and "
-        "name the first thing that is wrong with what to do about it. Exit status 1 if something is wrong. "
+        "name the first thing that is wrong with what to do about it. Exit status 4 if something is wrong. "
         "Runs even where libraries are missing. The robot moves only with --drive.",
     )
     parser.add_argument(
@@ -90,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
             print("nothing is wrong")
         else:
             print(f"first: {first.subject}: {first.detail}\ndo: {first.advice}")
-    return int(first is not None)
+    return DONE if first is None else NO
 
 
 def _robot(arguments: argparse.Namespace, settings: Settings, driver: str, buses: list[Bus]) -> Robot:
@@ -120,9 +121,10 @@ def _print(findings: Sequence[Finding]) -> None:
     """A table; lines where rich is not installed."""
     try:
         from rich.box import SIMPLE
-        from rich.console import Console
         from rich.table import Table
         from rich.text import Text
+
+        from mapweave.terminal import plain_or_terminal
     except ImportError:
         for one in findings:
             print(f"{one.verdict:<8} {one.subject:<18} {one.detail}{'; ' if one.advice else ''}{one.advice}")
@@ -132,4 +134,4 @@ def _print(findings: Sequence[Finding]) -> None:
     table.add_column("what to do", overflow="fold", ratio=2)
     for one in findings:
         table.add_row(Text(one.verdict, STYLES[one.verdict]), one.subject, Text(one.detail), Text(one.advice))
-    Console().print(table)
+    plain_or_terminal(stderr=False).print(table)

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.network import SOON, add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.network import add_network, network_of, reach, settings_of, stop_on_signals
 
 if TYPE_CHECKING:
     import threading
@@ -59,13 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     terminal = RawTerminal() if gamepad is None else None
     network = network_of(arguments, settings_of(arguments))
     stop = stop_on_signals()
-    bus, keys = connect(network)
+    bus, keys = reach(network)
     try:
-        if not bus.wait_connected(SOON):
-            raise DeviceError(
-                f"no router at {', '.join(network.endpoints)}: start `mapweave server` or `mapweave router`, "
-                "or give --connect"
-            )
         with Session(bus, keys, name) as session:
             if gamepad is not None:
                 _by_gamepad(session, name, gamepad, stop)

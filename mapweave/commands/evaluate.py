@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -96,28 +95,24 @@ def add_to(commands: Any) -> None:
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Map, score and print."""
-    from rich.console import Console
-    from rich.progress import Progress
     from rich.table import Table
 
     from mapweave.agent.drivers.replay import Replay
     from mapweave.commands.network import settings_of
     from mapweave.evaluation.replaying import evaluate_replay, rows
     from mapweave.output_folder import check_output
+    from mapweave.terminal import Bar, plain_or_terminal
 
     path: Path = arguments.recording
     out = arguments.out or Path("out/eval-replay") / path.resolve().stem
     check_output(out)
     truth = arguments.truth or (path if path.is_dir() else path.parent) / "truth.csv"
     replay = Replay(path, arguments.robot, options=options_of(arguments))
-    console = Console(stderr=True)
+    console = plain_or_terminal()
     for note in replay.recording.notes:
         console.print(note, highlight=False)
-    with Progress(console=console) as progress:
-        task = progress.add_task("frames", total=len(replay))
-        evaluated = evaluate_replay(
-            replay, settings_of(arguments).agent, truth, lambda frame: progress.advance(task)
-        )
+    with Bar(console, "frames", len(replay)) as bar:
+        evaluated = evaluate_replay(replay, settings_of(arguments).agent, truth, lambda frame: bar.advance())
     for line in replay.damage:
         console.print(line, highlight=False)
     for written in evaluated.write(out):
@@ -129,23 +124,23 @@ def run_replay(arguments: argparse.Namespace) -> int:
     table = Table("", "", title=str(path))
     for name, words in rows(report):
         table.add_row(name, words)
-    Console(file=sys.stdout).print(table)
+    plain_or_terminal(stderr=False).print(table)
     return 0
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Examine and print."""
-    from rich.console import Console
     from rich.table import Table
 
     from mapweave.commands.network import settings_of
     from mapweave.evaluation.relocalization import evaluate_map, evaluate_relocalization
     from mapweave.output_folder import check_output
+    from mapweave.terminal import plain_or_terminal
 
     if arguments.out is not None:
         check_output(arguments.out)
     pipeline = settings_of(arguments).agent
-    console = Console(stderr=True)
+    console = plain_or_terminal()
     if arguments.map is not None:
         merged = merged_with_progress(opened(arguments.map), settings_of(arguments).merge)
         examination = evaluate_map(arguments.folder, arguments.robot, merged, console)
@@ -156,7 +151,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = examination.report()
     if arguments.out is not None:
         for path in examination.write(arguments.out):
-            console.print(f"answers in {path}")
+            console.print(f"answers in {path}", highlight=False)
     if arguments.json:
         print(json.dumps(report))
         return 0
@@ -168,7 +163,7 @@ def run(arguments: argparse.Namespace) -> int:
             table.add_row(
                 name, _shown(value), *(_shown(selection.get(name, "")) for selection in selections.values())
             )
-    Console(file=sys.stdout).print(table)
+    plain_or_terminal(stderr=False).print(table)
     return 0
 
 
@@ -177,16 +172,16 @@ def run_merge(arguments: argparse.Namespace) -> int:
     from mapweave.extras import need
 
     need("server", "viz")
-    from rich.console import Console
     from rich.table import Table
 
     from mapweave.commands.network import settings_of
     from mapweave.evaluation.merging import evaluate_merging
     from mapweave.output_folder import check_output
+    from mapweave.terminal import plain_or_terminal
 
     settings = settings_of(arguments)
     merge = settings.merge
-    console = Console(stderr=True)
+    console = plain_or_terminal()
     if arguments.out is not None:
         check_output(arguments.out)
     examination = evaluate_merging(arguments.folder, arguments.robots, settings.agent, merge, console)
@@ -202,7 +197,7 @@ def run_merge(arguments: argparse.Namespace) -> int:
         inner = value.items() if isinstance(value, dict) else ()
         words = ", ".join(f"{key} {_shown(number)}" for key, number in inner)
         table.add_row(name, words or _shown(value))
-    Console(file=sys.stdout).print(table)
+    plain_or_terminal(stderr=False).print(table)
     return 0
 
 

@@ -128,12 +128,15 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     before = merged_of(content, settings)
     earlier = ManualConstraints(content.constraints)
     constraint, effects = check_manual_constraint(before, earlier, constraint, settings=settings)
-    print(f"{event_words(constraint)}{f'; {effects}' if effects else ''}")
+    words = f"{event_words(constraint)}{f'; {effects}' if effects else ''}"
     if arguments.check:
+        print(f"only checked, nothing is changed: {words}")
         return
+    print(words)
     parts = parts_of({arguments.map: content})
-    merged = merged_with_progress(parts.maps, parts.constraints + ManualConstraints([constraint]), settings)
+    constraints = parts.constraints + ManualConstraints([constraint])
+    merged = merged_with_progress(parts.maps, constraints, settings, parts.annotations.pins)
     out = arguments.out or arguments.map
     history = (*parts.history, *between(before, merged, constraint.stamp_ns))
-    write_map_file(out, map_file_of(merged, history, parts.annotations))
+    write_map_file(out, map_file_of(merged, history, parts.annotations, parts.images))
     print(f"{out}: {merged.summary()}")

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from mapweave.commands.network import connect, network_of, settings_of
+from mapweave.commands.network import network_of, reach, settings_of
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
-from mapweave.wire.bus import Bus, Reply
+from mapweave.wire.bus import Reply
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.patience import ask_patiently
 
 if TYPE_CHECKING:
     from mapweave.mapserver.routes import Router
@@ -30,17 +30,6 @@ def ends_of(words: list[str]) -> Ends:
     if len(words) != 2:
         raise InvalidValue(f"give two nodes or two maps, not {len(words)}: {EXAMPLE}")
     return read_ends(words[0], words[1])
-
-
-def _patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Reply]:
-    """Ask, and ask busy servers again at their time, until the patience is over."""
-    end = time.monotonic() + timeout
-    while True:
-        replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
-        pause = max((reply.retry_after for reply in replies), default=0.0)
-        if pause <= 0.0 or time.monotonic() + pause > end:
-            return replies
-        time.sleep(pause)
 
 
 def resolved(arguments: argparse.Namespace, words: list[str], router: Router | None = None) -> list[str]:
@@ -119,19 +108,16 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
     Raises:
         NotConnected: no server answers, or all refuse.
     """
+    from mapweave.connection import no_server
+
     network = network_of(arguments, settings_of(arguments))
-    bus, keys = connect(network)
+    bus, keys = reach(network, "give --connect, or --map FILE")
     try:
-        where = ", ".join(network.endpoints)
-        if not bus.wait_connected(arguments.timeout):
-            raise NotConnected(
-                f"no router at {where}: start `mapweave server`, give --connect, or --map FILE"
-            )
-        replies = _patiently(bus, key_of(keys), payload, arguments.timeout)
+        replies = ask_patiently(bus, key_of(keys), payload, arguments.timeout)
     finally:
         bus.close()
     if not replies:
-        raise NotConnected(f"a router is up at {where}, but no map server of fleet {network.fleet} answered")
+        raise no_server(network.fleet)
     good = [reply for reply in replies if not reply.error]
     if not good:
         raise NotConnected(f"the map server refused: {replies[0].error}")

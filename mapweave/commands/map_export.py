@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.plan import add_plan_option
 
 FORMATS = ("g2o", "tum", "graphml", "geojson")
 
@@ -27,10 +28,10 @@ def add_to(actions: Any) -> None:
     parser.add_argument(
         "--component",
         type=int,
-        default=0,
         metavar="N",
-        help="which part that is one (default: 0, the largest)",
+        help="which part that is one (default: 0, the largest; with --plan that with most pairs)",
     )
+    add_plan_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -38,9 +39,16 @@ def run(arguments: argparse.Namespace) -> int:
     """Write, and print what was written and what was left out."""
     from mapweave.formats.export import FORMATS as WRITERS
     from mapweave.formats.map_part import MapPart
+    from mapweave.hybridmap.annotation import Annotations
+    from mapweave.mapserver.floor_plans import placed_plans
 
-    merged = merged_with_progress(opened(arguments.file))
-    part = MapPart(merged, arguments.component)
+    source = opened(arguments.file)
+    merged = merged_with_progress(source)
+    part = MapPart(merged, arguments.component or 0)
+    if arguments.plan is not None:
+        plans = placed_plans(Annotations(source.content.annotations), merged)
+        placed = plans.plan(arguments.plan).part(arguments.component)
+        part = MapPart(merged, placed.component, placed.plan_from_merged)
     for path in WRITERS[arguments.to](part, arguments.out):
         print(path)
     left = len(merged.poses) - len(part.nodes)

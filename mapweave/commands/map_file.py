@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from mapweave.commands import (
+    map_diff,
     map_explain,
     map_export,
     map_extract,
@@ -15,6 +16,7 @@ from mapweave.commands import (
     map_link,
     map_merge,
     map_photographs,
+    map_pin,
     map_retire,
     map_route,
     map_show,
@@ -26,11 +28,14 @@ from mapweave.commands import (
 def add_to(commands: Any) -> None:
     """Declare the command and its actions."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        "map", help="show, explain, merge, export and extract maps"
+        "map",
+        help="show, explain, merge, export and extract maps",
+        description="Show, explain, correct, merge, fetch, export and extract maps.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (
-        map_show, map_explain, map_route, map_history, map_link, map_unmerge, map_retire, map_undo,
+        map_show, map_diff, map_explain, map_route, map_history, map_link, map_unmerge, map_retire, map_undo,
+        map_pin,
         map_merge, map_fetch, map_export, map_extract, map_import, map_photographs,
     ):  # fmt: skip
         action.add_to(actions)

@@ -58,18 +58,11 @@ def router_of(arguments: argparse.Namespace) -> Router:
 @contextmanager
 def merge_progress() -> Iterator[Progress]:
     """A bar on stderr for people."""
-    from rich.console import Console
-    from rich.progress import Progress
+    from mapweave.terminal import Bar, plain_or_terminal
 
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = None
+    with Bar(plain_or_terminal(), "reading nodes", None, transient=True) as bar:
 
         def report(done: int, of: int) -> None:
-            nonlocal task
-            if task is None:
-                task = bar.add_task("reading nodes")
-            words = "reading nodes" if done < of else "comparing and joining"
-            bar.update(task, description=words, completed=done, total=of if done < of else None)
+            bar.update(done, "comparing and joining" if done == of else "", of)
 
         yield report

@@ -19,7 +19,7 @@ def add_to(actions: Any) -> None:
         "puts two robots in one place at one time, is refused with the figures and with what to undo first. "
         "The link stays, whatever robots map later; what contradicts it then is in `mapweave map history`.",
     )
-    parser.add_argument("nodes", nargs=2, metavar="NODE", help="the two nodes")
+    parser.add_argument("nodes", nargs=2, metavar="NODE|PLACE", help="the two nodes")
     parser.add_argument(
         "--pose", metavar="X,Y,DEGREES",
         help="the second node seen from the first: m ahead, m left, heading; if negative, --pose=-1,0,90",
@@ -30,10 +30,10 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Set the constraint, and print its effect."""
-    from mapweave.commands.map_ends import node_of
+    from mapweave.commands.map_ends import node_of, resolved
     from mapweave.hybridmap.constraint_subject import Linked, read_pose
 
-    a, b = map(node_of, arguments.nodes)
+    a, b = map(node_of, resolved(arguments, arguments.nodes))
     pose = None if arguments.pose is None else read_pose(arguments.pose.split(","))
     constrain(arguments, Linked(a, b, pose))
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.node import MapId
+    from mapweave.hybridmap.pin import Pin
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.merge.settings import MergeSettings
 
@@ -49,8 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     check_place(arguments.out)
     settings = settings_of(arguments).merge
     parts = parts_of({path: opened(path).content for path in arguments.files})
-    merged = merged_with_progress(parts.maps, parts.constraints, settings)
-    write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations))
+    merged = merged_with_progress(parts.maps, parts.constraints, settings, parts.annotations.pins)
+    write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations, parts.images))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
     if arguments.json:
@@ -75,11 +77,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def merged_with_progress(
-    maps: dict[MapId, HybridMap], constraints: ManualConstraints, settings: MergeSettings | None = None
+    maps: dict[MapId, HybridMap],
+    constraints: ManualConstraints,
+    settings: MergeSettings | None = None,
+    pins: Sequence[Pin] = (),
 ) -> MergedMap:
     """Merge, with a bar on stderr for people."""
     from mapweave.commands.map_input import merge_progress
     from mapweave.offline_merge import merge_parts
 
     with merge_progress() as report:
-        return merge_parts(maps, constraints, report, settings)
+        return merge_parts(maps, constraints, report, settings, pins=pins)

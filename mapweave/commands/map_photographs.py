@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.network import add_network, connect, network_of, settings_of
+from mapweave.commands.network import add_network, connect, network_of, reach, settings_of
 
 
 def add_to(actions: Any) -> None:
@@ -52,12 +52,16 @@ def run(arguments: argparse.Namespace) -> int:
     map_id = MapId(check_name(arguments.name or arguments.out.stem), int(time.time()))
     camera, distortion = read_camera(arguments.camera or arguments.folder / "camera.toml")
     images = images_in(arguments.folder)
+    network = network_of(arguments, settings_of(arguments))
+    if arguments.send:
+        # A server that is not there is better said before the work than after it.
+        bus, keys = reach(network, "leave out --send")
+        bus.close()
     changes = map_of_photographs(images, camera, distortion, arguments.spacing, map_id)
     title = f"{map_id}, of {len(images)} photographs"
     write_map_file(arguments.out, MapFile("agent", title, tuple(changes), {}))
     landmarks = [len(change.node.landmarks) for change in changes if isinstance(change, NodePut)]
     if arguments.send:
-        network = network_of(arguments, settings_of(arguments))
         bus, keys = connect(network)
         try:
             journal = arguments.out.with_suffix(".sqlite")

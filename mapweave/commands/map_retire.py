@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_constraint import add_constraint_options, constrain
@@ -30,7 +31,7 @@ def add_to(actions: Any) -> None:
         help='what lies in a polygon in the frame of a node, m: --area r0.1.17 "0,-1 2,-1 2,1 0,1"',
     )  # fmt: skip
     parser.add_argument("--from", dest="begin", default="", metavar="TIME",
-                        help="nodes of the map from then on: 2026-03-01T12:00 (UTC), or ns")  # fmt: skip
+                        help="nodes of the map from then on: 2026-03-01T12:00, or ns")  # fmt: skip
     parser.add_argument("--to", dest="end", default="", metavar="TIME", help="until then")
     add_constraint_options(parser)
     parser.set_defaults(run=run)
@@ -43,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:
-    from mapweave.commands.map_ends import map_of, node_of
+    from mapweave.commands.map_ends import map_of, node_of, resolved
     from mapweave.hybridmap.area import Area, read_corner
     from mapweave.hybridmap.constraint_subject import RetiredArea, read_retired, read_window
     from mapweave.hybridmap.errors import InvalidValue
@@ -53,7 +54,8 @@ def _subject(arguments: argparse.Namespace) -> Subject:
         raise InvalidValue("give a map or nodes, or --area; --from and --to go with one map")
     if arguments.area is not None:
         anchor, corners = arguments.area
-        return RetiredArea(Area(node_of(anchor), tuple(map(read_corner, corners.split()))))
+        (node,) = map(node_of, resolved(arguments, [anchor]))
+        return RetiredArea(Area(node, tuple(map(read_corner, corners.split()))))
     if in_time:
-        return read_window(map_of(arguments.which[0]), arguments.begin, arguments.end)
+        return read_window(map_of(arguments.which[0]), arguments.begin, arguments.end, time.time_ns(), None)
     return read_retired(arguments.which)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_input import SOURCES, router_of
 from mapweave.commands.network import add_network
+from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import RouteExplanation
@@ -27,7 +28,7 @@ def add_to(actions: Any) -> None:
         description="Explain the route from one node or named place to another (r0.1.17 kitchen), step by "
         "step; why not a shorter one; or why there is no way at all: what of it cannot be driven, what is "
         "blocked, or which maps would have to be one. A running server is asked, or a map file. "
-        "Exit status 0: there is a way; 2: there is none; 1: could not ask.",
+        "Exit status 0: there is a way; 4: there is none; 1: could not ask.",
     )
     parser.add_argument("start", metavar="START", help="a node, a named place, or a position")
     parser.add_argument("goal", metavar="GOAL", help="another one")
@@ -72,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(json.dumps(values) if arguments.json else "\n".join(lines))
     if arguments.draw is not None and not explanation.found:
         print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
-    return 0 if explanation.found else 2
+    return DONE if explanation.found else NO
 
 
 def _run_via(

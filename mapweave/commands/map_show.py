@@ -6,10 +6,16 @@ import argparse
 import json
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+
+if TYPE_CHECKING:
+    from mapweave.hybridmap.node import NodeId
+    from mapweave.hybridmap.pose import Pose2
+    from mapweave.storage.map_file import MapFile
 
 
 def add_to(actions: Any) -> None:
@@ -109,7 +115,8 @@ def run(arguments: argparse.Namespace) -> int:
             which = f"component {arguments.component}" if len(sizes) > 1 else "what is in use"
             title += f"\ndrawn: {which}, {len(poses)} of {len(hybrid.nodes)} nodes"
             summary["drawn"] = f"{which}, {len(poses)} nodes"
-        draw_map(MapPicture(title, poses, list(hybrid.edges.values()), landmarks=points), out)
+        edges, places = list(hybrid.edges.values()), _places(content, poses)
+        draw_map(MapPicture(title, poses, edges, landmarks=points, places=places), out)
         summary["picture"] = str(out)
     if arguments.json:
         print(json.dumps(summary))
@@ -117,6 +124,19 @@ def run(arguments: argparse.Namespace) -> int:
         for key, value in summary.items():
             print(f"{key.replace('_', ' '):26} {_text(value)}")
     return 0
+
+
+def _places(content: MapFile, poses: Mapping[NodeId, Pose2]) -> dict[str, tuple[float, float]]:
+    """Named places that are in the picture: a node, or the middle of an area."""
+    from mapweave.hybridmap.annotation import Annotations, Place
+
+    places = {}
+    for entry, place in Annotations(content.annotations).in_force(Place):
+        at = poses.get(place.anchor)
+        if at is not None:
+            x, y = at.vector[:2] if place.area is None else place.area.polygon(at).mean(axis=0)
+            places[entry.name] = float(x), float(y)
+    return places
 
 
 def _text(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""`mapweave go`, `explore` and `stop`: missions for robots of a running fleet."""
+"""`mapweave go`, `explore`, `stop` and `missions`: missions of robots of a running fleet."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import add_network, network_of, settings_of
+from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
     from mapweave.hybridmap.agent_status import AgentStatus
     from mapweave.hybridmap.mission_order import MissionReport
 
-NOT_DONE = 2
-"""Exit status: the robot has refused the mission, given it up, or got a newer one."""
 STATUS = (
-    "Exit status: 0 if the robot took the mission (with --wait: has done it), 2 if it did not, 1 if it "
+    "Exit status: 0 if the robot took the mission (with --wait: has done it), 4 if it did not, 1 if it "
     "cannot be asked."
 )
 
@@ -70,6 +69,17 @@ def add_to(commands: Any) -> None:
     _add_common(stop, None)
     stop.set_defaults(run=run_stop)
 
+    missions: argparse.ArgumentParser = commands.add_parser(
+        "missions",
+        help="list the missions of robots",
+        description="List the newest missions that the map server keeps, oldest first: robot, goal, state, "
+        "reason.",
+    )
+    missions.add_argument("robot", nargs="?", default="", help="of this robot alone, for example r0")
+    missions.add_argument("--json", action="store_true", help="print one JSON object")
+    add_network(missions)
+    missions.set_defaults(run=run_missions)
+
 
 def _add_common(parser: argparse.ArgumentParser, patience: float | None) -> None:
     if patience is not None:
@@ -121,6 +131,19 @@ def run_stop(arguments: argparse.Namespace) -> int:
     return _exit_status(reports, False)
 
 
+def run_missions(arguments: argparse.Namespace) -> int:
+    """List missions."""
+    from mapweave.hybridmap.node import check_name
+
+    robot = check_name(arguments.robot) if arguments.robot else ""
+    with fleet_of(arguments) as fleet:
+        reports = list(fleet.missions(robot))
+    if not reports and not arguments.json:
+        print("no missions yet")
+    _print(reports, arguments.json)
+    return DONE
+
+
 def words(report: MissionReport) -> str:
     """One line."""
     order = report.order
@@ -156,4 +179,4 @@ def _exit_status(reports: list[MissionReport], waited: bool) -> int:
     from mapweave.hybridmap.mission_order import MissionState
 
     good = {MissionState.DONE} if waited else {MissionState.DONE, MissionState.RUNNING, MissionState.SENT}
-    return 0 if all(report.state in good for report in reports) else NOT_DONE
+    return DONE if all(report.state in good for report in reports) else NO

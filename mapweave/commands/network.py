@@ -10,15 +10,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.connection import SOON
+
 if TYPE_CHECKING:
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.settings import NetworkSettings, Settings
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
-
-SOON = 2.0
-"""s; a router that is there is found sooner."""
 
 
 def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
@@ -124,27 +123,43 @@ def renew_access(bus: ZenohBus, folder: KeyFolder, settings: BusSettings, server
         The settings in use.
     """
     from mapweave.hybridmap.errors import MapweaveError
+    from mapweave.terminal import stamped
 
     try:
         if not folder.changed():
             return settings
         settings = folder.router(server, settings.listen)
         bus.reopen(settings)
-        print("the keys have changed: all connect again", flush=True)
+        print(stamped("the keys have changed: all connect again"), flush=True)
     except MapweaveError as error:
-        print(f"the keys cannot be read again: {error}", file=sys.stderr, flush=True)
+        print(stamped(f"the keys cannot be read again: {error}"), file=sys.stderr, flush=True)
     return settings
+
+
+def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[ZenohBus, Keys]:
+    """A client connection of a command that needs a router now.
+
+    Raises:
+        NotConnected: there is none; one line says what to do.
+    """
+    from mapweave import connection
+    from mapweave.wire.keys import Keys
+
+    return connection.reach(client_settings(network), advice), Keys(network.fleet)
 
 
 def warn_without_router(bus: ZenohBus, name: str) -> None:
     """Warn on stderr if no router is reached soon; does not wait."""
+    from mapweave.terminal import stamped
+
     began = time.monotonic()
 
     def look() -> None:
         # A process that ends earlier has not waited long enough to know.
         if not bus.wait_connected(SOON) and time.monotonic() - began >= SOON:
             advice = "start `mapweave server` or `mapweave router`, or give --connect"
-            print(f"{name} finds no router: {advice}; it goes on looking", file=sys.stderr, flush=True)
+            line = stamped(f"{name} finds no router: {advice}; it goes on looking")
+            print(line, file=sys.stderr, flush=True)
 
     threading.Thread(target=look, name="router", daemon=True).start()
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.agent import add_robot, close_on, open_robot, print_error
-from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.agent import add_robot, bus_of, close_on, open_robot, print_error
+from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 
 
 def add_to(commands: Any) -> None:
@@ -31,11 +31,10 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Record until the robot ends or the process is stopped."""
-    from rich.console import Console
-
     from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.recorded import RecordedRobot
     from mapweave.hybridmap.node import check_name
+    from mapweave.terminal import Bar, plain_or_terminal
 
     name = check_name(arguments.name)
     settings = settings_of(arguments)
@@ -43,17 +42,18 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     if arguments.body:
         network = replace(network, endpoints=(arguments.body,))
-    bus, _ = connect(network)
+    bus = bus_of(arguments, settings.robot, network)
     try:
         robot, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
         threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
         recorded = RecordedRobot(robot, arguments.out, arguments.lossless, print_error)
         try:
-            with Console(stderr=True).status(f"{name}: waits for its robot") as status:
-                checked = CheckedRobot(recorded)
-                checked.describe()
+            print_error(f"{name}: waits for its robot")
+            checked = CheckedRobot(recorded)
+            checked.describe()
+            with Bar(plain_or_terminal(), f"{name}: observations in {arguments.out}", None) as bar:
                 while not stop.is_set() and checked.sense() is not None:
-                    status.update(f"{name}: {recorded.written} observations in {arguments.out}")
+                    bar.update(recorded.written)
         finally:
             recorded.close()
     finally:

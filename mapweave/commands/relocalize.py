@@ -7,15 +7,22 @@ import json
 import math
 import sys
 import time
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
-from mapweave.commands.network import add_network, connect, network_of, settings_of
+from mapweave.commands.network import add_network, network_of, reach, settings_of
+from mapweave.commands.plan import add_plan_option, plan_of, plan_place
+from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mapweave.hybridmap.floor_plan import PlacedPlan
     from mapweave.hybridmap.node import Node, NodeId
-    from mapweave.hybridmap.query import RelocalizeAnswer, View
+    from mapweave.hybridmap.pose import Pose2
+    from mapweave.hybridmap.query import RelocalizeAnswer, View, Whereabouts
     from mapweave.settings import NetworkSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
@@ -28,7 +35,7 @@ def add_to(commands: Any) -> None:
         help="where an image was taken",
         description="Extract an image's features and ask the map server where it was taken; or, with --map, "
         "answer from a map: `mapweave relocalize --map office.mapweave photo.png`. "
-        "Exit status 0: found; 2: unknown, ambiguous, or the place without a pose; 1: could not ask.",
+        "Exit status 0: found; 4: unknown, ambiguous, or the place without a pose; 1: could not ask.",
     )
     parser.add_argument("image", type=Path, help="png, jpg, pgm or bmp")
     parser.add_argument(
@@ -40,6 +47,7 @@ def add_to(commands: Any) -> None:
         "--draw", type=Path, metavar="PNG",
         help="draw the best candidate's landmarks next to the image, joined where they match",
     )  # fmt: skip
+    add_plan_option(parser)
     parser.add_argument("--timeout", type=float, default=5.0, metavar="S", help="longest wait for an answer")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
@@ -52,7 +60,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.drawing.match_picture import draw_matches
     from mapweave.hybridmap.errors import DeviceError
     from mapweave.hybridmap.query import Certainty
-    from mapweave.mapserver.http.json_values import json_values
     from mapweave.storage.image_file import read_grey
     from mapweave.vision.lens import Lens
     from mapweave.vision.sift import Sift
@@ -69,33 +76,44 @@ def run(arguments: argparse.Namespace) -> int:
         raise DeviceError(f"{arguments.draw}: the picture will be a PNG; end its name with .png")
     camera, distortion = read_camera(camera_file)
     grey = read_grey(arguments.image, camera, str(camera_file))
+
     lens = Lens(camera, distortion)
-    view = Sift(lens).extract(grey).view(camera)
+    plan = plan_of(arguments)
+
+    @cache
+    def view() -> View:
+        return Sift(lens).extract(grey).view(camera)
+
     if arguments.map is None:
         answer, node = _by_server(arguments, view)
     else:
-        answer, node = _by_map(arguments, view)
+        answer, node = _by_map(arguments, view())
     if arguments.json:
-        print(json.dumps(json_values(answer)))
+        print(json.dumps(_json(answer, plan)))
     else:
-        _print(answer)
+        _print(answer, plan)
     if arguments.draw is not None and node is not None:
         best = answer.candidates[0].node_from_robot.mean
-        draw_matches(arguments.draw, grey, lens, node, view, best)
+        draw_matches(arguments.draw, grey, lens, node, view(), best)
     elif arguments.draw is not None:
         print(f"{arguments.draw} is not drawn: no place was recognised", file=sys.stderr)
-    return 0 if answer.certainty is Certainty.FOUND else 2
+    return DONE if answer.certainty is Certainty.FOUND else NO
 
 
-def _by_server(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer, Node | None]:
+def _by_server(
+    arguments: argparse.Namespace, view: Callable[[], View]
+) -> tuple[RelocalizeAnswer, Node | None]:
     """The answer of a running server, and the best candidate's node if it is to be drawn."""
+    from mapweave.connection import no_server
     from mapweave.hybridmap.query import RelocalizeAnswer
     from mapweave.wire.messages import decode, encode_view
 
     network = network_of(arguments, settings_of(arguments))
-    bus, keys = connect(network)
+    bus, keys = reach(network)
     try:
-        payload = _ask(bus, network, keys.any_relocalize(), encode_view(view), arguments.timeout)
+        if not bus.ask(keys.server_statuses(), b"", arguments.timeout):
+            raise no_server(network.fleet)  # said before the work
+        payload = _ask(bus, network, keys.any_relocalize(), encode_view(view()), arguments.timeout)
         answer = decode(payload, RelocalizeAnswer)
         if arguments.draw is None or not answer.candidates:
             return answer, None
@@ -118,20 +136,17 @@ def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer
 
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
     """Ask until a server answers; a busy server is asked again at its retry time."""
+    from mapweave.connection import no_server
     from mapweave.hybridmap.errors import NotConnected
 
-    where, end = ", ".join(network.endpoints), time.monotonic() + patience
-    if not bus.wait_connected(patience):
-        raise NotConnected(f"no router at {where}: start `mapweave server` or give --connect")
+    end = time.monotonic() + patience
     while True:
         replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
         for reply in replies:
             if not reply.error:
                 return reply.payload
         if not replies:
-            raise NotConnected(
-                f"a router is up at {where}, but no map server of fleet {network.fleet} answered"
-            )
+            raise no_server(network.fleet)
         pause = replies[0].retry_after
         if not pause or time.monotonic() + pause > end:
             raise NotConnected(f"the map server refused: {replies[0].error}")
@@ -151,7 +166,24 @@ def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, 
     return way.legs[0].node
 
 
-def _print(answer: RelocalizeAnswer) -> None:
+def _json(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> dict[str, Any]:
+    from mapweave.mapserver.http.json_values import json_values
+
+    values = json_values(answer)
+    for place, candidate in zip(answer.candidates, values["candidates"], strict=True):
+        pose = None if plan is None else _in_plan(place, plan)
+        if plan is not None:
+            candidate["plan_from_robot"] = None if pose is None else json_values(pose)
+    return values
+
+
+def _in_plan(place: Whereabouts, plan: PlacedPlan) -> Pose2 | None:
+    """Where a candidate is on a plan; None where the plan does not lie."""
+    pose = place.merged_from_robot
+    return None if pose is None else plan.pose(place.component, pose.mean)
+
+
+def _print(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> None:
     import numpy as np
 
     print(f"{answer.certainty}: {answer.reason}")
@@ -171,6 +203,8 @@ def _print(answer: RelocalizeAnswer) -> None:
             f"{math.degrees(heading):+.1f} deg (sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
             f"{place.inliers} landmarks agree, probability {place.probability:.3f}"
         )
+        if plan is not None:
+            print(f"    {plan_place(plan, _in_plan(place, plan))}")
     for near in answer.similar:
         side = "left" if (near.turn or 0.0) > 0.0 else "right"
         turn = "" if near.turn is None else f"; turn {abs(math.degrees(near.turn)):.0f} deg {side}"

@@ -8,8 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.agent import add_calibration, calibration_of
-from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.agent import add_calibration, add_rerun, calibration_of
+from mapweave.commands.network import (
+    add_network,
+    connect,
+    network_of,
+    settings_of,
+    stop_on_signals,
+    warn_without_router,
+)
 from mapweave.hybridmap.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -36,6 +43,7 @@ def add_to(commands: Any) -> None:
         "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
     )
     add_calibration(parser)
+    add_rerun(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -94,9 +102,12 @@ def run(arguments: argparse.Namespace) -> int:
         trajectories=True,
         patience=0.0 if arguments.offline else arguments.patience,
         calibration=calibration_of(arguments, name),
+        rerun=arguments.rerun,
     )
     stop = stop_on_signals()
     bus, keys = connect(network)
+    if not arguments.offline:
+        warn_without_router(bus, name)
     try:
         run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
@@ -106,18 +117,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     """Map a recording without odometry by its images alone."""
-    from rich.console import Console
-    from rich.progress import track
-
     from mapweave.agent.replication.epochs import newest_on_server, next_epoch
     from mapweave.agent.replication.journal import Journal
     from mapweave.hybridmap.change import NodePut
     from mapweave.photographs import send_map
     from mapweave.processes.agent import FIRST_PATIENCE, epochs_of_files, map_path
     from mapweave.storage.map_file import MapFile, write_map_file
+    from mapweave.terminal import EventLog, plain_or_terminal, tracked
     from mapweave.visual_mapping import keyframes, visual_maps
 
-    name, data, console = name_of(arguments), arguments.data, Console(stderr=True)
+    name, data, console = name_of(arguments), arguments.data, plain_or_terminal()
+    say = EventLog(console)
     network = network_of(arguments, settings_of(arguments))
     print(f"{recording.path}: no odometry, so it is mapped by its images alone: the map has no scale")
     data.mkdir(parents=True, exist_ok=True)
@@ -131,7 +141,7 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
         if not (taken or arguments.offline):
             stored = newest_on_server(bus, keys, network.server, name, FIRST_PATIENCE)
         epoch = max([arguments.epoch or 0, *(used + 1 for used in taken)]) or next_epoch(taken, stored)
-        frames = track(range(len(recording)), name, console=console)
+        frames = tracked(range(len(recording)), name, console=console)
         walk, damage = keyframes(recording, frames)
         maps = visual_maps(walk, recording.camera, name, epoch)
         if not maps:
@@ -140,10 +150,10 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
         for map_id, changes in maps:
             write_map_file(map_path(data, map_id), MapFile("agent", str(map_id), tuple(changes)))
             nodes = sum(isinstance(change, NodePut) for change in changes)
-            console.print(f"{name}: {nodes} nodes in {map_path(data, map_id)}; its scale is unknown")
+            say(f"{name}: {nodes} nodes in {map_path(data, map_id)}; its scale is unknown")
             if not arguments.offline:
                 sent = send_map(changes, map_id, path, bus, keys, network.server, arguments.patience)
-                console.print(f"server {network.server} has {'' if sent else 'not taken '}it all")
+                say(f"{name}: server {network.server} has {'' if sent else 'not taken '}it all")
     finally:
         bus.close()
     return _report([*recording.damage, *damage])

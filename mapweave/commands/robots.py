@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from typing import Any
 
 
@@ -14,6 +15,7 @@ def add_to(commands: Any) -> None:
         description="List the drivers with their robots and missing libraries. The settings file of a robot "
         'names its driver: [robot] driver = "koala". Your own driver is FILE.py:CLASS.',
     )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=run)
 
 
@@ -23,6 +25,13 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.extras import extra_of
 
     robots = listing()
+    if arguments.json:
+        listed = [
+            {"name": r.name, "robots": r.line, "missing": r.missing or None, "error": r.error or None}
+            for r in robots
+        ]
+        print(json.dumps({"drivers": listed}))
+        return 0
     width = max(len(robot.name) for robot in robots)
     for robot in robots:
         line = robot.line

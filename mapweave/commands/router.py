@@ -30,6 +30,7 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Route until stopped."""
+    from mapweave.terminal import stamped
     from mapweave.wire.zenoh_bus import ZenohBus
 
     network = network_of(arguments, settings_of(arguments))
@@ -37,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(settings)
     try:
-        print(f"router listens at {', '.join(settings.listen)}", flush=True)
+        print(stamped(f"router listens at {', '.join(settings.listen)}"), flush=True)
         while not stop.wait(1.0):
             if keys is not None:
                 settings = renew_access(bus, keys, settings, network.server)

@@ -6,6 +6,7 @@ import argparse
 import logging
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from mapweave.commands.map_input import SOURCES, opened
@@ -18,6 +19,8 @@ from mapweave.commands.network import (
     stop_on_signals,
 )
 
+DATA = Path("out/server")
+DEMO_HTTP = "8080"
 LARGE = 20_000_000
 """Bytes of a store whose reading is announced, since it takes long."""
 
@@ -28,12 +31,16 @@ def add_to(commands: Any) -> None:
         "server",
         help="run the map server and the router",
         description="Keep every robot's map, merge them, localize lost robots and give routes. "
-        "The Zenoh router that robots connect to runs inside. With --http it also tells people where a "
-        "photograph was taken, and why maps are one or are not: POST /relocalize, GET /explain, GET /status, "
-        "and pages for phones at / and /why.",
+        "The Zenoh router that robots connect to runs inside. With --http it also serves a page: the merged "
+        "map and its robots live, where a photograph was taken, and why maps are one or are not.",
     )
     parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
-    parser.add_argument("--data", type=Path, default=Path("out/server"), help="folder for the store")
+    parser.add_argument("--data", type=Path, help=f"folder for the store (default: {DATA})")
+    parser.add_argument(
+        "--demo", action="store_true",
+        help="show a recorded fleet whose robots move, without any robot; nothing is kept, and the page is "
+        "at http://127.0.0.1:8080/ unless --http says otherwise",
+    )  # fmt: skip
     parser.add_argument(
         "--map", type=Path, metavar="FILE",
         help=f"a map that is there from the start, beside the store, and that robots join: {SOURCES}; it is "
@@ -57,16 +64,18 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until stopped."""
+    from mapweave.hybridmap.errors import SettingsError
     from mapweave.hybridmap.node import check_name
     from mapweave.mapserver.base_map import BaseMap
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
+    from mapweave.terminal import STAMP, stamped
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
-    logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
+    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
     for part in ("mapweave.mapserver", "mapweave.wire"):
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
@@ -74,32 +83,42 @@ def run(arguments: argparse.Namespace) -> int:
     name = check_name(arguments.name or network.server)
     router, folder = router_settings(network, name)
     keys = Keys(router.fleet)
-    address = None
-    if arguments.http is not None:
+    if arguments.demo and arguments.data is not None:
+        raise SettingsError("--demo keeps nothing: leave out --data")
+    address, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
+    if http is not None:
         from mapweave.mapserver.http.web import Web, parse_address
 
-        address = parse_address(arguments.http)
+        address = parse_address(http)
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
         how = ServerSettings(settings.admission_control, settings.merge)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
-            path = arguments.data / f"{name}.sqlite"
+            data = arguments.data or DATA
+            if arguments.demo:
+                from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
+
+                data = Path(stack.enter_context(TemporaryDirectory()))
+                prepare(data, data / f"{name}.sqlite")
+            path = data / f"{name}.sqlite"
             if path.exists() and path.stat().st_size > LARGE:
-                print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
+                print(stamped(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ..."), flush=True)
             base = None
             if arguments.map is not None:
                 base = BaseMap.of(str(arguments.map), opened(arguments.map).content)
             server = MapServer(bus, keys, path, name, how, schedule, base)
             if base is not None:
-                print(f"with {base}", flush=True)
+                print(stamped(f"with {base}"), flush=True)
             stack.enter_context(server)
             where = ", ".join(router.listen)
-            print(f"map server {name} of fleet {keys.fleet} listens at {where}", flush=True)
+            print(stamped(f"map server {name} of fleet {keys.fleet} listens at {where}"), flush=True)
             if address is not None:
                 stack.enter_context(Web(address, server, commands=arguments.http_commands))
-                print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
+                print(stamped(f"for people: http://{':'.join(map(str, address))}/"), flush=True)
+            if arguments.demo:
+                stack.enter_context(RecordedFleet(bus, keys, name, data))
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):
@@ -108,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
                     router = renew_access(bus, folder, router, name)
                 now = server.summary()
                 if now != last_line:
-                    print(now, flush=True)
+                    print(stamped(now), flush=True)
                     last_line = now
     finally:
         bus.close()

@@ -16,6 +16,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.exit_status import DONE, NO
 
 
 def add_to(commands: Any) -> None:
@@ -35,6 +36,7 @@ def add_to(commands: Any) -> None:
         help="the scenarios that come with Mapweave",
         description="Names and summaries. The files are a good start for your own: see docs/scenarios.md.",
     )
+    listing.add_argument("--json", action="store_true", help="print one JSON object")
     listing.set_defaults(run=run_list)
 
 
@@ -62,7 +64,7 @@ def _add_run(kinds: Any) -> None:
         help="try a scenario",
         description="Run a scenario with server, simulator and an agent for each robot; leave a report "
         "folder with figures, trajectories (TUM), map, picture and film. Exit status 0: all expectations "
-        "were met; 2: not; 1: it could not be run.",
+        "were met; 4: not; 1: it could not be run.",
     )
     _add_scenario(parser)
     parser.add_argument("--seed", type=int, help="other seeds, other worlds (default: the scenario's)")
@@ -71,6 +73,10 @@ def _add_run(kinds: Any) -> None:
     parser.add_argument(
         "--view", type=int, nargs="?", const=8090, metavar="PORT",
         help="show the trial live at http://127.0.0.1:PORT (default port: 8090)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--rerun", action="store_true",
+        help="write what each robot senses and estimates for the Rerun viewer: rerun/ROBOT.1.rrd in --out",
     )  # fmt: skip
     _add_fleet(parser)
     parser.set_defaults(run=run_one)
@@ -113,16 +119,19 @@ def _add_serve(kinds: Any) -> None:
 
 def run_list(arguments: argparse.Namespace) -> int:
     """Name and summary of each scenario."""
-    from rich.console import Console
     from rich.table import Table
 
     from mapweave.scenarios.scenario import load_scenario, scenario_names, scenario_path
+    from mapweave.terminal import plain_or_terminal
 
-    del arguments
+    if arguments.json:
+        summaries = {name: load_scenario(scenario_path(name)).summary for name in scenario_names()}
+        print(json.dumps({"scenarios": summaries}))
+        return DONE
     table = Table(box=None, show_header=False)
     for name in scenario_names():
         table.add_row(name, load_scenario(scenario_path(name)).summary)
-    Console().print(table)
+    plain_or_terminal(stderr=False).print(table)
     return 0
 
 
@@ -130,12 +139,11 @@ def run_one(arguments: argparse.Namespace) -> int:
     """Run one trial and print what came of it."""
     from mapweave.extras import TRIAL, need
 
-    need(*TRIAL)
-    from rich.console import Console
-
+    need(*TRIAL, *(["rerun"] if arguments.rerun else []))
     from mapweave.scenarios.run import TrialOptions, run_trial
     from mapweave.scenarios.scenario import load_scenario, scenario_path
     from mapweave.scenarios.summary import summary_table
+    from mapweave.terminal import plain_or_terminal
 
     settings = settings_of(arguments)
     scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
@@ -154,15 +162,16 @@ def run_one(arguments: argparse.Namespace) -> int:
             film_every=0.0 if arguments.no_film else 1.0,
             view=arguments.view,
             quiet=arguments.json,
+            rerun=arguments.rerun,
         ),
     )
     if arguments.json:
         print(json.dumps(trial.as_dict()))
     else:
-        console = Console()
+        console = plain_or_terminal(stderr=False)
         console.print(summary_table(scenario, seed, trial))
         console.print(f"the report is in {out}: report.md, map.png, film.webm, trajectories ...")
-    return 0 if trial.passed else 2
+    return DONE if trial.passed else NO
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
@@ -187,18 +196,19 @@ def run_batch(arguments: argparse.Namespace) -> int:
         film=arguments.film,
         json=arguments.json,
     )
-    return 0 if run_batch_of_trials(scenario, options) else 2
+    return DONE if run_batch_of_trials(scenario, options) else NO
 
 
 def run_serve(arguments: argparse.Namespace) -> int:
     """Serve the simulated robots until stopped."""
     from mapweave.processes.simulator import run_sim
     from mapweave.scenarios.scenario import load_scenario, scenario_path
+    from mapweave.terminal import STAMP
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Which robots time waits for, and which agents have gone.
-    logging.basicConfig(format="%(message)s")
+    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
     logging.getLogger("mapweave.sim").setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)

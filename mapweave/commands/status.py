@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network
+from mapweave.commands.plan import add_plan_option
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from mapweave.fleet import Fleet
     from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
+    from mapweave.hybridmap.floor_plan import PlacedPlan
 
 SILENT = 5.0
 """A robot that has sent nothing for longer is shown as silent, s; it sends twice a second."""
-WIDE = 400
-"""Characters of a line that no terminal shows."""
 COLUMNS = ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "last trouble")
 LEAST = 12
 """Characters that a column of words keeps on a narrow terminal."""
@@ -38,6 +38,7 @@ def add_to(commands: Any) -> None:
         "server the robots are asked themselves; their places in the merged map are then unknown.",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object; with --watch one a line")
+    add_plan_option(parser)
     parser.add_argument("--watch", action="store_true", help="go on until interrupted")
     add_network(parser)
     parser.set_defaults(run=run)
@@ -45,39 +46,51 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from rich.console import Console
     from rich.live import Live
+
+    from mapweave.hybridmap.errors import NotConnected
+    from mapweave.terminal import plain_or_terminal
 
     with fleet_of(arguments) as fleet:
         if arguments.json:
             while True:
-                _print_json(fleet.status())
+                _print_json(fleet.status(), _plan(fleet, arguments))
                 if not arguments.watch:
                     return 0
                 time.sleep(EVERY)
         # A line a robot where another program reads.
-        console = Console(width=None if sys.stdout.isatty() else WIDE)
+        console = plain_or_terminal(stderr=False)
         if not arguments.watch:
             status = fleet.status()
-            console.print(table(status, console.width) if status.robots else "no robot is there")
+            rows = table(status, console.width, _plan(fleet, arguments))
+            console.print(rows if status.robots else "no robot is there")
             return 0
-        with Live(table(fleet.status(), console.width), console=console, auto_refresh=False) as live:
+        with Live(console=console, auto_refresh=False) as live:
             while True:
+                try:
+                    shown: Table | str = table(fleet.status(), console.width, _plan(fleet, arguments))
+                except NotConnected as error:  # it may come back
+                    shown = str(error)
+                live.update(shown, refresh=True)
                 time.sleep(EVERY)
-                live.update(table(fleet.status(), console.width), refresh=True)
 
 
-def table(status: FleetStatus, width: int) -> Table:
+def _plan(fleet: Fleet, arguments: argparse.Namespace) -> PlacedPlan | None:
+    return None if arguments.plan is None else fleet.plans().plan(arguments.plan)
+
+
+def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Table:
     """One line a robot.
 
     Args:
         status: of the fleet.
         width: characters of a line; what is long is cut, and nothing else.
+        plan: in the coordinates of which robots are; None: of the merged map.
     """
     from rich.markup import escape
     from rich.table import Table
 
-    rows = [cells(robot) for robot in status.robots]
+    rows = [cells(robot, plan) for robot in status.robots]
     widest = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
     doing, trouble = COLUMNS.index("doing"), COLUMNS.index("last trouble")
     over = sum(widest) + len(COLUMNS) - 1 - width
@@ -99,7 +112,7 @@ def table(status: FleetStatus, width: int) -> Table:
     return lines
 
 
-def cells(robot: RobotEntry) -> tuple[str, ...]:
+def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
     """A robot's line: name, mission, doing, place, nodes, battery, unsent changes, age, trouble."""
     status = robot.status
     age = "gone" if not robot.alive else f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
@@ -114,7 +127,7 @@ def cells(robot: RobotEntry) -> tuple[str, ...]:
         robot.robot,
         mission,
         f"{doing.doing}: {doing.detail}" if doing.detail else doing.doing,
-        _place(robot),
+        _place(robot, plan),
         str(doing.nodes),
         "" if status.battery is None else f"{status.battery:.0%}",
         str(status.unsent),
@@ -123,8 +136,14 @@ def cells(robot: RobotEntry) -> tuple[str, ...]:
     )
 
 
-def _place(robot: RobotEntry) -> str:
+def _place(robot: RobotEntry, plan: PlacedPlan | None) -> str:
     pose, status = robot.merged_from_robot, robot.status
+    if pose is not None and plan is not None:
+        on_plan = plan.pose(robot.component, pose)
+        name = f", {robot.place}" if robot.place else ""
+        if on_plan is None:
+            return f"not on plan {plan.name}{name}"
+        return f"{on_plan.x:.2f},{on_plan.y:.2f} {math.degrees(on_plan.heading):.0f}°{name}"
     if pose is not None:
         part = f" in part {robot.component}" if robot.component > 0 else ""
         part += f", {robot.place}" if robot.place else ""
@@ -134,9 +153,15 @@ def _place(robot: RobotEntry) -> str:
     return "unknown"
 
 
-def _print_json(status: FleetStatus) -> None:
+def _print_json(status: FleetStatus, plan: PlacedPlan | None) -> None:
     import json
 
     from mapweave.mapserver.http.json_values import json_values
 
-    print(json.dumps(json_values(status)), flush=True)
+    values = json_values(status)
+    if plan is not None:
+        for robot, value in zip(status.robots, values["robots"], strict=True):
+            pose = robot.merged_from_robot
+            on_plan = None if pose is None else plan.pose(robot.component, pose)
+            value["plan_from_robot"] = None if on_plan is None else json_values(on_plan)
+    print(json.dumps(values), flush=True)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from mapweave.wire.zenoh_bus import ZenohBus
 
 SUBJECT = "server"
-PATIENCE = 3.0
-"""s for a connection, and for an answer."""
+PATIENCE = 1.5
+"""s for a connection, and for an answer; what is there answers sooner."""
 
 
 def examine(network: NetworkSettings) -> Iterator[Finding]:
@@ -35,7 +35,8 @@ def examine(network: NetworkSettings) -> Iterator[Finding]:
         )  # fmt: skip
         return
     credentials = read_key_file(Path(network.keys)).credentials if network.keys else None
-    bus = ZenohBus(BusSettings(endpoints=network.endpoints, credentials=credentials))
+    attempt = PATIENCE / len(network.endpoints)
+    bus = ZenohBus(BusSettings(endpoints=network.endpoints, credentials=credentials, attempt=attempt))
     try:
         if not bus.wait_connected(PATIENCE):
             yield wrong(

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.drawing.names import Name, draw_names
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
@@ -78,6 +79,30 @@ class Drive:
 
 
 @dataclass(frozen=True, eq=False)
+class Backdrop:
+    """An image under a map.
+
+    Attributes:
+        pixels: (H, W) grey or (H, W, 3) red, green, blue.
+        lower_left: pose of its lower left corner, its x axis along the lower edge.
+        metres_per_pixel: m.
+        pairs: clicked places, drawn with their differences: x, y on the image and x, y on the map, m.
+    """
+
+    pixels: NDArray[np.uint8]
+    lower_left: Pose2
+    metres_per_pixel: float
+    pairs: Sequence[tuple[tuple[float, float], tuple[float, float]]] = ()
+
+    @property
+    def corners(self) -> Array:
+        """(4, 2) m."""
+        height, width = self.pixels.shape[:2]
+        size = self.metres_per_pixel * np.array([[0, 0], [width, 0], [width, height], [0, height]])
+        return self.lower_left.apply(size)
+
+
+@dataclass(frozen=True, eq=False)
 class MapPicture:
     """What to draw; all in one frame.
 
@@ -91,6 +116,7 @@ class MapPicture:
         starts: where each robot began.
         false: links that are known to be false; they are highlighted.
         places: positions of named places, m.
+        backdrop: an image under all of it.
     """
 
     title: str
@@ -102,6 +128,7 @@ class MapPicture:
     starts: Mapping[str, Pose2] = field(default_factory=dict)
     false: frozenset[EdgeId] = frozenset()
     places: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    backdrop: Backdrop | None = None
 
 
 def outline_of(plan: FloorPlan) -> Outline:
@@ -144,6 +171,8 @@ def draw_on(axes: Any, picture: MapPicture) -> None:
         picture: what to draw.
     """
     _draw_outline(axes, picture.outline)
+    if picture.backdrop is not None:
+        _draw_backdrop(axes, picture.backdrop)
     if len(picture.landmarks):
         axes.plot(*picture.landmarks.T, ".", color="#999999", markersize=1.2, zorder=1, alpha=0.6)
     colours = colours_of([*(n.agent for n in picture.poses), *picture.starts])
@@ -173,6 +202,8 @@ def bounds_of(picture: MapPicture) -> tuple[float, float, float, float]:
     poses = [*picture.poses.values(), *picture.starts.values()]
     shown.append(np.array([[pose.x, pose.y] for pose in poses]).reshape(-1, 2))
     shown.append(np.array([*picture.places.values()]).reshape(-1, 2))
+    if picture.backdrop is not None:
+        shown.append(picture.backdrop.corners)
     if len(picture.landmarks):
         low, high = np.percentile(picture.landmarks, [5, 95], axis=0)
         more = 0.25 * (high - low)
@@ -237,6 +268,35 @@ def _draw_outline(axes: Any, outline: Outline) -> None:
         axes.text(*middle, name, color="#b8b0a0", fontsize=13, ha="center", va="center", zorder=0.2)
     for corners in outline.solids:
         axes.fill(*corners.T, color="#cfc8ba", edgecolor="#a79f8f", linewidth=0.5, zorder=0.4)
+
+
+def _draw_backdrop(axes: Any, backdrop: Backdrop) -> None:
+    from matplotlib.image import AxesImage
+    from matplotlib.transforms import Affine2D
+
+    height, width = backdrop.pixels.shape[:2]
+    pose, scale = backdrop.lower_left, backdrop.metres_per_pixel
+    # Not by `imshow`, which takes the limits of the axes from pixels before the transform.
+    image = AxesImage(axes, cmap="gray", norm=None, extent=(0, width, 0, height), interpolation="antialiased")
+    image.set_data(backdrop.pixels)
+    image.set_clim(0, 255)
+    image.set(alpha=0.75, zorder=0.5)
+    image.set_transform(
+        Affine2D().scale(scale).rotate(pose.heading).translate(pose.x, pose.y) + axes.transData
+    )
+    axes.add_artist(image)
+    for number, (on_plan, on_map) in enumerate(backdrop.pairs, 1):
+        first = number == 1
+        axes.plot(*zip(on_plan, on_map, strict=True), "-", color="#c0392b", linewidth=2.0, zorder=6)
+        axes.plot(
+            *on_plan, "o", color="none", markeredgecolor="#c0392b", markersize=11, markeredgewidth=1.8,
+            zorder=6, label="clicked pair" if first else None,
+        )  # fmt: skip
+        axes.annotate(
+            str(number), on_plan, (9, 9), textcoords="offset points", fontsize=10, fontweight="bold",
+            color="#c0392b", zorder=7,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1},
+        )  # fmt: skip
 
 
 def _draw_scale(axes: Any) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import track
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
@@ -31,6 +30,7 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import write_map_file
+from mapweave.terminal import tracked
 
 FALSE_SHARE = 0.1
 """Outdoors a link leads to what is far away: it is false only if it is also off by this share of the distance
@@ -188,7 +188,7 @@ def evaluate_merging(
     images = {}
     for name, robot in cut.items():
         images[name] = len(robot)
-        for change in track(changes(name, robot, settings), f"{name} maps", len(robot), console=console):
+        for change in tracked(changes(name, robot, settings), f"{name} maps", len(robot), console=console):
             for part in change:
                 merger.on_change(part)
     console.print("merging")

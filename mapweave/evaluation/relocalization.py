@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import track
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.camera_file import read_camera
@@ -25,6 +24,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.image_file import read_grey
+from mapweave.terminal import tracked
 from mapweave.vision.lens import NO_DISTORTION, Distortion
 
 STAND_IN_HEIGHT = 0.8
@@ -107,7 +107,7 @@ def _examine_drive(folder: Path, settings: AgentSettings, console: Console) -> R
         )
     truth = Truth.read(folder / "truth.csv")
     mapping, asking = Replay(folder, names[0]), [Replay(folder, name) for name in names[1:]]
-    ticks = track(range(len(mapping)), f"{names[0]} maps", console=console)
+    ticks = tracked(range(len(mapping)), f"{names[0]} maps", console=console)
     drive = DriveMap.of_pass(mapping, truth, settings, ticks)
     return _ask(folder, drive, asking, truth, console)
 
@@ -135,7 +135,7 @@ def _ask(
     folder: Path, drive: DriveMap, asking: Sequence[Replay], truth: Truth, console: Console
 ) -> RelocalizationEvaluation:
     questions = (verdict for robot in asking for verdict in drive.questions(robot))
-    verdicts = list(track(questions, "asking", total=sum(map(len, asking)), console=console))
+    verdicts = list(tracked(questions, "asking", total=sum(map(len, asking)), console=console))
     about = {"folder": folder.name, "nodes": drive.nodes, "truth": bool(truth.poses)}
     return RelocalizationEvaluation(about, {"depths": verdicts}, drive.trials)
 
@@ -146,11 +146,11 @@ def _examine_photographs(
     photographs = Photographs(folder)
     camera, distortion = _camera_of(folder, camera_file, focal_px)
     places = AppearanceMap(camera, distortion)
-    for number, image in track(list(photographs.places.items()), "first pass", console=console):
+    for number, image in tracked(list(photographs.places.items()), "first pass", console=console):
         places.add(number, image)
     verdicts = [
         places.ask(number, image, photographs.references[number])
-        for number, image in track(list(photographs.questions.items()), "questions", console=console)
+        for number, image in tracked(list(photographs.questions.items()), "questions", console=console)
     ]
     about = {"folder": folder.name, "nodes": len(photographs.places), "focal_px": camera.fx}
     return RelocalizationEvaluation(about, {"looks": verdicts}, photograph_trials(verdicts))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from mapweave.evaluation.map_score import write_tum
 from mapweave.formats.g2o import G2oEdge, G2oGraph, write_g2o
+from mapweave.formats.graph import graph_of
 from mapweave.formats.map_part import MapPart
 from mapweave.hybridmap.node import Edge, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -57,22 +59,8 @@ def export_tum(part: MapPart, out: Path) -> list[Path]:
 
 def export_graphml(part: MapPart, out: Path) -> list[Path]:
     """Places and edges with their numbers, for networkx, Gephi, yEd and the like."""
-    graph: nx.MultiGraph = nx.MultiGraph(component=part.component)
-    for node in part.nodes:
-        x, y, heading = (float(value) for value in part.pose(node).vector)
-        stamp = part.node(node).stamp_ns
-        graph.add_node(
-            str(node), map=str(node.map), x=x, y=y, heading=heading, stamp_ns=stamp,
-            landmarks=len(part.node(node).landmarks),
-        )  # fmt: skip
-    for edge in part.graph.edges.values():
-        x, y, heading = (float(value) for value in edge.a_from_b.mean.vector)
-        sigma = np.sqrt(np.diag(edge.a_from_b.covariance))
-        graph.add_edge(
-            str(edge.a), str(edge.b), key=str(edge.id), kind=str(edge.kind), a=str(edge.a), x=x, y=y,
-            heading=heading, sigma_xy=float(sigma[:2].max()), sigma_heading=float(sigma[2]),
-            shared=len(edge.shared), **_link_numbers(part, edge),
-        )  # fmt: skip
+    placed = {node: (part.component, part.pose(node)) for node in part.nodes}
+    graph = graph_of(part.graph.nodes, placed, part.graph.edges.values(), partial(_link_numbers, part))
     text = io.BytesIO()
     nx.write_graphml(graph, text)
     write_whole(out, text.getvalue())

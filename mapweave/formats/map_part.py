@@ -15,6 +15,8 @@ from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
+IDENTITY = Pose2()
+
 
 @dataclass(frozen=True, eq=False)
 class MapPart:
@@ -23,10 +25,12 @@ class MapPart:
     Attributes:
         merged: the whole map.
         component: its number, 0 is the largest.
+        frame_from_merged: takes coordinates of the component to those that are written.
     """
 
     merged: MergedMap
     component: int = 0
+    frame_from_merged: Pose2 = IDENTITY
 
     def __post_init__(self) -> None:
         """Refuse a component that is not there (InvalidValue)."""
@@ -79,5 +83,5 @@ class MapPart:
         return self.merged.maps[node.map].nodes[node]
 
     def pose(self, node: NodeId) -> Pose2:
-        """Pose in the component's frame."""
-        return self.merged.pose(node)
+        """Pose in the frame that is written."""
+        return self.frame_from_merged @ self.merged.pose(node)

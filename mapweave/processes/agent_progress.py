@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import TracebackType
+
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
 from mapweave.agent.observation import Observation
 from mapweave.agent.pipeline import Step
+from mapweave.terminal import Bar, EventLog
 
 
 class AgentProgress:
@@ -20,31 +22,28 @@ class AgentProgress:
             name: of the agent.
             total: observations that will come, if that is known.
         """
-        self._console, self._name, self._total = console, name, total
-        self._bar: Progress | None = None
+        self._name, self._say = name, EventLog(console)
+        self._bar = None if total is None else Bar(console, name, total)
         self._last_line = ""
 
     def __enter__(self) -> AgentProgress:
         """Begin."""
-        if self._total is not None:
-            self._bar = Progress(
-                SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                TextColumn("{task.fields[detail]}"), console=self._console,
-            )  # fmt: skip
-            self._task = self._bar.add_task(self._name, total=self._total, detail="")
-            self._bar.start()
+        if self._bar is not None:
+            self._bar.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """End."""
         if self._bar is not None:
-            self._bar.stop()
+            self._bar.__exit__(kind, error, trace)
 
     def __call__(self, observation: Observation, step: Step) -> None:
         """Show a tick."""
         status = step.status
         if self._bar is not None:
-            self._bar.update(self._task, advance=1, detail=f"{status.nodes} nodes, {status.detail}")
+            self._bar.advance(1, f"{status.nodes} nodes, {status.detail}")
         elif status.doing != self._last_line:
             self._last_line = status.doing
-            self._console.print(f"{self._name}: {status.doing} ({status.nodes} nodes) {status.detail}")
+            self._say(f"{self._name}: {status.doing} ({status.nodes} nodes) {status.detail}")

@@ -28,8 +28,9 @@ from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.values import BASES, FOOTPRINT, TF_TYPE, heading_of, stamp_of
-from mapweave.hybridmap.node import Edge, EdgeKind, Node, NodeId
+from mapweave.hybridmap.node import Edge, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
+from mapweave.processes.edge_colours import COLOURS
 from mapweave.wire.pose_messages import MergedPose
 from mapweave.wire.ros2.messages import decode, make
 from mapweave.wire.ros2.node import Arrival, Ros2Node
@@ -50,10 +51,6 @@ LONGEST_PATH = 2000
 """Poses; the oldest are left out."""
 KEPT = 256
 """Odometry transforms; four seconds of the quickest robots."""
-COLOURS = {
-    EdgeKind.MAPPED: (0.2, 0.7, 0.3), EdgeKind.TURNED: (0.6, 0.6, 0.6), EdgeKind.DRIVEN: (0.2, 0.5, 0.9),
-    EdgeKind.LOOP: (0.95, 0.6, 0.1), EdgeKind.MERGED: (0.85, 0.2, 0.6),
-}  # fmt: skip
 SPHERES, LINES, ADD, DELETE = 7, 5, 0, 2
 """Of visualization_msgs/msg/Marker."""
 

@@ -6,14 +6,12 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import MapweaveError, SettingsError
 from mapweave.scenarios.batch_table import Attempt, batch_json, batch_table
 from mapweave.scenarios.run import TrialOptions, run_trial
 from mapweave.scenarios.scenario import Scenario
+from mapweave.terminal import Bar, plain_or_terminal
 
 MOST_SEEDS = 10_000
 
@@ -54,29 +52,24 @@ def run_batch_of_trials(scenario: Scenario, options: BatchOptions) -> bool:
     Returns:
         Whether every trial ran to its end and met its expectations.
     """
-    console = Console(stderr=True, quiet=options.json)
+    console = plain_or_terminal(quiet=options.json)
     attempts: list[Attempt] = []
-    columns = (
-        TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("{task.fields[detail]}"),
-    )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task(scenario.name, total=options.seeds, detail="")
+    with Bar(console, scenario.name, options.seeds) as bar:
         for seed in range(options.first, options.first + options.seeds):
-            progress.update(task, detail=f"seed {seed}")
+            bar.update(seed - options.first, f"seed {seed}")
             attempts.append(_attempt(scenario, options, seed))
             failed = [failed_attempt for failed_attempt in attempts if not failed_attempt.passed]
             if attempts[-1] in failed:
                 for line in attempts[-1].complaints:
                     console.print(f"seed {seed}: {line}", highlight=False)
-            progress.update(task, advance=1, detail=f"{len(failed)} failed")
+            bar.advance(1, f"{len(failed)} failed")
     summary = batch_json(attempts)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "batch.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if options.json:
         print(json.dumps(summary))
     else:
-        Console().print(batch_table(attempts, scenario.name))
+        plain_or_terminal(stderr=False).print(batch_table(attempts, scenario.name))
     return all(attempt.passed for attempt in attempts)
 
 

@@ -28,6 +28,7 @@ class Stage:
         out: folder: `agents/` holds journals and map files, `server/` the store, `logs/` the output.
         settings: of every robot's pipeline.
         settings_file: where they came from, if from a file.
+        rerun: whether each robot's agent writes a log for the Rerun viewer.
     """
 
     scenario: Scenario
@@ -35,6 +36,7 @@ class Stage:
     out: Path
     settings: AgentSettings
     settings_file: Path | None = None
+    rerun: bool = False
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -50,6 +52,12 @@ class Stage:
     def store(self) -> Path:
         """The server's store."""
         return self.out / "server" / f"{SERVER}.sqlite"
+
+    def rerun_log(self, robot: str) -> str | None:
+        """File of a robot's log, `r0.1.rrd`; `r0.2.rrd` when its agent is started again."""
+        folder = self.out / "rerun"
+        starts = len(list(folder.glob(f"{robot}.*.rrd")))
+        return str(folder / f"{robot}.{starts + 1}.rrd") if self.rerun else None
 
     def agent_seed(self, robot: str) -> int:
         """Of a robot's random choices."""

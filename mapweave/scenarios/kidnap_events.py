@@ -24,7 +24,7 @@ class KidnapEvents:
 
     Attributes:
         lost: in order.
-        sent: the robot that was sent last.
+        sent: by robot, what became of the last goal that it was sent to.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class KidnapEvents:
         self._command = command
         self._note = note
         self.lost: list[Lost] = []
-        self.sent: Lost | None = None
+        self.sent: dict[str, Lost] = {}
         self._plot: Kidnapping | None = None
 
     def look(self, agents: Mapping[str, AgentStatus]) -> None:
@@ -57,7 +57,7 @@ class KidnapEvents:
                 lost.fix = Fix(report.stamp_ns, status.fix_node, status.node_from_robot)
             if lost.arrived_ns is None and status.mission == "goto":
                 lost.legs = max(lost.legs, status.legs)
-                if status.finished and lost is self.sent:
+                if status.finished and lost is self.sent.get(lost.robot):
                     lost.arrived_ns = report.stamp_ns
 
     def merged(self) -> MapFile:
@@ -109,19 +109,19 @@ class KidnapEvents:
     def send(self, robot: str, goal: str) -> None:
         """Send a robot, or the last lost one, to a goal; see `actions.Send`."""
         lost = next((record for record in reversed(self.lost) if robot in ("", record.robot)), None)
-        if lost is None:
-            if not robot:
-                self._note("no robot is sent: none was lost", True)
-                return
-            # A robot that was not kidnapped is sent from where it is localized.
-            self.mark(robot)
+        if lost is None and not robot:
+            self._note("no robot is sent: none was lost", True)
+            return
+        if lost is None or lost.goal is not None:
+            # It was not kidnapped, or has been sent since: it is sent from where it is now.
+            self.mark(robot if lost is None else lost.robot)
             lost = self.lost[-1]
         try:
             node = self._goal(lost, goal)
         except NothingToShow as reason:
             self._note(f"{lost.robot} is not sent: {reason}", True)
             return
-        lost.goal, self.sent = node, lost
+        lost.goal, self.sent[lost.robot] = node, lost
         self._command(lost.robot, MissionKind.GO, node)
         self._note(f"{lost.robot} shall go to {node}", False)
 

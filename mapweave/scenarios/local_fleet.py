@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from mapweave.agent.observation import Command
+from mapweave.agent.observation import Command, Observation
+from mapweave.agent.pipeline import Step
 from mapweave.agent.synchronization import Lockstep
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
-from mapweave.processes.agent import Agent, AgentOptions
+from mapweave.processes.agent import Agent, AgentOptions, rerun_log
 from mapweave.scenarios.actions import MISSION_KINDS
 from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
 from mapweave.settings import load_settings
@@ -23,6 +25,9 @@ from mapweave.sim.keys import SimKeys
 from mapweave.sim.simulation import Simulation
 from mapweave.wire.bus import Request
 from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
+
+if TYPE_CHECKING:
+    from mapweave.processes.rerun_log import RerunLog
 
 OVERTAKEN = 0.5
 """Share of a bad network's messages that later ones overtake."""
@@ -40,6 +45,7 @@ class LocalFleet:
         self.control = SimControl(self.bus, FLEET, timeout=60.0)
         self._buses: dict[str, MemoryBus] = {}
         self._agents: dict[str, Agent] = {}
+        self._logs: dict[str, RerunLog] = {}
         self._commands: dict[str, Command] = {}
         self._server: MapServer | None = None
         self._server_bus: MemoryBus | None = None
@@ -94,6 +100,9 @@ class LocalFleet:
     def kill_agent(self, robot: str) -> None:
         """Drop an agent. In lock-step all that it has mapped is on its disk already."""
         self._agents.pop(robot).close()
+        if robot in self._logs:
+            missing = self._logs.pop(robot).close()
+            self._log += [f"{robot}: not in the Rerun log: {missing}"] if missing else []
         self._commands.pop(robot, None)
         self._buses.pop(robot).close()
 
@@ -111,9 +120,16 @@ class LocalFleet:
             synchronization=Lockstep(),
             server=SERVER,
         )
+        if path := stage.rerun_log(robot):
+            self._logs[robot] = rerun_log(path, robot)
+
+        def stepped(observation: Observation, step: Step) -> None:
+            if robot in self._logs:
+                self._logs[robot].step(observation, step, self._agents[robot].pipeline)
+
         self._agents[robot] = Agent(
-            lambda: simulation.describe(robot), bus, self.keys, stage.settings, options,
-            print_line=self._log.append,
+            lambda: simulation.describe(robot), bus, self.keys, stage.settings, options, stepped,
+            self._log.append,
         )  # fmt: skip
 
     def kill_server(self) -> None:

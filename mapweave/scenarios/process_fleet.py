@@ -82,7 +82,8 @@ class ProcessFleet:
             "--mission", stage.scenario.missions[robot],
             "--connect", _endpoint(port), "--body", _endpoint(self._simulator_port),
         ]  # fmt: skip
-        self._children.start(robot, [*arguments, *self._settings()])
+        log = stage.rerun_log(robot)
+        self._children.start(robot, [*arguments, *self._settings(), *(["--rerun", log] if log else [])])
 
     def _settings(self) -> list[str]:
         file = self._stage.settings_file

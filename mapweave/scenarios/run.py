@@ -25,7 +25,7 @@ from mapweave.sim.placement import starting_places
 
 OWN = ".mapweave-trial"
 """A file of this name marks a folder as a trial's: only there folders are taken away."""
-FOLDERS = ("agents", "server", "logs", "photographs")
+FOLDERS = ("agents", "server", "logs", "photographs", "rerun")
 FILES = (
     "*.tum", "*.mapweave", "figures.json", "report.*", "map.png", "errors.png", "film.webm", "scenario.toml",
 )  # fmt: skip
@@ -44,6 +44,7 @@ class TrialOptions:
         film_every: simulated seconds between two frames of the film; 0 makes none.
         view: port of the live view, None for none.
         quiet: no progress on the terminal.
+        rerun: whether each robot's agent writes a log for the Rerun viewer.
     """
 
     seed: int
@@ -54,6 +55,7 @@ class TrialOptions:
     film_every: float = 1.0
     view: int | None = None
     quiet: bool = False
+    rerun: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,7 @@ def run_trial(scenario: Scenario, options: TrialOptions) -> Trial:
     # A world that cannot be built shall be one line, before anything has been started.
     starting_places(scenario.world(options.seed), scenario.robots, options.seed)
     _make_room(options.out)
-    stage = Stage(scenario, options.seed, options.out, options.settings, options.settings_file)
+    stage = Stage(scenario, options.seed, options.out, options.settings, options.settings_file, options.rerun)
     with TerminalProgress(scenario.name, stage.robots, len(scenario.events), options.quiet) as show:
         recording = _record(stage, options, show)
         show.stage("scoring")

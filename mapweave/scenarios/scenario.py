@@ -48,7 +48,7 @@ CONDITIONS = {
     "joined": "the merged map has one component that holds every robot's map",
     "explored": "no robot finds anything new to explore",
     "found": "the robot that was lost last knows where it is",
-    "arrived": "the robot that was sent last reports that it has arrived",
+    "arrived": "the robots that were sent report that they have arrived",
     "grown": "the agent that was started last has made a new node",
 }
 

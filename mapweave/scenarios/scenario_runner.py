@@ -155,8 +155,8 @@ class ScenarioRunner:
             case "found":
                 return bool(self.lost) and self.lost[-1].fix is not None
             case "arrived":
-                sent = self._losing.sent
-                return sent is not None and sent.arrived_ns is not None
+                sent = self._losing.sent.values()
+                return bool(sent) and all(one.arrived_ns is not None for one in sent)
             case _:
                 robot, nodes = self._grown
                 return robot in self.agents and self.agents[robot].status.nodes > nodes

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from mapweave.scenarios.scenario_runner import ScenarioRunner
+from mapweave.terminal import EVERY, plain_or_terminal
 
 
 class TerminalProgress:
@@ -15,7 +16,8 @@ class TerminalProgress:
 
     def __init__(self, name: str, robots: tuple[str, ...], events: int, quiet: bool) -> None:
         """Prepare; with `quiet` nothing is shown."""
-        self._console = Console(stderr=True, quiet=quiet)
+        self._console = plain_or_terminal(quiet=quiet)
+        self._said_at = 0.0
         self._progress = Progress(
             TextColumn("{task.description:>8}"), BarColumn(bar_width=24), TimeElapsedColumn(),
             TextColumn("{task.fields[doing]}"), console=self._console, transient=False,
@@ -28,14 +30,16 @@ class TerminalProgress:
 
     def __enter__(self) -> TerminalProgress:
         """Begin to show."""
-        self._progress.start()
+        if self._console.is_terminal:
+            self._progress.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Leave the last state on the terminal."""
-        self._progress.stop()
+        if self._console.is_terminal:
+            self._progress.stop()
 
     def say(self, text: str) -> None:
         """One line that stays."""
@@ -44,6 +48,8 @@ class TerminalProgress:
     def stage(self, text: str) -> None:
         """Print an activity outside the scenario."""
         self._progress.update(self._whole, doing=text)
+        if not self._console.is_terminal:
+            self._console.print(text, highlight=False)
 
     def look(self, runner: ScenarioRunner) -> None:
         """Print the progress of the trial, and the activity of every robot."""
@@ -51,6 +57,9 @@ class TerminalProgress:
             self._console.print(f"{moment.stamp_ns / 1e9:7.1f} s  {moment.text}", highlight=False)
         self._printed = len(runner.moments)
         doing = f"{runner.now:6.1f} s  {runner.doing}"
+        if not self._console.is_terminal and time.monotonic() - self._said_at >= EVERY:
+            self._console.print(f" {doing}", highlight=False)
+            self._said_at = time.monotonic()
         self._progress.update(self._whole, completed=float(runner.done), doing=doing[:110])
         for robot, task in self._robots.items():
             report = runner.agents.get(robot)

@@ -20,7 +20,7 @@ from mapweave.wire.messages import decode, encode
 
 PERIOD = 0.1
 """Between two commands at the most, s."""
-FIRST = 3.0
+FIRST = 1.0
 """How long the agent may take for its first answer, s."""
 
 

@@ -67,7 +67,7 @@ def agglomerate(
     refused = {r.pair: r for key in asked for r in groups[key].sorted.refused if r.pair not in keys}
     waiting = [link for key, links in asked.items() if key[0] != key[1] for link in links]
     between = {key: group.sorted for key, group in groups.items() if group.first is not group.second}
-    chance = _chance_support(groups)
+    chance = _chance_support(groups, standing)
     agreed = {
         link.key
         for key in asked
@@ -161,9 +161,9 @@ def _sorted(
     return sort_links(best, first, second, s)
 
 
-def _chance_support(groups: Mapping[Key, LinkGroup]) -> dict[MapId, ChanceSupport]:
+def _chance_support(groups: Mapping[Key, LinkGroup], standing: Sequence[Link]) -> dict[MapId, ChanceSupport]:
     """Chance support by map: measured on all maps that links connect to it, directly or not."""
-    ties: nx.Graph = nx.Graph()
+    ties: nx.Graph = nx.Graph(link.maps for link in standing)
     ties.add_edges_from((group.first.name.map, group.second.name.map) for group in groups.values())
     out: dict[MapId, ChanceSupport] = {}
     for island in nx.connected_components(ties):

@@ -51,8 +51,6 @@ class Standpoint(NamedTuple):
         strain2: `off` in the link's own uncertainty, chi-square with 3 degrees of freedom.
         alone: whether only this link connects the two.
         log_factor: natural logarithm of Bayes' factor for the link, 0 if it is alone.
-        distance2: of the link from the rest of the map, chi-square with 3 degrees of freedom, 0 if it is
-            alone.
     """
 
     merged_a_from_b: PoseGaussian
@@ -60,7 +58,6 @@ class Standpoint(NamedTuple):
     strain2: float
     alone: bool
     log_factor: float
-    distance2: float = 0.0
 
 
 def prior_odds(merged: MergedMap) -> float:
@@ -136,5 +133,5 @@ def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> St
     log_density = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * spread)[1])
     if log_density <= anywhere:
         return Standpoint(merged, off, strain2, True, 0.0)
-    distance2 = float(moved @ np.linalg.solve(spread, moved))
-    return Standpoint(merged, off, strain2, False, log_density - 0.5 * distance2 - anywhere, distance2)
+    factor = log_density - 0.5 * float(moved @ np.linalg.solve(spread, moved)) - anywhere
+    return Standpoint(merged, off, strain2, False, factor)

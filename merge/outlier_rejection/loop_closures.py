@@ -43,7 +43,7 @@ def sort_loop_closures(edges: Iterable[Edge], s: ConsistencySettings) -> tuple[C
         recognition = recognised.get(pair)
         if recognition is None:
             claims[pair] = (edge,)
-        elif _alike(link_of(edge).a_from_b, link_of(recognition).a_from_b, s):
+        elif distance2_of(link_of(edge).a_from_b, link_of(recognition).a_from_b, s) < s.gate:
             both = sorted(
                 (edge, recognition), key=lambda one: float(link_of(one).a_from_b.covariance.trace())
             )
@@ -53,7 +53,8 @@ def sort_loop_closures(edges: Iterable[Edge], s: ConsistencySettings) -> tuple[C
     return claims, refusals
 
 
-def _alike(a: PoseGaussian, b: PoseGaussian, s: ConsistencySettings) -> bool:
+def distance2_of(a: PoseGaussian, b: PoseGaussian, s: ConsistencySettings) -> float:
+    """Squared Mahalanobis distance of two measurements of one pose, chi-square with 3 degrees of freedom."""
     spread = b.covariance.copy()
     spread[[0, 1, 2], [0, 1, 2]] += s.floor_xy**2, s.floor_xy**2, s.floor_heading**2
-    return PoseGaussian(a.mean, a.covariance + spread).mahalanobis2(b.mean) < s.gate
+    return PoseGaussian(a.mean, a.covariance + spread).mahalanobis2(b.mean)

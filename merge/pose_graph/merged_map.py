@@ -14,6 +14,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, nearest_covariance
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.merge.pose_graph.links import Link, RefusedLink
@@ -33,7 +34,7 @@ class Placement(NamedTuple):
     Attributes:
         component: number of the component, 0 is the largest.
         merged_from_robot: pose in the component's frame, which is the map frame of the component's
-            smallest node id.
+            smallest node id, unless a pin holds it (mapweave.merge.pose_graph.pinned_frames).
     """
 
     component: int
@@ -129,6 +130,7 @@ class MergedMap:
         set_apart: maps that are not among these, because the merge fails with them, and why.
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
         contradicted: links by hand that the rest of the map contradicts, by their nodes, and how.
+        pins: people's pins of components' frames, oldest first.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -143,6 +145,7 @@ class MergedMap:
     set_apart: Mapping[MapId, str] = field(default_factory=dict)
     wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
     contradicted: Mapping[tuple[NodeId, NodeId], str] = field(default_factory=dict)
+    pins: tuple[Pin, ...] = ()
 
     @staticmethod
     def empty() -> MergedMap:

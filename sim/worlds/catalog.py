@@ -15,6 +15,7 @@ from mapweave.sim.worlds.corridor import CorridorParameters, corridor
 from mapweave.sim.worlds.design import MAX_SEED, Design, within
 from mapweave.sim.worlds.file import load_world
 from mapweave.sim.worlds.office import OfficeParameters, office
+from mapweave.sim.worlds.passage import PassageParameters, passage
 from mapweave.sim.worlds.twins import TwinsParameters, twins
 from mapweave.sim.worlds.warehouse import WarehouseParameters, warehouse
 from mapweave.storage.settings_file import build
@@ -39,6 +40,7 @@ KINDS: dict[str, Kind] = {
     "warehouse": Kind(WarehouseParameters, warehouse),
     "twins": Kind(TwinsParameters, twins),
     "arena": Kind(ArenaParameters, arena),
+    "passage": Kind(PassageParameters, passage),
 }
 
 

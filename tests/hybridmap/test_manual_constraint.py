@@ -13,11 +13,13 @@ from mapweave.hybridmap.constraint_subject import (
     Linked,
     RetiredMap,
     RetiredNodes,
+    RetiredWindow,
     read_pose,
     read_retired,
     read_window,
 )
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, event_words
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -80,7 +82,8 @@ def test_the_last_constraint_counts_in_any_order(made, cut) -> None:
     excluded = any(c.holds and c.about.key in excluding for c in last.values())
     assert (whole.against(B, A) is not None) == excluded
     linked = last.get(Linked(A, B).key)
-    assert ((A, B) in whole.links) == (linked is not None and linked.holds and not excluded)
+    holds = linked is not None and linked.holds and linked.about.pose is not None
+    assert ((A, B) in whole.links) == (holds and not excluded)
 
 
 def test_retired_nodes_are_linked_with_nothing() -> None:
@@ -129,13 +132,14 @@ def test_an_area_contains_what_its_sides_go_round_an_odd_number_of_times(corners
 def test_subjects_as_people_write_them() -> None:
     assert read_retired(["a.1"]) == RetiredMap(A.map) and read_retired(["b.1.5", "a.1.3"]).nodes == (A, B)
     assert read_corner("1.5,-2") == (1.5, -2.0) and read_pose([1, 2, 180]).heading == pytest.approx(np.pi)
-    window = read_window(A.map, "1970-01-01T00:01", "1970-01-01T01:02+01:00")
+    window = read_window(A.map, "1970-01-01T00:01", "1970-01-01T01:02+01:00", 0)
     assert (window.begin_ns, window.end_ns) == (60 * 10**9, 120 * 10**9)
-    assert read_window(A.map, "7").begin_ns == 7 and read_window(A.map, end=9).end_ns == 9
+    assert read_window(A.map, "7", 9, 0) == RetiredWindow(A.map, 7, 9)
+    assert read_window(A.map, "", "", 0) == RetiredWindow(A.map, 0, MAX_STAMP_NS)
     for wrong in (
         lambda: read_retired(["a.1", "b.1"]), lambda: read_retired([]), lambda: read_corner("1;2"),
-        lambda: read_pose([1.0, float("nan"), 0.0]), lambda: read_window(A.map, "noon"),
-        lambda: read_window(A.map, 5, 4), lambda: Area(A, ((0.0, 0.0), (1.0, 0.0), (1e5, 1.0))),
+        lambda: read_pose([1.0, float("nan"), 0.0]), lambda: read_window(A.map, "noon", "", 0),
+        lambda: read_window(A.map, 5, 4, 0), lambda: Area(A, ((0.0, 0.0), (1.0, 0.0), (1e5, 1.0))),
     ):  # fmt: skip
         with pytest.raises(InvalidValue):
             wrong()

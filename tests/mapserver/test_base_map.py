@@ -13,6 +13,7 @@ import pytest
 from mapweave.agent.replication.epochs import newest_on_server
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile
@@ -21,6 +22,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import ResolveRequest
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.server import MapServer
@@ -147,12 +149,15 @@ def test_another_map_of_the_same_name_is_refused_and_the_base_stays(tmp_path: Pa
         assert server.status()["nodes"] == 4, "the store is free again"
 
 
-def test_constraints_of_the_base_hold(tmp_path: Path) -> None:
+def test_constraints_and_annotations_of_the_base_hold(tmp_path: Path) -> None:
     apart = ManualConstraint(Apart((R0, R1)), True, "anna", 5, "two kitchens")
-    content = map_file_of(merge_parts(BASE.maps, ManualConstraints([apart])))
+    kitchen = Annotation("kitchen", Place(NodeId(*R0, 3)), False, "anna", 6)
+    content = map_file_of(merge_parts(BASE.maps, ManualConstraints([apart])), (), Annotations((kitchen,)))
     with serving(tmp_path, BaseMap.of("apart.mapweave", content)) as (server, _):
         assert server.status()["components"] == 2 and server.status()["constraints"] == 1
+        assert server.resolve(ResolveRequest(("kitchen",))).found[0].node == NodeId(*R0, 3)
         assert [event.words for event in server.history()] == [
             'r0.4 and r1.1: undone with all links between r0.4 and r1.1 by anna on 1970-01-01 00:00 UTC: '
-            '"two kitchens"'
+            '"two kitchens"',
+            "place kitchen is node r0.4.3, by anna",
         ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.mapserver.log.store import Store
@@ -229,3 +231,27 @@ def test_it_comes_through_bytes() -> None:
     for fields in ({}, *({"history": item} for item in wrong)):
         with pytest.raises(InvalidMessage):
             decode(pack(fields), History)
+
+
+def test_a_pinned_frame_that_moves_is_listed_with_its_change(merger: Merger, store: Store) -> None:
+    history = MapHistory(store)
+    older, newer = (
+        Pin(min(merger.maps[B].nodes), Pose2(3.0, 4.0, 1.0)),
+        Pin(min(merger.maps[A].nodes), Pose2()),
+    )
+    merger.pin([older, newer])
+    for constraints in (APART, ManualConstraints(), ManualConstraints(), APART):
+        merger.constrain(constraints)
+        merged = merger.merged()
+        history.follow(merged)
+        if constraints is not APART:
+            change = merged.pose(newer.node)
+            # A server that starts again does not report it again.
+            history = MapHistory(store)
+    merger.pin([])
+    history.follow(merger.merged())
+    words = [event.words for event in history.events if event.kind is MapEventKind.FRAME]
+    turn = f"turned by {math.degrees(change.heading):.2f} deg about the origin"
+    shift = f"then shifted by {change.x:.3f}, {change.y:.3f} m"
+    assert len(words) == 2 and turn in words[0] and shift in words[0] and str(older.node) in words[0]
+    assert words[1] == f"the pin of {newer.node} holds its component's frame again"

@@ -48,7 +48,7 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
     while not worker.settled:
         assert time.monotonic() < end
         time.sleep(0.001)
-    assert worker.answers.merged.constraints is constraints
+    assert worker.answers.merged.constraints.made == constraints.made
     worker.close()
 
 

@@ -132,7 +132,7 @@ def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
             call()
     link.close()
     other.close()
-    with pytest.raises(NotConnected, match="robot r0 did not take its mission: no answer"):
+    with pytest.raises(NotConnected, match="robot r0 does not answer: is its agent running"):
         house.person.stop("r0")
 
 
@@ -151,7 +151,7 @@ def test_a_person_whose_clock_is_behind_can_still_stop_a_robot(house: House, wit
 
 
 def test_the_map_comes_as_a_map_file(house: House) -> None:
-    assert len(house.person.map().poses) == 7
+    assert len(house.person.content.poses) == 7
 
 
 # Over HTTP

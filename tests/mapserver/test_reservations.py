@@ -128,6 +128,27 @@ def test_of_two_head_on_the_later_one_steps_aside_into_the_niche(router: Router)
     assert (waits.granted, waits.holder, waits.aside) == (0, "r0", None), "and the second waits there"
 
 
+def test_the_robot_with_the_shorter_way_aside_steps_aside(router: Router) -> None:
+    """It set out first, yet stands beside the niche; the other would have to go back by the hall."""
+    traffic = Traffic(router)
+    traffic.ask("r0", 4, 5, 6, 7, off=0.3)
+    traffic.ask("r1", 8, 7)
+    for _ in range(2):
+        coming = traffic.ask("r1", 7, 6, 5, 4, 3, 2)
+        beside = traffic.ask("r0", 4, 5, 6, 7, 8, off=0.3)
+    assert (coming.holder, coming.aside) == ("r0", None)
+    assert (beside.granted, beside.holder, beside.aside) == (0, "r1", node(9))
+
+
+def test_a_robot_does_not_step_aside_to_where_the_other_will_box_it_in(router: Router) -> None:
+    """r1 wants to node 1. Node 0 behind that is nearer to r0 than the niche, and a dead end."""
+    traffic = Traffic(router)
+    for _ in range(3):
+        traffic.ask("r1", 8, 7, 6, 5, 4, 3, 2, 1)
+        waits = traffic.ask("r0", 1, 2, 3, 4, 5, 6, 7, 8)
+    assert waits.aside == node(9)
+
+
 def test_robots_side_by_side_may_part(router: Router) -> None:
     """They stand nearer to each other than two robots ever pass: away from each other both may drive."""
     traffic = Traffic(router)

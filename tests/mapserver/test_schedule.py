@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
+from mapweave.hybridmap.agent_status import AgentStatus, Status
+from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.schedule import OVERDUE, LiveSchedule, LockstepSchedule, Schedule
+from mapweave.mapserver.server import MapServer
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import encode
 from tests.waiting import eventually
 
 
@@ -102,3 +109,15 @@ def test_in_lockstep_work_runs_on_demand_in_simulated_time() -> None:
     schedule.observe(1_900_000_000)
     schedule.catch_up()
     assert done == ["job", "beat"] and schedule.time_ns() == 1_900_000_000
+
+
+def test_in_lock_step_time_passes_while_nothing_is_mapped(tmp_path: Path) -> None:
+    """Leases of robots that only drive expire by it."""
+    schedule, keys, hub = LockstepSchedule(), Keys("demo"), MemoryHub()
+    status = AgentStatus(Status("driving", "", 3, 40, Pose2(), False), 7_000_000_000, "r0", 1)
+    robot, bus = MemoryBus(hub), MemoryBus(hub)
+    with MapServer(bus, keys, tmp_path / "s.mapweave", "s0", schedule=schedule):
+        robot.publish(keys.agent_status("r0"), encode(status))
+        eventually(lambda: schedule.monotonic() == 7.0)
+    robot.close()
+    bus.close()

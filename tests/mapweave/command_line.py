@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 
 import pytest
 
 from mapweave.cli import main, parser
+from mapweave.commands.examples import parsers_of
 
 CAMERA = "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m = 0.3\n"
 
@@ -22,19 +22,16 @@ def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     return output[0]
 
 
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """The parser of every command, by its words: `map`, `map show` ..."""
+    return parsers_of(parser())
+
+
 def commands(runnable: bool = False) -> list[str]:
-    """Every command that the parser has, as words: `map`, `map show` ...
+    """Every command that the parser has, as words.
 
     Args:
         runnable: only those that do something; not `map`, which has actions of its own.
     """
-
-    def walk(words: list[str], at: argparse.ArgumentParser) -> Iterator[list[str]]:
-        inner = [action for action in at._actions if isinstance(action, argparse._SubParsersAction)]
-        if words and not (inner and runnable):
-            yield words
-        for action in inner:
-            for name, choice in action.choices.items():
-                yield from walk([*words, name], choice)
-
-    return [" ".join(words) for words in walk([], parser())]
+    words = list(parsers())
+    return [w for w in words if not (runnable and any(other.startswith(f"{w} ") for other in words))]

@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from mapweave.cli import main
+from mapweave.exit_status import NO
 from tests.mapweave.command_line import commands, complaint
 
 pytestmark = pytest.mark.usefixtures("signals", "simulator")
@@ -88,11 +89,11 @@ def test_a_batch_names_its_failures(capfd, tmp_path):
         'robots = 1\n[world]\nkind = "arena"\n[[events]]\nat = 1.0\ndo = "wait"\n[expect]\nnodes = 77\n'
     )
     arguments = ["sim", "batch", path, "--seeds", 2, "--first", 4, "--one-process", "--out", tmp_path / "out"]
-    assert main([str(a) for a in arguments]) == 2
+    assert main([str(a) for a in arguments]) == NO
     output = capfd.readouterr()
     assert "seed 4: nodes is" in output.err
     assert "seed 5: nodes is" in output.err
-    assert main([str(a) for a in [*arguments, "--json"]]) == 2
+    assert main([str(a) for a in [*arguments, "--json"]]) == NO
     values = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
     assert values == json.loads((tmp_path / "out" / "batch.json").read_text())
     assert "seeds" in complaint(capfd, "sim", "batch", path, "--seeds", 0)

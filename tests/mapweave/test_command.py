@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import io
 import json
+import socket
+import time
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from mapweave.cli import main
-from mapweave.commands.missions import NOT_DONE
 from mapweave.commands.status import cells, table
+from mapweave.exit_status import NO
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
@@ -22,7 +24,7 @@ from mapweave.storage.map_file import read_map_file
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
-from tests.mapweave.command_line import complaint
+from tests.mapweave.command_line import complaint, parsers
 from tests.mapweave.test_kept_maps import PATIENCE, Body
 from tests.waiting import eventually
 
@@ -103,7 +105,7 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
             assert len(read_map_file(tmp_path / "m.mapweave", "merged").poses) >= 2
             assert "r0.7.1 is not in the merged map" in complaint(capfd, "go", "r0", "r0.7.1", *network)
             code, printed = shell("go", "r0", "r0.1.999")
-            assert code == NOT_DONE and "refused: there is no node r0.1.999" in printed
+            assert code == NO and "refused: there is no node r0.1.999" in printed
             code, printed = shell("status")
             assert code == 0 and "r0" in printed and "go to r0.1.1" in printed
             code, printed = shell("stop", "--all")
@@ -114,11 +116,43 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
         bus.close()
 
 
-def test_without_a_router_one_line_says_what_to_do(capfd: pytest.CaptureFixture[str]) -> None:
-    closed = f"tcp/127.0.0.1:{free_port()}"
-    for words in (["status"], ["map", "fetch", "out.mapweave"]):
-        output = complaint(capfd, *words, "--connect", closed)
-        assert f"no router at {closed}: start `mapweave server`" in output
+ASKING = {
+    "status": [], "go": ["r0", "home"], "explore": ["r0"], "stop": ["r0"], "map fetch": ["out.mapweave"],
+    "map explain": ["r0.1", "r1.1"], "map route": ["r0.1.1", "r0.1.2"], "map history": [],
+    "missions": [], "map link": ["r0.1.1", "r1.1.2"], "map undo": [],
+    "place add": ["kitchen", "r0.1.17"], "place list": [], "place remove": ["kitchen"], "close": ["r0.1.1"],
+    "reopen": ["kitchen"], "prefer": ["r0.1.1", "r0.1.2"], "avoid": ["r0.1.1", "r0.1.2"], "closures": [],
+    "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"],
+    "relocalize": ["walk/images/0.png"],
+    "record": ["r0", "--out", "drive"], "drive": ["r0", "--gamepad", "/dev/null"],
+    "calibrate drive": ["--robot", "remote", "--name", "r0"],
+    "map from-photos": ["walk/images", "--camera", "walk/camera.toml", "--spacing", "0.5", "--out",
+                        "out.mapweave", "--send"],
+}  # fmt: skip
+"""Commands that need a server, or a robot behind a router."""
+GO_ON = ["agent", "replay", "doctor", "sim serve"]
+"""Those that also look for one, and do without it."""
+
+
+def test_the_commands_that_look_for_a_server_are_known() -> None:
+    found = [words for words, parser in parsers().items() if "--connect ENDPOINT" in parser.format_help()]
+    assert sorted(found) == sorted([*ASKING, *GO_ON])
+
+
+@pytest.mark.usefixtures("signals")
+@pytest.mark.parametrize("words", ASKING)
+def test_without_a_router_one_line_says_so_and_what_to_do(
+    words: str, recording: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within the time for that, and no other: whatever listens there accepts, and says nothing."""
+    monkeypatch.chdir(recording.parent)
+    monkeypatch.setattr("mapweave.connection.SOON", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        where = f"tcp/127.0.0.1:{deaf.getsockname()[1]}"
+        began = time.monotonic()
+        output = complaint(capfd, *words.split(), *ASKING[words], "--connect", where)
+        assert f"no router at {where}: start `mapweave server`" in output
+        assert time.monotonic() - began < 5.0, "Zenoh's own patience is 10 s, that for an answer 20 s"
 
 
 def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:

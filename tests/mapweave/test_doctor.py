@@ -23,6 +23,7 @@ from mapweave.cli import main
 from mapweave.doctor import camera, camera_model, driver, machine
 from mapweave.doctor.finding import Finding, Verdict
 from mapweave.doctor.motion import MotionComparison
+from mapweave.exit_status import NO
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import free_port
@@ -64,7 +65,7 @@ def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path: 
         input=json.dumps(commands), capture_output=True, text=True, check=True, cwd=ROOT, timeout=60,
     )  # fmt: skip
     (status, out, err), (plain_status, plain, plain_err) = json.loads(ran.stdout)
-    assert status == plain_status == 1 and not err and not plain_err
+    assert status == plain_status == NO and not err and not plain_err
     wrong = [one for one in json.loads(out)["findings"] if one["verdict"] == "wrong"]
     assert len(wrong) == len(missing)
     assert all("is not installed" in one["detail"] and "pip install" in one["advice"] for one in wrong)
@@ -210,13 +211,13 @@ def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> 
     assert "the encoders count and the image stands still" in findings["encoders"].detail
     eventually(lambda: sketch.wheels.speeds == (0.0, 0.0))
     assert 0.08 < sketch.wheels.way()[1] < 0.2
-    assert status == 1 and first in ("image", "encoders")
+    assert status == NO and first in ("image", "encoders")
 
 
 def test_a_robot_that_is_not_pushed_and_a_wrong_size(walls, sketch, tmp_path, capfd) -> None:
     settings = robot_toml(tmp_path, film(tmp_path / "film.avi", walls), sketch.path, width=640)
     status, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
-    assert status == 1 and first == "camera" and "320x240" in findings["camera"].detail
+    assert status == NO and first == "camera" and "320x240" in findings["camera"].detail
     assert "declared as 640x240" in findings["camera"].detail
     assert sketch.wheels.way() == (0.0, 0.0)
 
@@ -225,7 +226,7 @@ def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd) -> N
     dark = film(tmp_path / "dark.avi", walls, lambda image: (image * 0.02).astype(np.uint8))
     settings = robot_toml(tmp_path, dark, tmp_path / "ttyUSB7")
     status, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
-    assert (status, first) == (1, "image") and "dark" in findings["image"].detail
+    assert (status, first) == (NO, "image") and "dark" in findings["image"].detail
     assert findings["driver"].verdict is Verdict.WRONG and "no such port" in findings["driver"].detail
     assert "mapweave find-port" in findings["driver"].advice
 
@@ -292,7 +293,7 @@ def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
     bus, endpoint = router
     asked = ("--connect", endpoint, "--fleet", "ours", "--data", tmp_path)
     status, findings, first = doctor(capfd, *asked)
-    assert (status, first) == (1, "server") and "no map server of fleet ours" in findings["server"].detail
+    assert (status, first) == (NO, "server") and "no map server of fleet ours" in findings["server"].detail
     theirs, ours = Keys("theirs"), Keys("ours")
     other = bus.announce(theirs.server_alive("s7"))
     assert "s7 of fleet theirs" in doctor(capfd, *asked)[1]["server"].detail
@@ -311,14 +312,14 @@ def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
 def test_nothing_listens(tmp_path, capfd) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     status, findings, first = doctor(capfd, "--connect", endpoint, "--data", tmp_path)
-    assert (status, first) == (1, "server") and "refused" in findings["server"].detail
+    assert (status, first) == (NO, "server") and "refused" in findings["server"].detail
 
 
 def test_a_table_names_the_first_thing_wrong(tmp_path, capfd) -> None:
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{closed.getsockname()[1]}"
-        assert main(["doctor", "--connect", endpoint, "--data", str(tmp_path)]) == 1
+        assert main(["doctor", "--connect", endpoint, "--data", str(tmp_path)]) == NO
     out = capfd.readouterr().out
     assert "python" in out and f"first: server: {endpoint}" in out and "do: start `mapweave server`" in out
     assert main(["doctor", "--offline", "--data", str(tmp_path)]) == 0

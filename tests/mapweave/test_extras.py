@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.cli import MISSING_EXTRA, main
+from mapweave.cli import main
+from mapweave.exit_status import MISSING_EXTRA
 from mapweave.extras import MODULES
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -62,12 +63,15 @@ CASES: list[tuple[str, str, str]] = [
     ("router", "--listen nowhere", "endpoints look like"),
     ("record", "R0 --out {tmp}/drive --connect {closed}", "R0"),
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
+    ("replay", "{recording} --offline --data {tmp} --rerun {tmp}/walk.rrd", 'needs the extra "rerun"'),
     ("info", "{recording}", "3 images"),
     ("calibrate target", "--out {tmp}/board.pdf", "Print it at 100 %"),
     ("calibrate camera", "{recording}", "no view shows the target"),
     ("calibrate camera", "--source {tmp}/none.avi --http 0", SERVER),
     ("calibrate drive", "{recording}", "too short"),
     ("settings", "", "[network]"),
+    ("completion", "bash", "mapweave"),
+    ("missions", "R0 --connect {closed}", "R0"),
     ("relocalize", "{recording}/images/0.png --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("eval relocalize", "{recording}", SERVER),
     ("eval replay", "{recording} --out {tmp}/replay", "frames"),
@@ -84,6 +88,7 @@ CASES: list[tuple[str, str, str]] = [
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said
     ("map show", "{own} --out {tmp}/own.png", VIZ),
+    ("map diff", "{own} {own}", SERVER),
     ("map fetch", "{tmp}/none/map.mapweave --connect {closed}", "there is no folder"),
     ("map explain", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map explain", "r0.1.1 r1.1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
@@ -102,6 +107,15 @@ CASES: list[tuple[str, str, str]] = [
     ("map undo", "--map {merged}", "no manual constraint"),
     ("map retire", "r0.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map retire", "r0.1 --map {merged} --out {tmp}/less.mapweave", SERVER),
+    ("map link", "r0.1.1 r1.1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
+    ("map link", "r0.1.1 r0.1.3 --map {merged} --check", SERVER),
+    ("map undo", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
+    ("map undo", "--map {merged}", "no manual constraint holds"),
+    ("map pin", "--connect {closed}", WITHOUT_SERVER),
+    ("plan add", "{tmp}/none.png --pair r0.1.1=1,2 --connect {closed}", "No such file"),
+    ("plan show", "--connect {closed}", WITHOUT_SERVER),
+    ("plan export", "office --format tf --connect {closed}", WITHOUT_SERVER),
+    ("plan remove", "office --connect {closed}", WITHOUT_SERVER),
     ("map merge", "{own} -o {tmp}/out.mapweave", SERVER),
     ("map extract", "{tmp}/none.sqlite -o {tmp}/maps", "no such file"),
     ("map from-photos", "{recording} --spacing 0.5 -o {tmp}/photos.mapweave", SERVER),

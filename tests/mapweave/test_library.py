@@ -22,6 +22,16 @@ WORLD = room(0, 0, 5, 4, 600, np.random.default_rng(1))
 TOUR = [mapweave.Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
 
 
+PUBLIC = """
+    AgentStatus Area Camera Certainty Command Edge EdgeKind FileMap Fleet FleetEvent FleetStatus
+    HybridMap Landmarks ManualConstraint Map MapChanged MapEvent MapEventKind MapFile MapId
+    MapsExplanation MapweaveError MissionKind MissionReport MissionState Node NodeId NodeTable
+    Observation Odometry PairExplanation Pose2 PoseGaussian RelocalizeAnswer Relocalizer Robot
+    RobotDescription RobotEntry RouteExplanation View connect maps_of merge_map_files open read_camera
+    read_grey read_map_file relocalizer_of view_of write_map_file
+"""
+
+
 def python(code: str, *arguments: str) -> str:
     """What another process prints."""
     process = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
@@ -57,6 +67,11 @@ def test_each_name_is_what_type_checkers_see() -> None:
         assert name == original
         assert getattr(mapweave, name) is getattr(import_module(str(module)), name)
         assert name in dir(mapweave)
+
+
+def test_what_is_public_is_this_list() -> None:
+    """Others' programs depend on these names: one that is added stays."""
+    assert sorted(mapweave.__all__) == PUBLIC.split()
 
 
 def test_what_is_not_there() -> None:

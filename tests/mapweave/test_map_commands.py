@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
+from mapweave.exit_status import NO
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -146,7 +147,7 @@ def test_a_route_is_explained(
     others = json.loads(said("map", "route", start, goal, *barred, "--json", "--map", files[3]))
     assert others["gaps"] and "reported as blocked" in others["gaps"][0]["words"]
     none = tmp_path / "none.png"
-    assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3]), "--draw", str(none)]) == 2
+    assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3]), "--draw", str(none)]) == NO
     out, err = capfd.readouterr()
     assert f"{none} is not drawn: there is no way" in err and not none.exists()
     assert "there is no way: " in out and "r0.1 and r2.1 are not one map" in out
@@ -211,6 +212,35 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     assert "decided that it is in use again (map r1.1)" in said(
         "map", "explain", "r0.1", "r1.1", "--map", path
     )
+
+
+def test_linking_in_a_file_and_taking_it_back(
+    files: list[Path], said: Said, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "m.mapweave"
+    path.write_bytes(files[3].read_bytes())
+    wrong = ["map", "link", "r0.1.1", "r2.1.3", "--map", str(path)]
+    assert main(wrong) == 1
+    assert "do not show one place: " in capfd.readouterr().err
+    by_hand = [*wrong, "--pose=-1,0.5,90", "--because", "the same door", "--by", "anna"]
+    only_checked = "only checked, nothing is changed: r0.1.1 and r2.1.3: linked by hand by anna"
+    assert said(*by_hand, "--check").startswith(only_checked)
+    assert path.read_bytes() == files[3].read_bytes(), "only checked"
+    assert "1 component" in said(*by_hand)
+    out = said("map", "explain", "r0.1.1", "r2.1.3", "--map", path)
+    assert "are linked: linked by hand by anna" in out and "they see one place (r0.1.1 and r2.1.3)" in out
+    out = said("map", "retire", "r0.1.3", "--map", path)
+    assert "node r0.1.3 is retired by " in out and "1 retired node" in out
+    out = said("map", "explain", "r0.1.3", "r1.1.1", "--map", path)
+    assert "are not linked: node r0.1.3 is retired" in out
+    assert [line.split()[0] for line in said("map", "undo", "--map", path).splitlines()] == ["1", "2"]
+    said("map", "undo", "2", "--map", path)
+    said("map", "undo", "1", "--map", path)
+    assert said("map", "undo", "--map", path) == "no manual constraint holds\n"
+    assert len(json.loads(said("map", "undo", "--json", "--map", path))["constraints"]) == 4
+    content, before = read_map_file(path), read_map_file(files[3])
+    assert content.changes == before.changes or links(path) == links(files[3])
+    assert [str(node) for node in content.poses] == [str(node) for node in before.poses]
 
 
 @pytest.mark.parametrize(

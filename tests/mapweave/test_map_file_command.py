@@ -13,6 +13,8 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.drawing.map_picture import MapPicture
+from mapweave.hybridmap.annotation import Annotation, Place
+from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -155,3 +157,24 @@ def test_a_robots_own_map_is_drawn_with_its_loop_closure_applied(tmp_path, monke
     assert main(["map", "show", str(path)]) == 0
     x = [drawn[0].poses[node.id].x for node in nodes]
     assert np.diff(x) == pytest.approx([0.92] * 4, abs=1e-3)
+
+
+def test_named_places_are_drawn(tmp_path, monkeypatch):
+    contents = tuple(changes("r0"))
+    node = next(body.node for body in contents if isinstance(body, NodePut))
+    area = Area(node.id, ((1.0, 0.0), (3.0, 0.0), (3.0, 2.0), (1.0, 2.0)))
+    said = (
+        Annotation("dock", Place(node.id), False, "anna", 1),
+        Annotation("hall", Place(area=area), False, "anna", 2),
+        Annotation("gone", Place(node.id), False, "anna", 3),
+        Annotation("gone", Place(node.id), True, "anna", 4),
+    )
+    path = tmp_path / "r0.mapweave"
+    write_map_file(path, MapFile("agent", "r0.1", contents, annotations=said))
+    drawn: list[MapPicture] = []
+    monkeypatch.setattr("mapweave.drawing.map_picture.draw_map", lambda picture, out: drawn.append(picture))
+    assert main(["map", "show", str(path)]) == 0
+    at = drawn[0].poses[node.id]
+    assert drawn[0].places.keys() == {"dock", "hall"}
+    assert drawn[0].places["dock"] == pytest.approx((at.x, at.y))
+    assert drawn[0].places["hall"] == pytest.approx(at.apply(np.array([[2.0, 1.0]]))[0])

@@ -25,6 +25,7 @@ from websockets.sync.client import connect
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
+from mapweave.hybridmap.annotation import Annotation, Place
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint
@@ -46,6 +47,7 @@ from tests.waiting import eventually
 
 R0, R1 = MapId("r0", 1), MapId("r1", 1)
 SAID = ManualConstraint(Apart((R0, MapId("r9", 1))), True, "anna", 5, "two kitchens")
+KITCHEN = Annotation("kitchen", Place(NodeId("r0", 1, 3)), False, "anna", 6)
 EVENT = MapEvent(7, MapEventKind.JOINED, "r0.1 and r1.1 are one map now")
 
 
@@ -73,6 +75,7 @@ def write_store(path: Path, maps: dict[MapId, list[ChangeBody]]) -> Path:
         ]
         store.apply(map_id, 7, entries, len(entries))
     store.add_constraint(encode(SAID))
+    store.add_annotation(encode(KITCHEN))
     store.put_result("history", encode(KeptHistory((EVENT,))))
     store.close()
     return path
@@ -114,7 +117,8 @@ def test_what_it_is_shows_the_content(folder: Path) -> None:
         MapSource.STORE, MapSource.JOURNAL, MapSource.FILE, MapSource.FILE,
     ]  # fmt: skip
     assert opened["store"].maps == (R0, R1) and opened["journal"].maps == (R0, MapId("r0", 2))
-    assert opened["store"].content.constraints == (SAID,) and opened["store"].content.history == (EVENT,)
+    assert opened["store"].content.constraints == (SAID,)
+    assert opened["store"].content.annotations == (KITCHEN,) and opened["store"].content.history == (EVENT,)
     assert not any(one.complaints for one in opened.values())
     stored, filed = opened["store"].merged(), opened["merged"].merged()
     assert [link.pair for link in stored.links] == [link.pair for link in filed.links] != []
@@ -183,7 +187,7 @@ def test_a_store_whose_server_was_killed_is_read_with_its_last_commits(tmp_path:
     assert path.with_name("s0.sqlite-wal").stat().st_size > 0
     before = state(tmp_path)
     assert content_hash(open_map(path).content) == content_hash(
-        MapFile("agent", "", tuple(LOGS[R0]), constraints=(SAID,))
+        MapFile("agent", "", tuple(LOGS[R0]), constraints=(SAID,), annotations=(KITCHEN,))
     )
     assert state(tmp_path) == before
 
@@ -242,7 +246,7 @@ def test_a_map_is_served_to_people_and_never_changed(folder: Path, tmp_path: Pat
         assert counts["links"] == len(links) > 0 and counts["source"] == "server's store"
         assert ask("/robots")[1]["robots"] == ask("/missions")[1]["reports"] == []
         kinds = [event["kind"] for event in ask("/history")[1]["history"]]
-        assert kinds == ["constrained", "joined"]
+        assert kinds == ["constrained", "annotated", "joined"]
         link = links[0].pair
         assert ask(f"/explain?a={link[0]}&b={link[1]}")[1]["standing"] == "linked"
         assert ask(f"/route?a={link[0]}&b={link[1]}")[1]["found"]
@@ -269,7 +273,8 @@ WHOLE = MapFile(
     (RefusedPair(NODES[1], NODES[5], "too far"), RefusedPair(NODES[2], NODES[5], "too far")),
     (SAID, replace(SAID, holds=False, stamp_ns=6)),
     {NODES[1]: Superseded(NODES[2], 12, 0.1, 0.2), NODES[3]: Superseded(NODES[4], 12, 0.1, 0.2)},
-    {}, (EVENT,),
+    {}, (EVENT,), retired={NODES[6]: 0, NODES[7]: 0},
+    annotations=(KITCHEN, replace(KITCHEN, removed=True)),
 )  # fmt: skip
 
 
@@ -293,6 +298,7 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
     other = replace(
         WHOLE, title="renamed", changes=changes, poses={}, history=(), refused=WHOLE.refused[::-1],
         superseded=dict(reversed(list(WHOLE.superseded.items()))),
+        retired=dict(reversed(list(WHOLE.retired.items()))),
     )  # fmt: skip
     expected = content_hash(WHOLE)
     assert content_hash(other) == expected == content_hash(unpack_map_file(pack_map_file(other)))
@@ -306,7 +312,9 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
         replace(WHOLE, changes=(NodePut(replace(CONTENTS[0].node, stamp_ns=1)), *WHOLE.changes[1:])),  # type: ignore[union-attr]
         replace(WHOLE, refused=WHOLE.refused[:1]),
         replace(WHOLE, constraints=WHOLE.constraints[::-1]),
+        replace(WHOLE, annotations=WHOLE.annotations[::-1]),
         replace(WHOLE, superseded={}),
+        replace(WHOLE, retired={NODES[6]: 0, NODES[7]: 1}),
         replace(WHOLE, faded={NODES[0]: np.zeros(len(CONTENTS[0].node.landmarks), bool)}),  # type: ignore[union-attr]
     ],
 )

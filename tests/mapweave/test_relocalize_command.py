@@ -16,6 +16,7 @@ import skimage.data
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.drawing.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
+from mapweave.exit_status import NO
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import Busy
@@ -137,7 +138,7 @@ def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path: 
     assert (np.abs(cv2.imread(str(drawn)).astype(int) - GREEN) < 40).all(axis=2).sum() > 1000
     assert path.read_bytes() == before
     cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
-    assert main(["relocalize", str(photo), "--map", str(path)]) == 2
+    assert main(["relocalize", str(photo), "--map", str(path)]) == NO
     assert main(["relocalize", str(photo), "--map", str(photo)]) == 1
     assert "is neither a map file" in capfd.readouterr().err
 
@@ -145,7 +146,7 @@ def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path: 
 def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
     cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
     drawn = tmp_path / "matches.png"
-    assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == 2
+    assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == NO
     output = capfd.readouterr()
     assert output.out.startswith("unknown: ")
     assert output.err == f"{drawn} is not drawn: no place was recognised\n"

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
-from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredArea, RetiredNodes, Subject
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.manual_constraints import apply_constraints
-from mapweave.merge.merging import merge_maps
+from mapweave.merge.merging import MergeCache, decide
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
+from mapweave.merge.retired_nodes import retired_nodes
+from mapweave.merge.settings import MergeSettings
 from synthetic.fleet import FleetSettings, draw_fleet
 
 SMALL = FleetSettings(robots=5, nodes=16, side=7.0, true_links=80, apart=6)
@@ -112,7 +115,46 @@ class Life:
         self.change(map_id, EdgePut(edge))
 
     def rebuilt(self) -> MergedMap:
+        others = self.constraints.without(RetiredArea)
+        others = others.with_nodes(retired_nodes(self.maps, others, ()))
+        if others.made == self.constraints.made:
+            return self._decided(others)
+        graphs = self._decided(others).graphs
+        return self._decided(self.constraints.with_nodes(retired_nodes(self.maps, self.constraints, graphs)))
+
+    def _decided(self, constraints: ManualConstraints) -> MergedMap:
         links = [v for v in self.known.values() if isinstance(v, Link)]
         refused = [v for v in self.known.values() if isinstance(v, RefusedLink)]
-        undone = apply_constraints(self.maps, links, self.constraints)
-        return undone.completed(merge_maps(undone.maps, undone.links, [*refused, *undone.refused]))
+        undone = apply_constraints(self.maps, links, constraints)
+        everything = undone.maps, undone.links, [*refused, *undone.refused]
+        merged, _ = decide(*everything, MergeSettings(), MergeCache(), certain=undone.certain)
+        return undone.completed(merged)
+
+    def correct(self, areas: bool) -> None:
+        """A person links two nodes, rightly or by mistake, or retires some or an area; or takes it back."""
+        rng = self.rng
+        nodes = sorted(node for hybrid_map in self.maps.values() for node in hybrid_map.nodes)
+        if len(nodes) < 2:
+            return
+        about: Subject
+        made = [
+            c.about
+            for c in self.constraints.in_force
+            if isinstance(c.about, Linked | RetiredNodes | RetiredArea)
+        ]
+        holds = not made or bool(rng.random() < 0.6)
+        if not holds:
+            about = made[int(rng.integers(len(made)))]
+        elif rng.random() < 0.5:
+            a, b = (nodes[k] for k in rng.choice(len(nodes), 2, replace=False))
+            off = Pose2.from_vector(rng.normal(0.0, 0.02 if rng.random() < 0.7 else 1.0, 3))
+            pose = self.truth[a].inverse() @ self.truth[b] @ off
+            about = Linked.of(a, b, PoseGaussian.from_sigmas(pose, 0.05, 0.03))
+        elif areas and rng.random() < 0.5:
+            (x, y), anchor = rng.uniform(-2.0, 1.0, 2), nodes[int(rng.integers(len(nodes)))]
+            about = RetiredArea(Area(anchor, ((x, y), (x + 1.5, y), (x + 1.5, y + 1.5), (x, y + 1.5))))
+        else:
+            about = RetiredNodes(tuple(nodes[k] for k in rng.choice(len(nodes), 2, replace=False)))
+        self.number += 1
+        constraint = ManualConstraint(about, holds, "anna", self.number)
+        self.constraints = self.constraints + ManualConstraints([constraint])

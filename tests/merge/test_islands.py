@@ -113,6 +113,30 @@ def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int
     assert links > 15 and apart <= 0.1 * links
 
 
+@pytest.mark.parametrize("exact", [0, 600])
+def test_links_by_hand_and_retired_nodes_hold_in_whatever_order_all_comes(exact: int) -> None:
+    """Small islands against a merge from nothing; large ones in what no order may change."""
+    life, islands = Life(51, 0.3), Islands(exact=exact)
+    by_hand = retired = contradicted = 0
+    for _ in range(60):
+        life.step()
+        if life.rng.random() < 0.4:
+            life.correct(areas=exact > 0)
+        if life.rng.random() < 0.4:
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
+            life.touched, fresh = set(), life.rebuilt()
+            if exact:
+                assert contents(merged) == contents(fresh)
+            links = merged.constraints.links.keys()
+            there = {pair for pair in links if all(node in merged.poses for node in pair)}
+            assert there <= {link.pair for link in merged.links} and merged.contradicted.keys() <= there
+            assert set(merged.poses) == set(fresh.poses)
+            assert merged.constraints.nodes == fresh.constraints.nodes
+            by_hand, retired = by_hand + len(there), retired + len(merged.constraints.nodes)
+            contradicted += len(merged.contradicted)
+    assert by_hand > 10 and retired > 10 and contradicted > 1
+
+
 def test_all_is_decided_together_now_and_then_only(monkeypatch: pytest.MonkeyPatch) -> None:
     times: list[bool] = []
     real = islands_module.decide

@@ -23,9 +23,11 @@ from mapweave.hybridmap import (
     area,
     constraint_subject,
     explanation,
+    floor_plan,
     manual_constraint,
     map_event,
     mission_order,
+    pin,
     query,
     superseded,
 )  # fmt: skip
@@ -160,9 +162,9 @@ def test_the_page_on_the_wire_names_the_fields() -> None:
         for name, words in ROW.findall(page)
     }
     modules = (
-        annotation, area, constraint_subject, query, explanation, manual_constraint, map_event, superseded,
-        map_file, agent_status, mission_order,
+        annotation, area, constraint_subject, floor_plan, pin, query, explanation, manual_constraint,
+        map_event, superseded, map_file, agent_status, mission_order,
     )  # fmt: skip
     classes = {name: getattr(module, name) for module in modules for name in rows if hasattr(module, name)}
-    assert classes.keys() == rows.keys() and len(rows) == 50
+    assert classes.keys() == rows.keys() and len(rows) == 60
     assert {name: [one.name for one in fields(kind)] for name, kind in classes.items()} == rows

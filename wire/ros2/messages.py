@@ -37,6 +37,11 @@ def _stores() -> tuple[Any, Any]:
     return stores
 
 
+def typestore() -> Any:
+    """The messages of Jazzy and those of the Create 3, for readers and writers of bags."""
+    return _stores()[0]
+
+
 def type_hash(kind: str) -> str:
     """The hash of a type, as it stands in keys."""
     return str(_stores()[0].hash_rihs01(kind))

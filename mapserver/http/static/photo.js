@@ -1,46 +1,79 @@
-"use strict";
-const byId = id => document.getElementById(id), result = byId("result");
-const cell = text => { const td = document.createElement("td"); td.textContent = text; return td; };
-function say(text, kind) { result.className = kind; result.textContent = text; }
-function table(candidates) {
-  const table = document.createElement("table"), head = table.insertRow();
-  for (const name of ["place", "ahead", "left", "turned", "probability"]) {
-    const th = document.createElement("th"); th.textContent = name; head.append(th);
-  }
-  for (const c of candidates) {
-    const [x, y, turn] = c.node_from_robot.mean;
-    const away = m => cell(c.distance_known ? m.toFixed(2) + " m" : "not known");
-    table.insertRow().append(cell(c.node), away(x), away(y),
-      cell((turn * 180 / Math.PI).toFixed(0) + "\u00b0"), cell((100 * c.probability).toFixed(0) + " %"));
-  }
-  return table;
+// Where a photo was taken, or why that is not known: POST /relocalize.
+import { add, ask, button, byId, degrees, side } from "./dom.js";
+
+const LONGEST = 2048; // px; the server makes photos smaller anyway
+const result = byId("answer");
+
+async function shrunk(file) {
+  try {
+    const image = await createImageBitmap(file), scale = LONGEST / Math.max(image.width, image.height);
+    if (scale >= 1 || file.size < 2e6) return file;
+    const canvas = document.createElement("canvas");
+    canvas.width = Math.round(image.width * scale); canvas.height = Math.round(image.height * scale);
+    canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height);
+    return await new Promise(done => canvas.toBlob(done, "image/jpeg", 0.92)) || file;
+  } catch (error) { return file; }
 }
-async function ask() {
-  const file = byId("image").files[0];
+function table(candidates, show) {
+  const made = add(result, "table"), head = made.insertRow();
+  for (const name of ["place", "ahead", "left", "turned", "probability"]) add(head, "th", name);
+  for (const c of candidates) {
+    const [x, y, turn] = c.node_from_robot.mean, row = made.insertRow();
+    const away = m => c.distance_known ? m.toFixed(2) + " m" : "not known";
+    button(add(row, "td"), c.node, () => show(c.node));
+    const probability = (100 * c.probability).toFixed(0) + " %";
+    for (const text of [away(x), away(y), degrees(turn), probability]) add(row, "td", text);
+  }
+}
+function whyNot(similar, show) {
+  if (!similar?.length) return;
+  add(result, "p", "It looks most like:");
+  const list = add(result, "ul");
+  for (const place of similar) {
+    const item = add(list, "li");
+    button(item, place.node, () => show(place.node));
+    const counts = place.lacks.includes("are needed") ? ""
+      : ` ${place.matches} landmarks match, ${place.inliers} agree on one pose; ${place.needed} are needed.`;
+    item.append(` ${place.lacks}.${counts}`);
+    if (place.turn !== null && Math.abs(place.turn) > 0.12) item.append(` Turn by ${side(place.turn)} and try again.`);
+    else if (place.turn !== null) item.append(" Go a step aside and try again.");
+  }
+}
+let file = null;
+async function locate(found, show) {
   if (!file) return;
   byId("shown").src = URL.createObjectURL(file); byId("shown").hidden = false;
   const query = new URLSearchParams();
   for (const name of ["height_m", "hfov"]) if (byId(name).value) query.set(name, byId(name).value);
-  say("Looking ...", "");
-  for (let tries = 0; tries < 5; tries++) {
-    let reply, answer;
-    try {
-      reply = await fetch("relocalize?" + query, { method: "POST", body: file });
-      answer = await reply.json();
-    } catch (error) { return say("The map server does not answer: " + error.message, "failed"); }
-    if (reply.status === 503) {
-      say("Many robots ask at present, waiting ...", "");
-      await new Promise(done => setTimeout(done, 1000 * (answer.retry_after || 1)));
-      continue;
-    }
-    if (!reply.ok) return say(answer.error, "failed");
-    say(answer.certainty + ": " + answer.reason, answer.certainty);
-    if (answer.candidates.length) result.append(table(answer.candidates));
-    return;
-  }
-  say("The map server is too busy; try again in a minute.", "failed");
+  result.className = ""; result.textContent = "Looking ...";
+  const busy = () => { result.textContent = "Many robots ask at present, waiting ..."; };
+  const answer = await ask("relocalize?" + query, { method: "POST", body: await shrunk(file) }, busy);
+  result.textContent = "";
+  if (answer.error) { result.className = "box failed"; result.textContent = answer.error; found([]); return; }
+  const good = answer.certainty === "found" || answer.certainty === "place";
+  result.className = good ? "box good" : answer.certainty === "unknown" ? "box failed" : "box";
+  result.dataset.certainty = answer.certainty;
+  add(result, "p", `${answer.certainty}: ${answer.reason}`);
+  if (answer.candidates.length) table(answer.candidates, show);
+  whyNot(answer.similar, show);
+  found(answer.candidates);
 }
-for (const id of ["image", "height_m", "hfov"]) byId(id).addEventListener("change", ask);
-fetch("status").then(reply => reply.json())
-  .then(s => { byId("status").textContent = "The map: " + s.summary; })
-  .catch(() => { byId("status").textContent = "The map server does not answer."; });
+export function listenForPhotos(opened, found, show) {
+  const take = one => {
+    if (!one) return;
+    file = one;
+    opened();
+    locate(found, show);
+  };
+  byId("image").addEventListener("change", () => take(byId("image").files[0]));
+  for (const id of ["height_m", "hfov"]) byId(id).addEventListener("change", () => locate(found, show));
+  const drop = byId("drop"), files = event => [...(event.dataTransfer?.types || [])].includes("Files");
+  document.addEventListener("dragover", event => { if (files(event)) { event.preventDefault(); drop.hidden = false; } });
+  document.addEventListener("dragleave", event => { if (!event.relatedTarget) drop.hidden = true; });
+  document.addEventListener("drop", event => {
+    drop.hidden = true;
+    if (!files(event)) return;
+    event.preventDefault();
+    take(event.dataTransfer.files[0]);
+  });
+}

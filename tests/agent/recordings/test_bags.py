@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import cv2
@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapweave.agent.drivers.recorded import RecordedRobot
 from mapweave.agent.drivers.replay import Replay
@@ -36,6 +36,8 @@ from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, bet
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
+KIDNAP = "irobot_create_msgs/msg/KidnapStatus"
+STORE.register(get_types_from_msg("std_msgs/Header header\nbool is_kidnapped", KIDNAP))
 
 
 def make(store: Any, name: str, **fields: Any) -> Any:
@@ -90,8 +92,15 @@ def image(store: Any, stamp: int, grey: np.ndarray, encoding: str) -> Any:
     )  # fmt: skip
 
 
-def write_bag(path: Path, drive: Drive, encoding: str = "mono8", ros1: bool = False, **named: str) -> None:
-    """Images at their stamps, odometry four times as often; both arrive late."""
+def write_bag(
+    path: Path,
+    drive: Drive,
+    encoding: str = "mono8",
+    ros1: bool = False,
+    lifted: Mapping[float, bool] = MappingProxyType({}),
+    **named: str,
+) -> None:
+    """Images at their stamps, odometry four times as often; both arrive late. `lifted` is by image."""
     store: Any = STORE1 if ros1 else STORE
     topics = {"image": "/cam/image_raw", "info": "/cam/camera_info", "odom": "/odom", **named}
     kinds = {
@@ -103,6 +112,11 @@ def write_bag(path: Path, drive: Drive, encoding: str = "mono8", ros1: bool = Fa
     serialize: Callable[[Any, str], Any] = store.serialize_ros1 if ros1 else store.serialize_cdr
     with writer:
         opened = {key: writer.add_connection(topics[key], kinds[key], typestore=store) for key in topics}
+        for at, is_kidnapped in lifted.items():
+            stamp = BEGUN_NS + round(at * STEP_NS)
+            opened["kidnap"] = opened.get("kidnap") or writer.add_connection("/k", KIDNAP, typestore=store)
+            message = make(store, KIDNAP, header=header(store, stamp, "base"), is_kidnapped=is_kidnapped)
+            writer.write(opened["kidnap"], stamp, serialize(message, KIDNAP))
         fine = [Pose2(*row) for row in between(drive.poses, 4)]
         for k, pose in enumerate(fine):
             stamp = BEGUN_NS + k * STEP_NS // 4
@@ -263,8 +277,12 @@ def test_all_of_a_killed_recorder_but_the_last_seconds_is_there(drive: Drive, tm
         assert sum(1 for _ in reader.messages()) == reader.message_count
 
 
+LIFTED = (3, 4, 8)
+"""Images at which the robot below is lifted."""
+
+
 class Driven:
-    """A robot that senses a drive."""
+    """A robot that senses a drive, and is lifted on it."""
 
     def __init__(self, drive: Drive, lens: Distortion = (-0.1, 0.02, 0.001, 0.0, 0.0)) -> None:
         self._drive, self._lens, self._at, self.closed = drive, lens, 0, False
@@ -283,8 +301,9 @@ class Driven:
             return None
         forward, turn = self._drive.increments[k]
         return Observation(
-            self._drive.stamps_ns[k], Odometry(forward, turn), self._drive.images[k], np.array([1.0, 2.0])
-        )
+            self._drive.stamps_ns[k], Odometry(forward, turn), self._drive.images[k], np.array([1.0, 2.0]),
+            kidnapped=k in LIFTED,
+        )  # fmt: skip
 
     def act(self, command: Command) -> Command:
         return Command(min(command.forward, 0.3), command.turn)
@@ -311,11 +330,23 @@ def test_what_a_robot_recorded_is_replayed_as_it_sensed_it(drive: Drive, tmp_pat
     assert replay.describe().distortion == robot.describe().distortion
     seen = list(iter(replay.sense, None))
     assert [observation.stamp_ns for observation in seen] == drive.stamps_ns
+    assert [k for k, observation in enumerate(seen) if observation.kidnapped] == [*LIFTED]
+    assert "the robot was lifted 2 times" in replay.recording.notes
     for observation, grey, increment in zip(seen, drive.images, drive.increments, strict=True):
         assert np.array_equal(observation.image, grey)
         assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx(
             tuple(increment), abs=1e-9
         )
+
+
+def test_a_robot_that_is_lifted_between_two_images_was_lifted_at_the_second(
+    drive: Drive, tmp_path: Path
+) -> None:
+    """A base says so by a clock of its own, in a bag without definitions of messages."""
+    said = {0.0: False, 2.4: True, 2.6: False, 5.5: True, 6.5: True, 7.5: False}
+    write_bag(tmp_path / "drive", drive, "bgra8", lifted=said)
+    seen = list(iter(Replay(tmp_path / "drive", options=RecordingOptions(camera_height=0.3)).sense, None))
+    assert [k for k, observation in enumerate(seen) if observation.kidnapped] == [3, 6, 7]
 
 
 def test_a_fisheyes_recording_names_its_lens_as_ros_does(drive: Drive, tmp_path: Path) -> None:
@@ -344,6 +375,7 @@ def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> No
             "/camera/camera_info": ("sensor_msgs/msg/CameraInfo", COUNT),
             "/odom": ("nav_msgs/msg/Odometry", COUNT),
             "/cmd_vel": ("geometry_msgs/msg/TwistStamped", COUNT),
+            "/kidnap_status": (KIDNAP, 4),
             "/proximity/0": ("sensor_msgs/msg/Range", COUNT),
             "/proximity/1": ("sensor_msgs/msg/Range", COUNT),
         }
@@ -369,6 +401,7 @@ def test_a_long_recording_is_a_row_of_files(drive: Drive, tmp_path: Path) -> Non
     file.write_bytes(file.read_bytes()[:-100])
     replay = Replay(tmp_path / "walk")
     assert len(replay) == COUNT and "walk_2.mcap: damaged or cut off" in replay.damage[0]
+    assert [k for k, seen in enumerate(iter(replay.sense, None)) if seen.kidnapped] == [*LIFTED]
     file.write_bytes(b"")
     assert len(Replay(tmp_path / "walk")) == 8
 

@@ -13,7 +13,8 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
-from mapweave.agent.recordings.recording import reduced
+from mapweave.agent.recordings.recording import NoOdometry, reduced
+from mapweave.agent.recordings.video import video_images
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.vision.equidistant import Equidistant
@@ -156,6 +157,7 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
     for image in drive.images:
         writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     writer.release()
+    assert video_images(path).damage == ""
     with pytest.raises(DeviceError, match="video, 9 frames, but no odometry"):
         open_recording(path, RecordingOptions(camera=camera))
     rows = [f"{0.2 * k},{p.x!r},{p.y!r},{p.heading!r}" for k, p in enumerate(drive.poses)]
@@ -165,6 +167,52 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
     for k in (0, 3, 8, 2):
         error = np.abs(recording.read(k).astype(int) - drive.images[k])
         assert error.mean() < 3.0, "not the same frame"
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "share", "says"),
+    [("walk.avi", "MJPG", 0.999, "the file ends before its index"),
+     ("walk.avi", "MJPG", 0.3, "the file ends before its index"),
+     ("walk.mkv", "mp4v", 0.6, "its header says 9.0 s"),
+     ("walk.webm", "VP80", 1.0, "")],
+)  # fmt: skip
+def test_a_video_that_was_cut_off_says_so(
+    name: str, codec: str, share: float, says: str, drive: Drive, tmp_path: Path
+) -> None:
+    path, camera = tmp_path / name, tmp_path / "camera.toml"
+    camera.write_text(CAMERA_TOML)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 1.0, (320, 240), isColor=True)
+    for image in drive.images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    path.write_bytes(path.read_bytes()[: round(share * path.stat().st_size)])
+    with pytest.raises(NoOdometry) as caught:
+        open_recording(path, RecordingOptions(camera=camera))
+    recording = caught.value.recording
+    assert recording.damage == (
+        (f"{path}: cut off after {len(recording)} frames, {len(recording) - 1:.1f} s: {says}",)
+        if says
+        else ()
+    )
+
+
+def test_an_avi_whose_last_frames_cannot_be_read_says_how_long_it_should_be(
+    drive: Drive, tmp_path: Path
+) -> None:
+    """As a card's bad sectors leave it: as long as it was, with an index."""
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 1.0, (320, 240), isColor=True)
+    for image in drive.images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    data, half = path.read_bytes(), path.stat().st_size // 2
+    path.write_bytes(data[:half] + bytes(len(data) - half))
+    images = video_images(path)
+    assert len(images.stamps_ns) < COUNT
+    assert images.damage.endswith(
+        f"cut off after {len(images.stamps_ns)} frames, "
+        f"{len(images.stamps_ns) - 1:.1f} s: its header says 9.0 s"
+    )
 
 
 def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The page for phones in a real browser: a picture is chosen, sent, and the answer shown."""
+"""Photos on the page in a real browser: one is chosen, sent, and the answer shown, or why there is none."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from pathlib import Path
 import pytest
 
 from mapweave.hybridmap.errors import Busy, InvalidValue
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace
 from mapweave.mapserver.http.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.stub_services import PLACE, StubServices, picture
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-RESULT = "return document.getElementById('result').textContent"
+RESULT = "return document.getElementById('answer').textContent"
 ROWS = "return [...document.querySelectorAll('tr')].map(r => [...r.children].map(c => c.textContent))"
-STATUS = "return document.getElementById('status').textContent"
-KIND = "return document.getElementById('result').className"
+STATUS = "return document.getElementById('summary').textContent"
+KIND = "const answer = document.getElementById('answer'); return answer.dataset.certainty || answer.className"
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,8 @@ def image(tmp_path: Path) -> Path:
 
 
 def test_a_picture_is_answered_on_the_page(page: Browser, services: StubServices, image: Path) -> None:
-    eventually(lambda: page.run(STATUS) == "The map: 12 nodes")
+    eventually(lambda: page.run(STATUS) == "12 nodes")
+    page.run("document.getElementById('tab-photo').click()")
     page.type("#hfov", "90")
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "found")
@@ -60,6 +63,21 @@ def test_a_picture_is_answered_on_the_page(page: Browser, services: StubServices
     assert services.views[-1].camera.fx == pytest.approx(80.0)
 
 
+def test_an_unknown_place_is_explained(page: Browser, services: StubServices, image: Path) -> None:
+    near = SimilarPlace(NodeId("r0", 1, 3), 14, 9, 10, "only 31% of the matches agree on one pose", 0.6)
+    services.answer = RelocalizeAnswer(Certainty.UNKNOWN, (), "not recognised", (near,))
+    page.type("#image", str(image))
+    eventually(lambda: page.run(KIND) == "unknown")
+    words = page.run(RESULT)
+    assert "unknown: not recognised" in words and "r0.1.3 only 31% of the matches agree on one pose." in words
+    assert "14 landmarks match, 9 agree on one pose; 10 are needed." in words
+    assert "Turn by 34° to the left and try again." in words
+    page.run("document.querySelector('#answer li button').click()")
+    eventually(
+        lambda: page.run("return document.querySelector('#selected h2')?.textContent") == "Node r0.1.3"
+    )
+
+
 def test_no_unknown_distance_is_shown(page: Browser, services: StubServices, image: Path) -> None:
     services.answer = PLACE
     page.type("#image", str(image))
@@ -70,10 +88,10 @@ def test_no_unknown_distance_is_shown(page: Browser, services: StubServices, ima
 def test_errors_are_shown_on_the_page(page: Browser, services: StubServices, image: Path) -> None:
     services.refusal = InvalidValue("<b>this</b> is no place")
     page.type("#image", str(image))
-    eventually(lambda: page.run(KIND) == "failed")
+    eventually(lambda: page.run(KIND) == "box failed")
     # As text, with any content.
     assert "<b>this</b> is no place" in page.run(RESULT)
-    assert page.run("return document.querySelector('#result b')") is None
+    assert page.run("return document.querySelector('#answer b')") is None
 
 
 def test_a_busy_server_is_asked_again(page: Browser, services: StubServices, image: Path) -> None:

@@ -292,8 +292,8 @@ def test_the_page_and_the_status(served: Web) -> None:
         ("GET", "/static/%2e%2e/web.py", 404),
         ("GET", "/static//etc/passwd", 404),
         ("GET", "/static/%2fetc/passwd", 404),
-        ("GET", "/static/why.js%00", 404),
-        ("POST", "/static/why.js", 405),
+        ("GET", "/static/page.js%00", 404),
+        ("POST", "/static/page.js", 405),
     ],
 )
 def test_missing_pages(served: Web, method: str, path: str, status: int) -> None:
@@ -303,7 +303,7 @@ def test_missing_pages(served: Web, method: str, path: str, status: int) -> None
 
 
 def test_pages_load_nothing_but_files_of_this_server(served: Web) -> None:
-    for path in ("/", "/why", "/static/why.js", "/static/photo.css", "/status", "/nothing"):
+    for path in ("/", "/why", "/static/page.js", "/static/page.css", "/status", "/nothing"):
         _, headers, content = ask(served, "GET", path)
         assert headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'; ")
         assert (headers["X-Content-Type-Options"], headers["Cache-Control"]) == ("nosniff", "no-store")

@@ -12,13 +12,13 @@ from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
-from mapweave.merge.merging import merge_maps
+from mapweave.merge.merging import MergeCache, decide, merge_maps
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.settings import ExclusionSettings
+from mapweave.merge.settings import ExclusionSettings, MergeSettings
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 EDGE_SIGMAS = np.array([0.006, 0.005, 0.005])
@@ -186,6 +186,28 @@ def test_twins_that_a_third_map_joins_come_apart_at_the_weakest_links() -> None:
     assert len(merged.components) == 2
     reason = merged.explain(*false[0].pair)
     assert "a and b would have been at the same place" in reason and "weakest links" in reason
+
+
+def test_a_link_by_hand_that_cannot_be_true_stays_and_is_reported() -> None:
+    twins = Twins(1)
+    s = MergeSettings()
+    by_hand = twins.false[:1]
+    merged, _ = decide(twins.maps, twins.false[1:], (), s, MergeCache(), certain=by_hand)
+    assert pairs(by_hand) <= pairs(merged.links) and len(merged.components) == 1
+    assert "a and b would have been at the same place" in merged.contradicted[by_hand[0].pair]
+    # By way of a third robot's map, which came later: the true links to it are not to blame.
+    rng = np.random.default_rng(5)
+    stops = [stop @ Pose2(0.05, 0.0, 0.0) for stop in list(twins.truth_b.values())[:30]]
+    later, truth_c = mapped("c", stops, rng, start=1000.0)
+    true = links(twins.truth_b, truth_c, [(3 * k, 3 * k) for k in range(10)], rng)
+    false = links(twins.truth_a, truth_c, [(6, 6)], rng, EAST.inverse())
+    merged, _ = decide(twins.maps | {MapId("c", 1): later}, true, (), s, MergeCache(), certain=false)
+    assert pairs(false) <= pairs(merged.links) and len(merged.components) == 2
+    merged, _ = decide(
+        twins.maps | {MapId("c", 1): later}, (), (), s, MergeCache(), certain=[*false, true[0]]
+    )
+    assert len(merged.components) == 1
+    assert all("links by hand join the two" in merged.contradicted[p] for p in pairs(false))
 
 
 def test_true_merges_of_robots_that_map_together_are_kept() -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-from mapweave.commands.map_ends import _patiently
 from mapweave.wire.bus import Reply, Request
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.patience import ask_patiently
 
 
 def test_a_busy_server_is_asked_again_at_its_time() -> None:
@@ -22,11 +22,11 @@ def test_a_busy_server_is_asked_again_at_its_time() -> None:
             request.reply(b"because")
 
     closing = server.serve("why", answer)
-    assert _patiently(person, "why", b"", 20.0) == [Reply(b"because")]
+    assert ask_patiently(person, "why", b"", 20.0) == [Reply(b"because")]
     assert len(asked) == 3 and asked[1] - asked[0] >= 0.1
     # Not beyond the time that the person gives.
     asked.clear()
-    (reply,) = _patiently(person, "why", b"", 0.05)
+    (reply,) = ask_patiently(person, "why", b"", 0.05)
     assert reply.error == "busy" and len(asked) == 1
     closing.close()
     server.close()

@@ -1,0 +1,34 @@
+"""Load a map and plot it: `python examples/plot_map.py [MAP.mapweave]`.
+
+Without a map it takes that of a robot in the simulator.
+"""
+
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+import networkx as nx
+from drive_in_simulator import FOLDER, drive
+
+import mapweave
+
+mpl.use("agg")  # a picture in a file; leave this out in a notebook
+
+office = mapweave.open(Path(sys.argv[1]) if sys.argv[1:] else drive("r0"))
+print(office, office.hash[:12])
+
+nodes = office.nodes  # columns, which are NumPy arrays
+for name, x, y, sigma in zip(nodes.ids, nodes.x, nodes.y, nodes.sigma, strict=True):
+    print(f"{name}: {x:+.2f} {y:+.2f} m, +- {1000 * max(sigma[:2]):.0f} mm")
+
+graph = office.graph()  # of networkx
+print(f"{graph.number_of_edges()} edges, {nx.number_connected_components(graph)} component")
+first, *_, last = nodes.ids
+print(" -> ".join(nx.shortest_path(graph, first, last, weight="length")))
+print(office.route(first, last).reason)  # what a robot would drive, and why
+
+axes = office.plot()
+axes.set_title("An office, by one robot")
+FOLDER.mkdir(parents=True, exist_ok=True)
+axes.figure.savefig(FOLDER / "map.png", dpi=110)
+print(FOLDER / "map.png")

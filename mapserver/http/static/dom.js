@@ -1,0 +1,53 @@
+// Elements, numbers in words, and questions to the server.
+export const byId = id => document.getElementById(id);
+const SVG = "http://www.w3.org/2000/svg";
+
+export function add(parent, name, text, kind) {
+  const child = parent.appendChild(document.createElement(name));
+  if (text) child.textContent = text;
+  if (kind) child.className = kind;
+  return child;
+}
+export function draw(parent, name, values) {
+  const child = parent.appendChild(document.createElementNS(SVG, name));
+  for (const key in values) child.setAttribute(key, values[key]);
+  return child;
+}
+export function button(parent, text, act) {
+  const made = add(parent, "button", text);
+  made.type = "button";
+  made.addEventListener("click", act);
+  return made;
+}
+export function facts(parent, rows) {
+  const list = add(parent, "dl");
+  for (const [name, value, kind] of rows) {
+    if (value === null || value === undefined || value === "") continue;
+    add(list, "dt", name);
+    add(list, "dd", String(value), kind);
+  }
+  return list;
+}
+export const degrees = rad => `${(rad * 180 / Math.PI).toFixed(0)}\u00b0`;
+export const percent = share => share > 0.9999 ? "over 99.99 %" : `${(100 * share).toFixed(share > 0.99 ? 2 : 0)} %`;
+export const metres = ([x, y, turn]) =>
+  `${x.toFixed(3)} m ahead, ${y.toFixed(3)} m left, ${(turn * 180 / Math.PI).toFixed(1)}\u00b0`;
+export const side = turn => `${Math.abs(turn * 180 / Math.PI).toFixed(0)}\u00b0 to the ${turn > 0 ? "left" : "right"}`;
+export const seconds = s => s < 90 ? `${s.toFixed(s < 10 ? 1 : 0)} s` : s < 5400 ? `${(s / 60).toFixed(0)} min`
+  : `${(s / 3600).toFixed(1)} h`;
+export const when = stamp_ns => new Date(stamp_ns / 1e6).toISOString().slice(0, 19).replace("T", " ") + " UTC";
+
+// The answer as JSON, or an object with `error`; a busy server is asked again.
+export async function ask(path, options, busy) {
+  for (let tries = 0; tries < 5; tries++) {
+    let reply, answer;
+    try {
+      reply = await fetch(path, options);
+      answer = await reply.json();
+    } catch (error) { return { error: "The map server does not answer: " + error.message, status: 0 }; }
+    if (reply.status !== 503 || !answer.retry_after) return reply.ok ? answer : { status: reply.status, ...answer };
+    if (busy) busy();
+    await new Promise(done => setTimeout(done, 1000 * answer.retry_after));
+  }
+  return { error: "The map server is too busy; try again in a minute.", status: 503 };
+}

@@ -1,0 +1,51 @@
+// One node: GET /nodes/NODE.
+import { add, ask, button, byId, draw, facts, when } from "./dom.js";
+
+const box = byId("selected");
+let latest = "";
+
+function pose({ mean, sigma }) {
+  const turn = rad => `${(rad * 180 / Math.PI).toFixed(1)}\u00b0`;
+  return `${mean[0].toFixed(2)}, ${mean[1].toFixed(2)} m, ${turn(mean[2])} ` +
+    `(sigma ${sigma[0].toFixed(3)}, ${sigma[1].toFixed(3)} m, ${turn(sigma[2])})`;
+}
+function picture(parent, node) {
+  const { image: [width, height], pixels } = node.node, faded = new Set(node.faded);
+  const svg = draw(parent, "svg", { class: "picture", role: "img", viewBox: `-1 -1 ${width + 2} ${height + 2}`,
+    "aria-label": `${pixels.length} landmarks in the image of ${node.node.id}` });
+  draw(svg, "rect", { x: 0, y: 0, width, height, class: "frame" });
+  pixels.forEach(([cx, cy], k) =>
+    draw(svg, "circle", { cx, cy, r: width / 130, class: faded.has(k) ? "faded" : "landmark" }));
+  add(parent, "small", `The landmarks in its image, ${width} x ${height} px` + (faded.size ? "; red: faded" : ""));
+}
+export async function showNode(name, { select, why, send }) {
+  latest = name;
+  const node = await ask("nodes/" + encodeURIComponent(name));
+  if (latest !== name) return;
+  box.textContent = "";
+  add(box, "h2", `Node ${name}`);
+  if (node.error) { add(box, "p", node.error, "bad"); return; }
+  const fate = node.superseded;
+  facts(box, [
+    ["map", node.map],
+    ["in the merged map", node.merged_from_robot ? pose(node.merged_from_robot) : "nowhere"],
+    ["in its own map", pose(node.map_from_robot)],
+    ["landmarks", `${node.landmarks}, ${node.with_depth} with a depth, ${node.faded.length} faded`],
+    ["on the wire", `${node.bytes} bytes`],
+    ["taken", node.stamp_ns > 1e18 ? when(node.stamp_ns) : `${(node.stamp_ns / 1e9).toFixed(1)} s`],
+    ["superseded", fate ? `by ${fate.by}, ${fate.distance.toFixed(2)} m off, ${fate.found} landmarks found again` : "no"],
+  ]);
+  const actions = add(box, "div", "", "actions");
+  if (fate) button(actions, `Show ${fate.by}`, () => select(fate.by));
+  send(actions, name);
+  picture(box, node);
+  add(box, "h3", "Edges and links");
+  const list = add(box, "ul", "", "list");
+  for (const { node: other, kind, shared } of node.neighbours) {
+    const item = add(list, "li");
+    button(item, other, () => select(other));
+    item.append(` ${kind}` + (shared ? `, ${shared} landmarks ` : " "));
+    button(item, "why", () => why(name, other)).setAttribute("aria-label", `Why ${name} and ${other} are joined`);
+  }
+}
+export const forget = () => { latest = ""; };

@@ -1,0 +1,226 @@
+// The page: what comes over the WebSocket goes to the map and the panels, what is chosen on one shows on all.
+import { add, button, byId, draw } from "./dom.js";
+import { colours, edgeColour, followTheme, hue } from "./colours.js";
+import { drawAnnotations, loadAnnotations, nodeOf, placeNamed } from "./annotations.js";
+import { listCorrections } from "./corrections.js";
+import { explain, explainAddress, explanation } from "./explanation.js";
+import { forget, showNode } from "./node_panel.js";
+import { leaveRobot, listRobots, poseOf, showRobot, updateRobot } from "./robot_panel.js";
+import { listen } from "./input.js";
+import { listenForPhotos } from "./photo.js";
+import { listenToTabs, openTab } from "./panels.js";
+import { MapModel } from "./map_model.js";
+import { drawPlans, loadPlans } from "./plans.js";
+import { Painter } from "./painter.js";
+import { addEvents, clearEvents } from "./timeline.js";
+import { Viewport } from "./viewport.js";
+import { watch } from "./live.js";
+
+const PICK = 14;              // px about what is pressed
+const MOST_NAMES = 500;       // in the list that helps searching
+const SAID_EVERY = 10000;       // ms, between two looks at annotations and plans
+
+const model = new MapModel(), viewport = new Viewport(), painter = new Painter(byId("canvas"), model, viewport);
+const page = { robots: [], commands: false, node: "", robot: "", photo: [], places: [], readOnly: false };
+// For tests and measurements.
+window.mapweave = { model, viewport, painter, page };
+
+function selectNode(name, move = true) {
+  const row = model.rowOf(name);
+  page.node = name; page.robot = painter.robot = ""; painter.link = -1;
+  leaveRobot();
+  painter.selected = row ?? -1;
+  if (row !== undefined && move) viewport.show(model.x[row], model.y[row]);
+  openTab("selected");
+  showNode(name, { select: selectNode, why: (a, b) => showWhy({ a, b }), send: offerToSend });
+  painter.ask();
+}
+function offerToSend(parent, name) {
+  if (!page.commands) return;
+  for (const { robot, alive } of page.robots)
+    if (alive) button(parent, `Send ${robot} here`, () => {
+      selectRobot(robot, name);
+      byId("goal").form.requestSubmit();
+    });
+}
+function selectRobot(name, goal = page.node) {
+  page.robot = painter.robot = name;
+  forget();
+  openTab("selected");
+  showRobot(name, page.commands, goal);
+  updateRobot(page.robots);
+  const robot = painter.robots.find(one => one.name === name);
+  if (robot) viewport.show(robot.x, robot.y);
+  painter.ask();
+}
+function showWhy(question) {
+  openTab("why");
+  markLink(question.a, question.b);
+  return explain(question);
+}
+function markLink(a, b) {
+  const [i, j] = [a, b].map(name => model.rowOf(name));
+  painter.link = model.links.find(row => {
+    const [p, q] = [model.edges.a[row], model.edges.b[row]];
+    return (p === i && q === j) || (p === j && q === i);
+  }) ?? -1;
+  painter.ask();
+}
+function chosen(u, v) {
+  const [x, y] = viewport.toPlane(u, v), reach = PICK / viewport.scale;
+  const robot = painter.robots.find(one => Math.hypot(one.x - x, one.y - y) < reach);
+  if (robot) { selectRobot(robot.name); return; }
+  const row = model.nearest(x, y, reach);
+  if (row >= 0) { selectNode(model.name(row), false); return; }
+  const link = model.nearestLink(x, y, reach / 2);
+  if (link >= 0) showWhy({ a: model.name(model.edges.a[link]), b: model.name(model.edges.b[link]) });
+}
+function next(step) {
+  if (!model.order.length) return;
+  const at = model.order.indexOf(painter.selected);
+  selectNode(model.name(model.order[(at + step + model.order.length) % model.order.length]));
+  byId("canvas").focus();
+}
+function find(text) {
+  const place = placeNamed(text), name = place ? nodeOf(place) : text;
+  const robot = page.robots.find(one => one.robot === name);
+  if (robot) { selectRobot(robot.robot); return; }
+  if (model.rowOf(name) !== undefined) { selectNode(name); return; }
+  const map = model.numbers?.get(name);
+  if (map !== undefined) {
+    viewport.fit(model.bounds(model.order.filter(row => model.nodes.map[row] === map)));
+    painter.ask();
+    return;
+  }
+  if (/^[^.]+\.\d+\.\d+$/.test(name)) { selectNode(name); return; }
+  byId("announcement").textContent = byId("query").title = `There is no ${text} on this map.`;
+  byId("query").setCustomValidity(byId("query").title);
+  byId("query").reportValidity();
+}
+function fit() { viewport.fit(model.bounds()); viewport.touched = false; painter.ask(); }
+
+function listComponents() {
+  const list = byId("components");
+  list.textContent = "";
+  model.components.forEach(({ anchor, nodes, maps }, k) => {
+    const item = add(list, "li");
+    add(item, "span", "", "swatch").style.background = hue(anchor);
+    button(item, `component ${k}`, () => { viewport.fit(model.bounds(model.members[k])); painter.ask(); });
+    const some = maps.length > 6 ? `${maps.slice(0, 6).join(", ")} and ${maps.length - 6} more` : maps.join(", ");
+    item.append(` ${nodes} node${nodes === 1 ? "" : "s"} of ${some}`);
+  });
+}
+function listNames() {
+  const robots = page.robots.map(one => one.robot);
+  const names = [...page.places, ...robots, ...model.maps];
+  byId("names").replaceChildren(...names.slice(0, MOST_NAMES).map(name => new Option(name)));
+}
+function drawLegend() {
+  const list = byId("legend");
+  list.textContent = "";
+  const kinds = [["mapped", "driven while mapping"], ["driven", "driven again"], ["loop", "recognised, one map"],
+    ["merged", "link between maps"], ["doubtful", "link below 90 %"]];
+  for (const [kind, words] of kinds) {
+    const item = add(list, "li"), svg = draw(item, "svg", { viewBox: "0 0 30 10", "aria-hidden": true });
+    const doubtful = kind === "doubtful", stroke = edgeColour(doubtful ? "merged" : kind);
+    draw(svg, "line", { x1: 0, y1: 5, x2: 30, y2: 5, "stroke-width": 2.5, stroke,
+      "stroke-dasharray": doubtful ? "5 4" : "none" });
+    item.append(words);
+  }
+  const shapes = [["M2 5a4 4 0 1 0 8 0a4 4 0 1 0-8 0M6 5H20", colours.hues[0], "node, its heading"],
+    ["M2 5a4 4 0 1 0 8 0a4 4 0 1 0-8 0M6 5H20", colours.hues[0], "superseded node", 0.35],
+    ["M4 0L24 5L4 10L9 5Z", colours.robot, "robot, ellipse of 2 sigma"]];
+  for (const [d, colour, words, opacity = 1] of shapes) {
+    const item = add(list, "li"), svg = draw(item, "svg", { viewBox: "0 0 30 10", "aria-hidden": true });
+    draw(svg, "path", { d, fill: colour, stroke: colour, opacity });
+    item.append(words);
+  }
+}
+painter.underlays.push(drawPlans);
+// Where the photo may have been taken.
+painter.overlays.push(drawAnnotations, (c, v) => {
+  for (const { merged_from_robot, component, probability } of page.photo) {
+    if (!merged_from_robot || component < 0) continue;
+    const [x, y, heading] = model.placed(merged_from_robot.mean, component), [u, w] = v.toScreen(x, y);
+    c.save();
+    c.translate(u, w); c.rotate(-heading);
+    c.fillStyle = c.strokeStyle = colours.accent; c.lineWidth = 2;
+    c.globalAlpha = 0.25; c.beginPath(); c.moveTo(0, 0); c.arc(0, 0, 46, -0.5, 0.5); c.fill();
+    c.globalAlpha = 1; c.beginPath(); c.arc(0, 0, 6, 0, 7); c.fill();
+    c.restore();
+    c.font = "600 12px system-ui, sans-serif"; c.fillStyle = colours.accent;
+    c.fillText(`photo, ${(100 * probability).toFixed(0)} %`, u + 10, w + 16);
+  }
+});
+
+watch({
+  hello({ commands, read_only }) {
+    page.commands = explanation.commands = commands;
+    page.readOnly = read_only;
+    byId("connection").textContent = read_only ? "map file" : "live";
+    clearEvents();
+  },
+  map(message, bytes) {
+    const selected = painter.selected >= 0 ? page.node : "";
+    page.bytes = bytes;
+    model.apply(message);
+    byId("empty").hidden = model.order.length > 0;
+    if (!viewport.touched) viewport.fit(model.bounds());
+    if (selected) painter.selected = model.rowOf(selected) ?? -1;
+    painter.link = -1;
+    listComponents();
+    listNames();
+    painter.changed();
+    requestAnimationFrame(() => performance.mark("map drawn"));
+    loadSaid();
+  },
+  state({ server, robots }) {
+    page.robots = robots;
+    painter.robots = robots.map(robot => poseOf(robot, model)).filter(Boolean);
+    byId("summary").textContent = server.summary + (server.settled === false ? ", still merging" : "");
+    listRobots(robots, name => selectRobot(name));
+    updateRobot(robots);
+    // Lists are shown once they are filled, so that nothing jumps.
+    byId("fleet").classList.remove("waiting");
+    painter.ask();
+  },
+  events({ history }) {
+    addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name));
+    if (page.heard) byId("announcement").textContent = history.at(-1)?.words || "";
+    page.heard = true;
+    listCorrections(page.commands);
+  },
+}, up => {
+  byId("connection").className = up ? "" : "lost";
+  byId("connection").textContent = up ? "live" : "no server, trying again";
+});
+async function loadSaid() {
+  loadPlans(() => painter.ask());
+  const places = await loadAnnotations(selectNode);
+  if (!places) return;
+  page.places = places;
+  listNames();
+  painter.ask();
+}
+setInterval(loadSaid, SAID_EVERY);
+
+explanation.shown = answer => { if (answer.a?.id) markLink(answer.a.id, answer.b.id); };
+followTheme(() => { drawLegend(); listComponents(); painter.changed(); });
+drawLegend();
+listenToTabs(name => { if (name === "why" && !byId("result").textContent) explain({}, false); });
+listen(byId("canvas"), viewport, { moved: () => painter.ask(), chosen, fit, next });
+listenForPhotos(() => openTab("photo"), candidates => {
+  page.photo = candidates;
+  const best = candidates[0];
+  if (best?.merged_from_robot && best.component >= 0)
+    viewport.show(...model.placed(best.merged_from_robot.mean, best.component).slice(0, 2));
+  painter.ask();
+}, name => selectNode(name));
+byId("search").addEventListener("submit", event => { event.preventDefault(); find(byId("query").value.trim()); });
+byId("query").addEventListener("input", () => byId("query").setCustomValidity(""));
+byId("fit").addEventListener("click", fit);
+for (const [id, factor] of [["closer", 1.4], ["farther", 1 / 1.4]])
+  byId(id).addEventListener("click", () => { viewport.zoom(factor); painter.ask(); });
+addEventListener("popstate", () => { if (location.pathname.endsWith("/why")) { openTab("why"); explainAddress(); } });
+new ResizeObserver(() => { painter.resize(); if (!viewport.touched) fit(); }).observe(byId("map"));
+if (location.pathname.endsWith("/why")) { openTab("why"); explainAddress(); }

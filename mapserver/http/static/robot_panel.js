@@ -1,0 +1,90 @@
+// Robots: the list of all, and one with its missions. POST /robots/...
+import { add, ask, button, byId, degrees, facts, percent, seconds } from "./dom.js";
+
+const QUIET = 5; // s without a status
+let panel = null;
+
+export function poseOf(robot, model) {
+  if (!robot.merged_from_robot || robot.component < 0) return null;
+  const [x, y, heading] = model.placed(robot.merged_from_robot, robot.component);
+  return { name: robot.robot, alive: robot.alive, x, y, heading, doing: robot.status?.status.doing || "",
+    ellipse: ellipseOf(robot.status?.status.covariance) };
+}
+// Axes of the covariance [xx, xy, yy, heading] of the position, in the robot's frame.
+function ellipseOf(covariance) {
+  if (!covariance || !(covariance[0] + covariance[2] > 0)) return null;
+  const [xx, xy, yy] = covariance, middle = (xx + yy) / 2, reach = Math.hypot((xx - yy) / 2, xy);
+  return { major: Math.sqrt(middle + reach), minor: Math.sqrt(Math.max(middle - reach, 0)),
+    angle: Math.atan2(2 * xy, xx - yy) / 2 };
+}
+const life = robot => !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["silent", "warn"] : ["alive", "good"];
+function missionWords(mission) {
+  if (!mission) return "";
+  const { order, state, progress, reason } = mission, goal = order.goal || order.node || "";
+  const share = state === "running" && progress ? ` ${percent(progress)}` : "", why = reason ? `: ${reason}` : "";
+  return `${order.kind}${goal ? " to " + goal : ""}, ${state}${share}${why} (by ${order.by})`;
+}
+export function listRobots(robots, select) {
+  const list = byId("robots"), focus = document.activeElement?.dataset?.robot;
+  list.textContent = "";
+  if (!robots.length) add(list, "li", "None has been heard of.", "soft");
+  for (const robot of robots) {
+    const item = add(list, "li"), [word, kind] = life(robot), status = robot.status;
+    const choice = button(item, robot.robot, () => select(robot.robot));
+    choice.dataset.robot = robot.robot;
+    add(item, "span", ` ${word}`, kind);
+    const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
+      robot.component < 0 ? "not on the map" : ""];
+    item.append(" " + parts.filter(Boolean).join(", "));
+    if (focus === robot.robot) choice.focus();
+  }
+}
+// The frame of the panel is made once, so that a goal can be typed while statuses come.
+export function showRobot(name, commands, goal) {
+  const box = byId("selected");
+  box.textContent = "";
+  add(box, "h2", `Robot ${name}`);
+  panel = { name, facts: add(box, "div") };
+  if (!commands) { add(box, "p", "Robots take missions from the server's own machine alone.", "soft"); return; }
+  const form = add(box, "form", "", "actions"), input = add(form, "input");
+  input.id = "goal"; input.value = goal; input.placeholder = "node, x,y, place or home"; input.setAttribute("list", "names");
+  input.setAttribute("aria-label", `Where to send ${name}`);
+  add(form, "button", "Send");
+  const actions = add(box, "div", "", "actions"), words = add(box, "p");
+  words.setAttribute("role", "status");
+  const give = async path => {
+    words.className = ""; words.textContent = "Asking ...";
+    const answer = await ask(`robots/${encodeURIComponent(name)}/${path}`, { method: "POST" });
+    words.className = answer.error ? "bad" : "good";
+    words.textContent = answer.error || missionWords(answer);
+  };
+  form.addEventListener("submit", event => {
+    event.preventDefault();
+    give("go?" + new URLSearchParams({ goal: input.value.trim(), by: "page" }));
+  });
+  button(actions, "Explore", () => give("explore?by=page"));
+  button(actions, "Stop", () => give("stop?by=page"));
+}
+export const leaveRobot = () => { panel = null; };
+export function updateRobot(robots) {
+  if (!panel) return;
+  const robot = robots.find(one => one.robot === panel.name);
+  panel.facts.textContent = "";
+  if (!robot) { add(panel.facts, "p", "It is not known to the server any more.", "warn"); return; }
+  const status = robot.status, [word, kind] = life(robot), pose = robot.merged_from_robot;
+  const [xx = 0, , yy = 0, hh = 0] = (status?.status.covariance || []).map(Math.sqrt);
+  const spread = xx + yy > 0 ? ` (sigma ${xx.toFixed(3)}, ${yy.toFixed(3)} m, ${degrees(hh)})` : "";
+  facts(panel.facts, [
+    ["state", word, kind],
+    ["last heard", `${seconds(robot.age)} ago`],
+    ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
+    ["mission", status && missionWords(status.mission)],
+    ["on the map", pose ? `${pose[0].toFixed(2)}, ${pose[1].toFixed(2)} m, ${degrees(pose[2])}${spread}` : "not known"],
+    ["nodes", status && `${status.status.nodes}, ${status.placed} placed by the server`],
+    ["not yet on the server", status && `${status.unsent} changes`],
+    ["images skipped", status && status.skipped],
+    ["battery", status?.battery != null ? percent(status.battery) : ""],
+    ["sees the server", status && (status.linked ? "yes" : "no")],
+    ["last error", status?.last_error ? `${status.last_error} (${seconds(status.error_age)} before)` : "", "bad"],
+  ]);
+}

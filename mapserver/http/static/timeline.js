@@ -1,0 +1,28 @@
+// What has happened to the maps, newest first.
+import { add, byId } from "./dom.js";
+
+const MOST = 300;
+const KINDS = { joined: "good", parted: "warn", "kept apart": "warn", "set apart": "warn", failed: "bad" };
+const NAMES = /\b[a-z0-9][a-z0-9_-]*\.\d+(?:\.\d+)?\b/g;
+
+// Names of nodes and maps in the words become buttons.
+export function addEvents(events, select) {
+  const list = byId("history");
+  for (const { time, kind, words } of events) {
+    const item = document.createElement("li");
+    list.prepend(item);
+    add(item, "small", `${time} UTC `);
+    add(item, "span", `${kind}: `, KINDS[kind]);
+    let last = 0;
+    for (const match of words.matchAll(NAMES)) {
+      item.append(words.slice(last, match.index));
+      const choice = add(item, "button", match[0]);
+      choice.type = "button";
+      choice.addEventListener("click", () => select(match[0]));
+      last = match.index + match[0].length;
+    }
+    item.append(words.slice(last));
+  }
+  while (list.children.length > MOST) list.lastElementChild.remove();
+}
+export const clearEvents = () => { byId("history").textContent = ""; };

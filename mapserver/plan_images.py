@@ -1,0 +1,95 @@
+"""Images of floor plans on the server's disk, in a folder beside the store, each named by its content."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan, PlanImage
+from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.storage.plan_image import check_plan_png
+
+MOST_BYTES = 2**29
+"""Of all images together: a plan takes about 2 MiB."""
+SUFFIX = ".png"
+
+
+def kept_images(store: Path, annotations: Annotations) -> dict[str, bytes]:
+    """The images of a store's plans that are in force, read only; those that are lost are left out."""
+    used = {plan.image.sha256 for _, plan in annotations.in_force(FloorPlan)}
+    folder = _folder_of(store)
+    files = {name: folder / f"{name}{SUFFIX}" for name in sorted(used)}
+    return {name: path.read_bytes() for name, path in files.items() if path.is_file()}
+
+
+def _folder_of(store: Path) -> Path:
+    return store.with_name(f"{store.name}.plans")
+
+
+class PlanImages:
+    """Kept until no plan names them. Thread-safe."""
+
+    def __init__(self, store: Path, used: Iterable[str], beside: Mapping[str, bytes] | None = None) -> None:
+        """Open the folder of a store.
+
+        Args:
+            store: path of the store; the folder is made when the first image comes.
+            used: names of images that plans use, or have used; others are removed.
+            beside: images that are there besides, in memory.
+        """
+        self._beside = dict(beside or {})
+        self._folder = _folder_of(store)
+        self._lock = threading.Lock()
+        kept = {f"{name}{SUFFIX}" for name in used}
+        for path in self._folder.glob(f"*{SUFFIX}"):
+            if path.name not in kept:
+                path.unlink(missing_ok=True)
+
+    def put(self, png: bytes) -> PlanImage:
+        """Keep an image; it is on the disk when this returns. The same one twice is kept once.
+
+        Raises:
+            InvalidValue: it is no PNG file, too large, or there are too many.
+            InvalidFile: the disk does not take it.
+        """
+        image = check_plan_png(png)
+        with self._lock:
+            path = self._path(image.sha256)
+            if not path.exists():
+                total = sum(other.stat().st_size for other in self._folder.glob(f"*{SUFFIX}"))
+                if total + len(png) > MOST_BYTES:
+                    raise InvalidValue(f"the images of plans take {total >> 20} MiB: no more are kept")
+                self._folder.mkdir(parents=True, exist_ok=True)
+                write_whole(path, png)
+        return image
+
+    def get(self, sha256: str) -> bytes:
+        """The PNG file of an image.
+
+        Raises:
+            InvalidFile: it is not there, or damaged.
+        """
+        path = self._path(sha256)
+        if sha256 in self._beside:
+            return self._beside[sha256]
+        try:
+            png = read_whole(path)
+        except OSError:
+            raise InvalidFile(f"the image {sha256[:12]} of a plan is not on the server's disk") from None
+        if hashlib.sha256(png).hexdigest() != sha256:
+            raise InvalidFile(f"the image {sha256[:12]} of a plan is damaged: add the plan again")
+        return png
+
+    def __contains__(self, sha256: str) -> bool:
+        """Whether an image is there."""
+        return sha256 in self._beside or self._path(sha256).is_file()
+
+    def _path(self, sha256: str) -> Path:
+        # A name comes from a message: `PlanImage` has checked it, others may not have.
+        if len(sha256) != 64 or not set(sha256) <= set("0123456789abcdef"):
+            raise InvalidValue(f"{sha256[:70]!r} is no name of an image")
+        return self._folder / f"{sha256}{SUFFIX}"

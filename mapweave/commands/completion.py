@@ -1,0 +1,30 @@
+"""`mapweave completion SHELL`: what makes a shell complete commands and options."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+SHELLS = ("bash", "zsh", "fish")
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "completion",
+        help="print what makes a shell complete commands and options",
+        description="Print the code that makes a shell complete commands, options, choices and files. "
+        "bash reads it from ~/.local/share/bash-completion/completions/mapweave, fish from "
+        "~/.config/fish/completions/mapweave.fish; for zsh put `source <(mapweave completion zsh)` into "
+        "~/.zshrc, after compinit.",
+    )
+    parser.add_argument("shell", choices=SHELLS)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print it."""
+    from argcomplete import shellcode  # type: ignore[attr-defined]
+
+    print(shellcode(["mapweave"], shell=arguments.shell))
+    return 0

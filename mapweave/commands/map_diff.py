@@ -1,0 +1,48 @@
+"""`mapweave map diff`: what is different between two maps."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "diff",
+        help="what is different between two maps",
+        description="Say what changed from one map to another, as by a merge: nodes added, removed and "
+        "superseded, how far the others moved, links, and which maps became one or came apart: "
+        "`mapweave map diff monday.mapweave tuesday.mapweave`. "
+        "Exit status 0: they are the same; 2: they differ; 1: one cannot be read.",
+    )
+    parser.add_argument("before", type=Path, metavar="A", help=SOURCES)
+    parser.add_argument("after", type=Path, metavar="B", help="another one")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare and print."""
+    from mapweave.map_difference import difference
+    from mapweave.mapserver.content_hash import content_hash
+
+    files, maps = [], []
+    for path in (arguments.before, arguments.after):
+        one = opened(path)
+        maps.append(merged_with_progress(one))
+        files.append(one.file(maps[-1]))
+    same = content_hash(files[0]) == content_hash(files[1])
+    found = difference(*maps)
+    lines = found.words()
+    if arguments.json:
+        print(json.dumps({"same": same, **found.values()}))
+    elif same:
+        print("the maps are the same")
+    else:
+        print("\n".join(lines or ["landmarks, edges or people's decisions differ, and nothing that follows"]))
+    return 0 if same else 2

@@ -1,0 +1,87 @@
+"""`mapweave map pin`: a node keeps its pose, so that the merged frame never jumps."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from typing import Any
+
+from mapweave.commands.annotating import add_record_options, record_of
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "pin",
+        help="keep the frame of a part of the map by the pose of a node",
+        description="Pin a node: the part of the map in which it is keeps its frame, also when others join "
+        "it: `mapweave map pin r0.1.17`. With a pose (x,y in m, heading in degrees) the part is moved there: "
+        "`mapweave map pin r0.1.17 12.5,-3,90`. Where two pinned parts join, the older pin holds, and "
+        "`mapweave map history` says by which transform the other frame has moved. Without NODE the pins are "
+        "listed.",
+    )
+    parser.add_argument("node", nargs="?", metavar="NODE|PLACE", help="a node, or a place")
+    parser.add_argument("pose", nargs="?", metavar="X,Y,DEG", help="its pose (default: as it is now)")
+    parser.add_argument("--undo", action="store_true", help="take the pin out")
+    add_record_options(parser, changes=True)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Pin a node, take a pin out, or list them."""
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.query import ResolveRequest
+
+    if arguments.node is None:
+        if arguments.undo:
+            raise InvalidValue("name the node whose pin is taken out")
+        return _list(arguments)
+    fields: dict[str, Any] = {}
+    if arguments.pose is not None:
+        fields["merged_from_node"] = _pose(arguments.pose)
+    with record_of(arguments) as record:
+        if arguments.undo:
+            said = record.withdraw("pin", arguments.node, arguments.because)
+        else:
+            node = str(record.resolve(ResolveRequest((arguments.node,))).found[0].node)
+            said = record.annotate("pin", node, arguments.because, node=node, **fields)
+    print(json.dumps({"said": said}) if arguments.json else said)
+    return 0
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    from mapweave.hybridmap.pin import Pin
+    from mapweave.mapserver.http.json_values import json_values
+
+    with record_of(arguments) as record:
+        pins = sorted(record.annotations().in_force(Pin), key=lambda item: item[0].stamp_ns)
+    if arguments.json:
+        print(json.dumps({"pins": [json_values(entry) for entry, _ in pins]}))
+        return 0
+    for entry, pin in pins:
+        said = f" ({entry.because})" if entry.because else ""
+        print(f"{pin.node} {pin.words}{said}, by {entry.who or 'a person'}")
+    if not pins:
+        print("nothing is pinned: mapweave map pin NODE")
+    return 0
+
+
+def _pose(word: str) -> list[float]:
+    """`12.5,-3,90` as m, m, rad.
+
+    Raises:
+        InvalidValue: it is no pose.
+    """
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.pin import FARTHEST
+
+    try:
+        x, y, degrees = map(float, word.split(","))
+    except ValueError:
+        x = y = degrees = math.nan
+    # Written so that NaN fails.
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and abs(degrees) <= 360.0):
+        raise InvalidValue(f"pose {word!r}: give x,y,heading, m and degrees, for example 12.5,-3,90")
+    return [x, y, math.radians(degrees)]

@@ -1,0 +1,238 @@
+"""`mapweave plan`: floor plans under the merged map."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.annotating import add_record_options, record_of
+
+if TYPE_CHECKING:
+    from mapweave.fleet import Fleet
+    from mapweave.hybridmap.floor_plan import PlacedPlan
+    from mapweave.hybridmap.pose import Pose2
+    from mapweave.merge.pose_graph.merged_map import MergedMap
+    from mapweave.offline_annotations import OfflineAnnotations
+
+FORMATS = ("rmf", "nav2", "tf", "json")
+PAIR = "r0.1.17=412,230, kitchen=412,230 or 3.1,-2.0=412,230"
+EXAMPLE = "`mapweave plan add office.yaml --pair r0.1.1=102,340 --pair r0.1.17=412,230 --pair kitchen=77,52`"
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command and its actions."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "plan",
+        help="put a floor plan, or a map of Nav2, under the merged map",
+        description="Lay a floor plan under the merged map by three or more pairs of places and pixels, and "
+        f"export the transform. Example: {EXAMPLE}, then `mapweave plan show office`.",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    add: argparse.ArgumentParser = actions.add_parser(
+        "add",
+        help="add a plan, or replace one",
+        description="Add a floor plan: an image, or the map.yaml of a Nav2 map, with three or more pairs. A "
+        "pair is a place and its pixel: NODE, PLACE or x,y (m, in the merged map) = U,V (px from the upper "
+        "left corner, right and down). The scale of an image is that of the pairs unless it is given. "
+        f"Example: {EXAMPLE}.",
+    )
+    add.add_argument("file", type=Path, metavar="MAP.yaml|IMAGE", help="a map.yaml, or png, jpg, pgm, bmp")
+    add.add_argument(
+        "--pair", action="append", required=True, metavar="NODE|PLACE|X,Y=U,V", dest="pairs",
+        help=f"a place and its pixel: {PAIR}",
+    )  # fmt: skip
+    add.add_argument("--name", metavar="NAME", help="of the plan (default: the file's, without its ending)")
+    add.add_argument("--metres-per-pixel", type=float, metavar="M", help="scale of the image, m")
+    add.add_argument(
+        "--near", metavar="NODE|PLACE",
+        help="positions are in the part of the map where this is (default: the largest part)",
+    )  # fmt: skip
+    add_record_options(add, changes=True)
+    add.set_defaults(run=run_add)
+
+    show: argparse.ArgumentParser = actions.add_parser(
+        "show",
+        help="residuals, scale and a picture",
+        description="Print how each plan lies under the map: scale, residual of each pair, also from the "
+        "transform of the others alone, and what is doubtful. With -o the plan is drawn with the merged map "
+        "over it: `mapweave plan show office -o office.png`.",
+    )
+    show.add_argument("name", nargs="?", metavar="NAME", help="of the plan (default: all)")
+    show.add_argument("-o", "--picture", type=Path, metavar="PNG", help="draw plan and map")
+    _add_component(show)
+    add_record_options(show, changes=False)
+    show.set_defaults(run=run_show)
+
+    export: argparse.ArgumentParser = actions.add_parser(
+        "export",
+        help="the transform for Open-RMF, Nav2, tf",
+        description="Print the transform between plan and merged map: reference_coordinates of an RMF fleet "
+        "adapter (rmf), lines for a map.yaml (nav2), a static transform publisher (tf), or all numbers "
+        "(json). Example: `mapweave plan export office --format rmf`.",
+    )
+    export.add_argument("name", metavar="NAME", help="of the plan")
+    export.add_argument("--format", choices=FORMATS, required=True, help="for which program")
+    _add_component(export)
+    add_record_options(export, changes=False)
+    export.set_defaults(run=run_export)
+
+    remove: argparse.ArgumentParser = actions.add_parser(
+        "remove",
+        help="remove a plan",
+        description="Remove a plan: `mapweave plan remove office`. `mapweave map history` still shows it.",
+    )
+    remove.add_argument("name", metavar="NAME", help="of the plan")
+    add_record_options(remove, changes=True)
+    remove.set_defaults(run=run_remove)
+
+
+def _add_component(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--component", type=int, metavar="N",
+        help="the part of the map under which it lies (default: that with most pairs)",
+    )  # fmt: skip
+
+
+def run_add(arguments: argparse.Namespace) -> int:
+    """Read the image, keep it, and say how it fits."""
+    from mapweave.formats.plan_export import plan_words
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.storage.nav2_map import SUFFIXES, read_nav2_map
+    from mapweave.storage.plan_image import read_plan_file
+    from mapweave.wire.typed import packed
+
+    pairs = [_pair(word) for word in arguments.pairs]
+    scale = arguments.metres_per_pixel
+    if scale is not None and not 0.0 < scale < math.inf:
+        raise InvalidValue(f"--metres-per-pixel {scale:g}: give metres, for example 0.05")
+    path = arguments.file
+    fields: dict[str, Any] = {"pairs": pairs}
+    if path.suffix.lower() in SUFFIXES:
+        if scale is not None:
+            raise InvalidValue("--metres-per-pixel goes with an image: a map.yaml has its resolution")
+        described = read_nav2_map(path)
+        fields |= {"metres_per_pixel": described.resolution, "origin": packed(described.origin)}
+        kept = read_plan_file(described.image, described.negate)
+    else:
+        kept = read_plan_file(path)
+        if scale is not None:
+            fields["metres_per_pixel"] = scale
+    fields["image"] = packed(kept.image)
+    if arguments.near:
+        fields["near"] = arguments.near
+    name = arguments.name or path.stem
+    with record_of(arguments) as record:
+        record.put_plan_image(kept.png)
+        print(record.annotate("plan", name, arguments.because, **fields))
+        print("\n".join(plan_words(record.plans().plan(name))))
+    return 0
+
+
+def run_show(arguments: argparse.Namespace) -> int:
+    """Print, and draw."""
+    from mapweave.formats.plan_export import plan_words
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.floor_plan import PlacedPlans
+    from mapweave.mapserver.http.json_values import json_values
+
+    with record_of(arguments) as record:
+        plans = record.plans()
+        shown = plans.plans if arguments.name is None else (plans.plan(arguments.name),)
+        if arguments.json:
+            print(json.dumps(json_values(PlacedPlans(shown))))
+        else:
+            print("\n".join(line for placed in shown for line in plan_words(placed)) or "there is no plan")
+        if arguments.picture is not None:
+            if len(shown) != 1:
+                raise InvalidValue("name the plan to draw: mapweave plan show NAME -o PNG")
+            _draw(record, shown[0], arguments)
+    return 0
+
+
+def run_export(arguments: argparse.Namespace) -> int:
+    """Print the transform."""
+    from mapweave.formats.plan_export import FORMATS as WRITERS
+
+    with record_of(arguments) as record:
+        placed = record.plans().plan(arguments.name)
+    part = placed.part(arguments.component)
+    print(WRITERS[arguments.format](placed, part), end="")
+    for doubt in part.doubts:
+        print(f"mapweave: {doubt}", file=sys.stderr)
+    return 0
+
+
+def run_remove(arguments: argparse.Namespace) -> int:
+    """Withdraw a plan."""
+    with record_of(arguments) as record:
+        print(record.withdraw("plan", arguments.name, arguments.because))
+    return 0
+
+
+def add_plan_option(parser: argparse.ArgumentParser) -> None:
+    """Declare `--plan` of commands that answer in coordinates."""
+    parser.add_argument("--plan", metavar="NAME", help="in the coordinates of this floor plan")
+
+
+def plan_of(arguments: argparse.Namespace) -> PlacedPlan | None:
+    """The plan that `--plan` names, of a server or of the map of `--map`; None if it is not given.
+
+    Raises:
+        MapweaveError: there is none of this name, no server answers, or the map cannot be read.
+    """
+    if arguments.plan is None:
+        return None
+    with record_of(arguments) as record:
+        return record.plans().plan(arguments.plan)
+
+
+def plan_place(placed: PlacedPlan, pose: Pose2 | None) -> str:
+    """A pose on a plan, in words."""
+    if pose is None:
+        return f"not on plan {placed.name}"
+    return f"on plan {placed.name}: {pose.x:.2f},{pose.y:.2f} m, {math.degrees(pose.heading):.0f} deg"
+
+
+def _pair(word: str) -> dict[str, Any]:
+    """`r0.1.17=412,230` as fields of an annotation.
+
+    Raises:
+        InvalidValue: it is none.
+    """
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.places import position_of
+
+    place, equals, pixel = word.rpartition("=")
+    position = position_of(pixel) if equals and place.strip() else None
+    if position is None:
+        raise InvalidValue(f"--pair {word}: write {PAIR}")
+    return {"at": place.strip(), "u": position[0], "v": position[1]}
+
+
+def _draw(record: Fleet | OfflineAnnotations, placed: PlacedPlan, arguments: argparse.Namespace) -> None:
+    from mapweave.drawing.plan_picture import draw_plan
+    from mapweave.extras import need
+    from mapweave.storage.atomic_file import check_place
+    from mapweave.storage.plan_image import plan_pixels
+
+    need("viz")
+    check_place(arguments.picture)
+    part = placed.part(arguments.component)
+    pixels = plan_pixels(record.plan_image(placed.plan.image.sha256))
+    draw_plan(placed, part, pixels, _merged(record, arguments), arguments.picture)
+    print(arguments.picture, file=sys.stderr if arguments.json else sys.stdout)
+
+
+def _merged(record: Fleet | OfflineAnnotations, arguments: argparse.Namespace) -> MergedMap:
+    from mapweave.commands.network import settings_of
+    from mapweave.fleet import Fleet
+    from mapweave.mapserver.map_files import merged_of
+    from mapweave.storage.map_file import unpack_map_file
+
+    if isinstance(record, Fleet):
+        return merged_of(unpack_map_file(record.map_bytes()), settings_of(arguments).merge)
+    return record.merged

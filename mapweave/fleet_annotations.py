@@ -1,0 +1,68 @@
+"""Annotations from Python: what people say about the map, and nodes for words."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from mapweave.fleet_questions import FleetQuestions
+from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.annotation_words import annotation_of_words
+from mapweave.wire.log_messages import decode_record
+from mapweave.wire.messages import decode, encode
+
+ANSWER = 10.0
+"""A server that merges answers questions about its map late, s."""
+
+
+class FleetAnnotations(FleetQuestions):
+    """The part of `mapweave.fleet.Fleet` by which people say what is not on the map."""
+
+    def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
+        """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
+
+        Args:
+            kind: of the annotation: place, closure, preference, plan, pin.
+            name: for the same kind and name the last one holds.
+            because: why.
+            fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a
+                place, a position `3.1,-2.0` in the merged map. An area is `corners`, positions in the merged
+                map (in the component of the place or node `near`), or `radius`, m, around `node`.
+
+        Returns:
+            What it says, in words.
+
+        Raises:
+            MapweaveError: it says nothing new, is about something that is not there, or no server answers.
+        """
+        return self._annotate(name, {"kind": kind, **fields}, False, because)
+
+    def withdraw(self, kind: str, name: str, because: str = "") -> str:
+        """Withdraw what was said about the map; see `annotate`."""
+        return self._annotate(name, {"kind": kind}, True, because)
+
+    def annotations(self) -> Annotations:
+        """What people say about the map.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._question(self._keys.any_annotations(), b"", ANSWER), Annotations)
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words: names of places, and positions in the merged map.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+            NotConnected: no map server answers.
+        """
+        return decode(self._question(self._keys.any_resolve(), encode(request), ANSWER), ResolveAnswer)
+
+    def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
+        annotation = annotation_of_words(
+            name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
+        )
+        said = decode_record(self._question(self._keys.any_annotate(), encode(annotation), ANSWER))["said"]
+        return str(said)

@@ -1,0 +1,366 @@
+"""A map to look at and to ask, in one form: from a file (`mapweave.open`) or of a fleet (`mapweave.connect`).
+
+import mapweave
+
+office = mapweave.open("office.mapweave")
+print(office, office.nodes.x.mean())
+office.plot()
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.extras import need
+from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.constraint_subject import read_ends
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.explanation import (
+    Explanation,
+    FleetExplanation,
+    MapsExplanation,
+    PairExplanation,
+    RouteExplanation,
+)
+from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
+from mapweave.map_reading import MapReading
+from mapweave.merge.settings import MergeSettings
+from mapweave.node_table import NodeTable
+from mapweave.opened_map import MapSource, open_map
+from mapweave.storage.map_file import MapFile, write_map_file
+
+if TYPE_CHECKING:
+    import networkx as nx
+    from matplotlib.axes import Axes
+
+    from mapweave.mapserver.routes import Router
+
+NodeName = NodeId | str
+"""A node, also as people write it: `r0.1.17`, the name of a place, a position `3.1,-2.0` in component 0."""
+MapName = MapId | str
+"""A robot's own map, also as people write it: `r0.1`."""
+
+
+class Map(ABC):
+    """A map. What it has does not change while it is looked at; a fleet's is fetched again by `refresh`."""
+
+    @property
+    @abstractmethod
+    def _reading(self) -> MapReading:
+        """The map as it was read last."""
+
+    @abstractmethod
+    def _answer(self, view: View) -> RelocalizeAnswer:
+        """Where a view was taken."""
+
+    @abstractmethod
+    def _explained(self, request: ExplainRequest) -> Explanation:
+        """An explanation of the kind that the request asks for."""
+
+    @abstractmethod
+    def annotations(self) -> Annotations:
+        """What people say about the map: named places, closures, preferences."""
+
+    @abstractmethod
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words: names of places, and positions in the merged map.
+
+        Raises:
+            InvalidValue: a word is none, with the reason.
+        """
+
+    def __repr__(self) -> str:
+        """For example `<FileMap: 17 nodes, 3 maps, ...>`."""
+        return f"<{type(self).__name__}: {self.content.title}>"
+
+    @property
+    def content(self) -> MapFile:
+        """All that a map file holds."""
+        return self._reading.content
+
+    @property
+    def hash(self) -> str:
+        """Content hash in hexadecimal digits, as `mapweave map show` prints it: the same map has the same."""
+        return self._reading.hash
+
+    @property
+    def nodes(self) -> NodeTable:
+        """The nodes in columns, which are NumPy arrays."""
+        return self._reading.nodes
+
+    def node(self, node: NodeName) -> Node:
+        """A node with its camera and landmarks.
+
+        Raises:
+            InvalidValue: it is not there.
+        """
+        return self._reading.node(self._named(node)[0])
+
+    def pose(self, node: NodeName) -> PoseGaussian:
+        """Pose of a node in the frame of its component.
+
+        Raises:
+            InvalidValue: it is not there.
+        """
+        found = self._reading.placed.get(self._named(node)[0])
+        if found is None:
+            raise InvalidValue(f"the map has no pose of node {node}")
+        return found[1]
+
+    def graph(self) -> nx.MultiGraph[str]:
+        """Nodes and edges as a networkx graph; see `mapweave.formats.graph` for their attributes.
+
+        Among others, nodes have `x`, `y`, `heading` and `component`, edges `kind`, `length` and, for links
+        between maps, `probability`.
+        """
+        from mapweave.formats.graph import graph_of
+        from mapweave.mapserver.own_maps import PROBABILITY
+
+        reading = self._reading
+        placed = {node: (component, pose.mean) for node, (component, pose) in reading.placed.items()}
+        wanted = ("inliers", PROBABILITY)
+        return graph_of(
+            reading.graph.nodes, placed, reading.graph.edges.values(),
+            lambda edge: {name: float(edge.evidence[name]) for name in wanted if name in edge.evidence},
+        )  # fmt: skip
+
+    def plot(self, axes: Axes | None = None, component: int = 0, landmarks: bool = True) -> Axes:
+        """Draw a component: nodes, edges and links, with the landmarks that the nodes see.
+
+        Args:
+            axes: where; by default in a new figure.
+            component: which; each has a frame of its own.
+            landmarks: whether they are drawn.
+
+        Returns:
+            The axes; `axes.figure.savefig("map.png")` writes the picture.
+
+        Raises:
+            MissingExtra: matplotlib is not installed.
+            InvalidValue: there is no such component.
+        """
+        need("viz")
+        from mapweave.drawing.map_picture import MapPicture, draw_on
+
+        reading = self._reading
+        poses = {n: pose.mean for n, (number, pose) in reading.placed.items() if number == component}
+        if not poses:
+            raise InvalidValue(f"the map has no component {component}")
+        if axes is None:
+            from matplotlib import pyplot
+
+            axes = pyplot.figure(layout="constrained").add_subplot()
+        seen = [
+            poses[n].apply(reading.node(n).points_in_robot[reading.node(n).landmarks.has_depth, :2])
+            for n in (poses if landmarks else ())
+        ]
+        points = np.concatenate([np.zeros((0, 2)), *seen])
+        edges = list(reading.graph.edges.values())
+        draw_on(axes, MapPicture(self.content.title, poses, edges, landmarks=points))
+        axes.legend(loc="best", fontsize="small")
+        return axes
+
+    def relocalize(
+        self, image: NDArray[np.uint8] | str | os.PathLike[str], camera: Camera | str | os.PathLike[str]
+    ) -> RelocalizeAnswer:
+        """Where an image was taken.
+
+        Args:
+            image: (H, W) grey, or its file (PNG, JPEG, PGM or BMP).
+            camera: that took it, ideal, or its `camera.toml`, which also gives the lens.
+
+        Returns:
+            Certainty, candidates with poses, best first, and the reason in words.
+
+        Raises:
+            InvalidValue: the image is of another form or size.
+            DeviceError: a file cannot be read.
+        """
+        from mapweave.agent.recordings.camera_file import read_camera
+        from mapweave.offline_relocalization import view_of
+        from mapweave.storage.image_file import read_grey
+        from mapweave.vision.lens import NO_DISTORTION, Distortion
+
+        source, distortion = "the camera", NO_DISTORTION
+        lens: Distortion = distortion
+        if not isinstance(camera, Camera):
+            source = str(camera)
+            camera, lens = read_camera(Path(camera))
+        if not isinstance(image, np.ndarray):
+            image = read_grey(Path(image), camera, source)
+        if image.dtype != np.uint8 or image.shape != (camera.height, camera.width):
+            wanted = f"({camera.height}, {camera.width}) of uint8, grey, by {source}"
+            raise InvalidValue(f"an image of shape {image.shape} of {image.dtype}: give {wanted}")
+        return self._answer(view_of(image, camera, lens))
+
+    def route(
+        self, start: NodeName, goal: NodeName, blocked: Iterable[tuple[NodeName, NodeName]] = ()
+    ) -> RouteExplanation:
+        """The way that a robot would drive, step by step, or why there is none.
+
+        Args:
+            start: a node.
+            goal: another one.
+            blocked: as if a robot could not get through between these.
+
+        Raises:
+            InvalidValue: a node is not there.
+        """
+        a, b, *closed = self._named(start, goal, *(end for pair in blocked for end in pair))
+        pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
+        explanation = self._explained(ExplainRequest((a, b), True, pairs))
+        assert isinstance(explanation, RouteExplanation), "a route was asked for"
+        return explanation
+
+    def explain(self, a: NodeName, b: NodeName) -> PairExplanation:
+        """Why two nodes are linked, or are not, with every number behind it.
+
+        Raises:
+            InvalidValue: a node is not there.
+        """
+        first, second = self._named(a, b)
+        explanation = self._explained(ExplainRequest((first, second)))
+        assert isinstance(explanation, PairExplanation), "two nodes were asked for"
+        return explanation
+
+    def explain_maps(self, *ends: MapName) -> tuple[MapsExplanation, ...]:
+        """Why two robots' maps are one, or are not; of each two of them if none are given.
+
+        Raises:
+            InvalidValue: a map is not there, or there is one alone.
+        """
+        if len(ends) not in (0, 2):
+            raise InvalidValue(f"give two maps, or none for each two of them; not {len(ends)}")
+        pair = read_ends(str(ends[0]), str(ends[1])) if ends else None
+        if pair is not None and isinstance(pair[0], NodeId):
+            raise InvalidValue(f"{ends[0]} is a node: `explain` is for two nodes")
+        explanation = self._explained(ExplainRequest(pair))
+        assert isinstance(explanation, FleetExplanation), "maps were asked for"
+        return explanation.maps
+
+    def _named(self, *names: NodeName) -> list[NodeId]:
+        """The nodes for names.
+
+        Raises:
+            InvalidValue: one is none.
+        """
+        nodes = {name: _node_id(name) for name in names}
+        words = [str(name) for name, node in nodes.items() if node is None]
+        if words:
+            found = self.resolve(ResolveRequest(tuple(words))).found
+            nodes |= {word: one.node for word, one in zip(words, found, strict=True)}
+        return [node for name in names if (node := nodes[name]) is not None]
+
+    def export(self, path: str | os.PathLike[str], to: str = "", component: int = 0) -> list[Path]:
+        """Write a component for others' tools, as `mapweave map export` does.
+
+        Args:
+            path: the file, or the folder for several trajectories.
+            to: `g2o`, `tum`, `graphml` or `geojson`; by default as the file is called.
+            component: which.
+
+        Returns:
+            What was written.
+
+        Raises:
+            MissingExtra: that needs the extra "server".
+            InvalidValue: there is no such format or component.
+        """
+        merged, out = self._reading.merged, Path(path)
+        from mapweave.formats.export import FORMATS
+        from mapweave.formats.map_part import MapPart
+
+        write = FORMATS.get(to or out.suffix[1:])
+        if write is None:
+            raise InvalidValue(f"{out}: give its format with `to`: {', '.join(FORMATS)}")
+        return write(MapPart(merged, component), out)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the map into a map file, all or nothing.
+
+        Raises:
+            InvalidFile: the disk does not take it.
+        """
+        write_map_file(Path(path), self.content)
+
+
+class FileMap(Map):
+    """A map from a file; it asks no server."""
+
+    def __init__(self, content: MapFile, settings: MergeSettings | None = None) -> None:
+        """Take the content of a map file.
+
+        Args:
+            content: as `read_map_file` and `merge_map_files` give it.
+            settings: with which it was merged.
+        """
+        self._read = MapReading(content, settings)
+
+    @property
+    def _reading(self) -> MapReading:
+        return self._read
+
+    def _answer(self, view: View) -> RelocalizeAnswer:
+        return self._read.relocalizer.answer(view)
+
+    def _explained(self, request: ExplainRequest) -> Explanation:
+        router = self._router()
+        from mapweave.mapserver.explanations import explained
+
+        return explained(request, router, self._read.settings.consistency)
+
+    def annotations(self) -> Annotations:
+        """What people say about the map, as the file has it."""
+        return Annotations(self.content.annotations)
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words; see Map."""
+        router = self._router()
+        from mapweave.mapserver.places import Places
+
+        return Places(router, router.annotations).answer(request)
+
+    def _router(self) -> Router:
+        """Of the ways that are open now."""
+        return self._read.router.at(self.annotations(), time.time_ns())
+
+
+def open(path: str | os.PathLike[str]) -> FileMap:
+    """Open a map file, a server's store or an agent's journal. It is never changed.
+
+    Several maps of a store or journal are merged first. Of a damaged one what can be read is opened, with a
+    warning that says what is lost.
+
+    Raises:
+        InvalidFile: it cannot be read, is damaged, in use, or none of these.
+        MissingExtra: several maps are merged with the extra "server".
+    """
+    opened = open_map(Path(path))
+    for complaint in opened.complaints.values():
+        warnings.warn(complaint, stacklevel=2)
+    if opened.source is MapSource.FILE or len(opened.maps) < 2:
+        return FileMap(opened.content)
+    need("server")
+    return FileMap(opened.file(opened.merged()))
+
+
+def _node_id(name: NodeName) -> NodeId | None:
+    """The node that is written; None if it may be the name of a place, or a position."""
+    if isinstance(name, NodeId):
+        return name
+    try:
+        return NodeId.parse(name)
+    except InvalidValue:
+        return None

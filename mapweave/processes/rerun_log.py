@@ -1,0 +1,370 @@
+"""What an agent senses, estimates and decides, for the Rerun viewer: into a file, or to a viewer that runs.
+
+Below the robot's name, on the time line `stamp`:
+
+    map                       frame of the robot's own map
+    map/nodes, map/edges      the map so far, edges in the colours of their kinds
+    map/floor                 what the rangers saw: free, occupied, unknown
+    map/robot                 pose of the robot; map/path is the way so far
+    map/robot/landmarks       the filter's landmarks with ellipsoids of two sigmas
+    map/robot/camera          the camera, its image, and the tracks in it
+    bearings/...              outermost bearings of the tracks against the limit of the field of view
+    pose/..., command/...     uncertainty of the pose, and what the wheels do
+    status, now               what it does and why, in words
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import queue
+import socket
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from mapweave.agent.observation import Command, Observation
+from mapweave.agent.occupancy_grid import GridCells
+from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import NotConnected, SettingsError
+from mapweave.hybridmap.node import Edge, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.processes.edge_colours import COLOURS
+
+CONNECT = "connect"
+"""Instead of a file: to the viewer on this computer."""
+VIEWER = "rerun+http://127.0.0.1:9876/proxy"
+"""Where a viewer listens, see `rerun --help`."""
+SOON = 2.0
+"""s; a viewer that is there is found sooner."""
+PATIENCE = 10.0
+"""How long the end of the recording may take, s."""
+QUEUED = 64
+"""Ticks that wait to be written; beyond that ticks are left out, so that the robot never waits."""
+FLOOR_EVERY = 10
+"""Ticks between two occupancy grids."""
+SIGMAS = 2.0
+"""Of the ellipsoids."""
+LARGEST = 3.0
+"""m; larger ellipsoids, of landmarks that were just begun, would hide all others."""
+QUALITY = 80
+"""Of the JPEG images, %."""
+STEP = 0.02
+"""m between two points of the path."""
+FREE, UNKNOWN, OCCUPIED = 254, 205, 0
+"""Greys of the floor, as in the map files of ROS."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What is written of one tick; nothing in it changes later.
+
+    Attributes:
+        stamp_ns: of the observation.
+        image: (H, W) grey as the pipeline takes it; None without one.
+        camera: that took it, ideal.
+        tracks_px: (N, 2) px in the image: all tracks, or those of the node by which the robot is localized.
+        bearings: (N,) rad, of the tracks, positive to the left.
+        landmarks: (M, 3) m, in robot.
+        covariances: (M, 3, 3) m^2, in robot.
+        map_from_robot: None if the robot does not know where it is.
+        status: of the pipeline.
+        command: for the wheels.
+        map: nodes and edges if they have changed, else None.
+        floor: now and then, else None.
+    """
+
+    stamp_ns: int
+    image: NDArray[np.uint8] | None
+    camera: Camera
+    tracks_px: Array
+    bearings: Array
+    landmarks: Array
+    covariances: Array
+    map_from_robot: PoseGaussian | None
+    status: Status
+    command: Command
+    map: tuple[tuple[Node, ...], tuple[Edge, ...]] | None
+    floor: GridCells | None
+
+
+class RerunLog:
+    """Writes in a thread of its own; the agent's loop only hands over.
+
+    Attributes:
+        left_out: ticks that were not written, since writing was slower than the robot.
+    """
+
+    def __init__(self, target: str, robot: str) -> None:
+        """Begin a recording.
+
+        Args:
+            target: file that ends with `.rrd`; `connect` for the viewer on this computer; or the address of
+                a viewer, `rerun+http://192.168.1.7:9876/proxy`.
+            robot: its name, under which everything is.
+
+        Raises:
+            SettingsError: the target is none of these, or the file cannot be written.
+            NotConnected: there is no viewer.
+        """
+        self.left_out = 0
+        self._robot = robot
+        self._recording = recording = rr.RecordingStream("mapweave", make_default=False)
+        if target == CONNECT or target.startswith("rerun+"):
+            address = VIEWER if target == CONNECT else target
+            _check_viewer(address)
+            recording.connect_grpc(address, default_blueprint=_layout(robot))
+        else:
+            recording.save(_writable(target), default_blueprint=_layout(robot))
+        recording.set_log_tick_enabled(False)
+        recording.set_log_time_enabled(False)
+        self._pipeline: Pipeline | None = None
+        self._ticks = 0
+        self._changed = True
+        self._waiting: queue.Queue[Moment | None] = queue.Queue(QUEUED)
+        self._words = ""
+        self._path: list[Array] = []
+        self._camera: Camera | None = None
+        self._thread = threading.Thread(target=self._serve, name="rerun", daemon=True)
+        self._thread.start()
+
+    def step(self, observation: Observation, step: Step, pipeline: Pipeline) -> None:
+        """Take in a tick; never waits.
+
+        Args:
+            observation: of the tick.
+            step: what it gave.
+            pipeline: after the tick.
+        """
+        self._changed |= bool(step.changes) or pipeline is not self._pipeline
+        self._pipeline = pipeline
+        if self._waiting.full():
+            self.left_out += 1
+            return
+        tracks, bearings, landmarks, covariances = _tracked(pipeline)
+        # Only this thread puts, so there is room.
+        self._waiting.put_nowait(
+            Moment(
+                observation.stamp_ns,
+                pipeline.image,
+                pipeline.lens.camera,
+                tracks,
+                bearings,
+                landmarks,
+                covariances,
+                pipeline.map_from_robot,
+                step.status,
+                step.command,
+                _map_of(pipeline) if self._changed else None,
+                pipeline.floor.taken() if self._ticks % FLOOR_EVERY == 0 else None,
+            )
+        )
+        self._changed = False
+        self._ticks += 1
+
+    def close(self) -> str:
+        """Write what waits, and end the recording; returns what is missing in it, in words."""
+        with contextlib.suppress(queue.Full):
+            self._waiting.put(None, timeout=PATIENCE)
+        self._thread.join(PATIENCE)
+        missing = f"{self.left_out} ticks, since writing was too slow" if self.left_out else ""
+        try:
+            self._recording.flush(timeout_sec=PATIENCE)
+        except RuntimeError as error:
+            missing = f"the end ({str(error).splitlines()[0]})"
+        self._recording.disconnect()
+        return missing
+
+    # In the thread of the log.
+
+    def _serve(self) -> None:
+        while (moment := self._waiting.get()) is not None:
+            self._recording.set_time("stamp", timestamp=np.datetime64(moment.stamp_ns, "ns"))
+            self._write_camera(moment)
+            self._write_pose(moment)
+            self._write_map(moment)
+            self._write_words(moment)
+
+    def _log(self, path: str, value: rr.AsComponents, static: bool = False) -> None:
+        self._recording.log(f"{self._robot}/{path}", value, static=static)
+
+    def _write_camera(self, moment: Moment) -> None:
+        camera, path = moment.camera, "map/robot/camera"
+        if camera != self._camera:
+            self._camera = camera
+            # The camera looks along the robot's x: its x is the robot's -y, its y the robot's -z.
+            axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+            at = [camera.mount_forward, 0.0, camera.mount_height]
+            self._log(path, rr.Transform3D(translation=at, mat3x3=axes))
+            size = (camera.width, camera.height)
+            focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
+            lens = rr.Pinhole(focal_length=focal, principal_point=middle, resolution=size)
+            self._log(path, lens)
+            for side in ("left", "right"):
+                limit = rr.SeriesLines(colors=[200, 60, 60], names=f"limit {side}")
+                self._log(f"bearings/limit_{side}", limit, static=True)
+        if moment.image is not None:
+            self._log(path, rr.Image(moment.image).compress(jpeg_quality=QUALITY))
+        self._log(f"{path}/tracks", rr.Points2D(moment.tracks_px, radii=2.0, colors=[60, 220, 90]))
+        if len(moment.bearings):
+            for side, sign in (("left", 1.0), ("right", -1.0)):
+                limit = rr.Scalars(sign * math.degrees(camera.semi_aperture))
+                outermost = moment.bearings.max() if sign > 0.0 else moment.bearings.min()
+                self._log(f"bearings/outermost_{side}", rr.Scalars(math.degrees(outermost)))
+                self._log(f"bearings/limit_{side}", limit)
+
+    def _write_pose(self, moment: Moment) -> None:
+        self._log("map/robot/landmarks", rr.Points3D(moment.landmarks, radii=0.01, colors=[240, 160, 40]))
+        self._log("map/robot/ellipsoids", _ellipsoids(moment.landmarks, moment.covariances))
+        for name, value in (("forward", moment.command.forward), ("turn", moment.command.turn)):
+            self._log(f"command/{name}", rr.Scalars(value))
+        self._log("tracked", rr.Scalars(moment.status.tracked))
+        if moment.map_from_robot is None:
+            return
+        pose, sigma = moment.map_from_robot.mean, np.sqrt(np.diag(moment.map_from_robot.covariance))
+        angle = rr.RotationAxisAngle(axis=[0.0, 0.0, 1.0], radians=pose.heading)
+        self._log("map/robot", rr.Transform3D(translation=[pose.x, pose.y, 0.0], rotation=angle))
+        self._log("pose/sigma_xy", rr.Scalars(float(sigma[:2].max())))
+        self._log("pose/sigma_heading", rr.Scalars(float(sigma[2])))
+        here = np.array([pose.x, pose.y, 0.0])
+        if not self._path or np.linalg.norm(here - self._path[-1]) > STEP:
+            self._path.append(here)
+
+    def _write_map(self, moment: Moment) -> None:
+        if moment.map is not None:
+            nodes, edges = moment.map
+            places = {node.id: _raised(node.map_from_robot.mean) for node in nodes}
+            labels = [str(node.id) for node in nodes]
+            self._log(
+                "map/nodes", rr.Points3D(list(places.values()), labels=labels, show_labels=False, radii=0.04)
+            )
+            self._log("map/edges", _edges(places, edges))
+            self._log("map/path", rr.LineStrips3D([self._path], colors=[90, 130, 255]))
+        if moment.floor is not None:
+            self._log("map/floor", _floor(moment.floor))
+
+    def _write_words(self, moment: Moment) -> None:
+        status = moment.status
+        now = f"{status.doing}: {status.detail}" if status.detail else status.doing
+        self._log("now", rr.TextDocument(f"mission: {status.mission}\n\n{now}"))
+        if status.doing != self._words:
+            self._words = status.doing
+            self._log("status", rr.TextLog(now))
+
+
+def _tracked(pipeline: Pipeline) -> tuple[Array, Array, Array, Array]:
+    """Tracks (px), their bearings, landmarks and covariances in robot: of the node that the robot drives by,
+    else of the mapping filter.
+    """
+    lens, fix = pipeline.lens, pipeline.fix
+    if fix is None:
+        mapper = pipeline.mapper
+        seen = mapper.landmarks
+        return mapper.tracks[2], mapper.bearings, seen.points_in_robot, seen.covariances_in_robot
+    if fix.localizer is None:
+        return np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3))
+    known, robot_from_node = fix.localizer.landmarks, fix.node_from_robot.mean.inverse()
+    rotation = np.eye(3)
+    rotation[:2, :2] = robot_from_node.rotation
+    points = np.column_stack([robot_from_node.apply(known.points[:, :2]), known.points[:, 2]])
+    pixels = fix.localizer.pixels
+    covariances = rotation @ known.covariances @ rotation.T
+    return lens.distort(pixels), lens.camera.bearings(pixels), points, covariances
+
+
+def _map_of(pipeline: Pipeline) -> tuple[tuple[Node, ...], tuple[Edge, ...]]:
+    return tuple(pipeline.map.nodes.values()), tuple(pipeline.map.edges.values())
+
+
+def _raised(pose: Pose2) -> Array:
+    return np.array([pose.x, pose.y, 0.0])
+
+
+def _ellipsoids(points: Array, covariances: Array) -> rr.Ellipsoids3D:
+    """Of landmarks that are known well enough to be drawn."""
+    finite = np.isfinite(points).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    variances, axes = np.linalg.eigh(covariances[finite])
+    half_sizes = SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+    drawn = half_sizes.max(axis=1, initial=0.0) <= LARGEST
+    # Axes are columns; a rotation has no reflection.
+    axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
+    turns = np.array([cv2.Rodrigues(matrix)[0].ravel() for matrix in axes[drawn]]).reshape(-1, 3)
+    angles = np.linalg.norm(turns, axis=1, keepdims=True)
+    units = np.divide(turns, angles, out=np.zeros_like(turns), where=angles > 0.0)
+    quaternions = np.concatenate([units * np.sin(angles / 2.0), np.cos(angles / 2.0)], axis=1)
+    return rr.Ellipsoids3D(
+        centers=points[finite][drawn], half_sizes=half_sizes[drawn], quaternions=quaternions,
+        colors=[240, 160, 40], fill_mode=rr.components.FillMode.DenseWireframe,
+    )  # fmt: skip
+
+
+def _edges(places: dict[NodeId, Array], edges: tuple[Edge, ...]) -> rr.LineStrips3D:
+    known = [edge for edge in edges if edge.a in places and edge.b in places]
+    return rr.LineStrips3D(
+        np.array([[places[edge.a], places[edge.b]] for edge in known]).reshape(-1, 2, 3),
+        colors=np.array([COLOURS[edge.kind] for edge in known]).reshape(-1, 3), radii=0.015,
+        labels=[str(edge.kind) for edge in known], show_labels=False,
+    )  # fmt: skip
+
+
+def _floor(cells: GridCells) -> rr.GridMap:
+    """Rows of the image are along -y of the map, columns along x."""
+    grey = np.where(
+        cells.odds > cells.decided, OCCUPIED, np.where(cells.odds < -cells.decided, FREE, UNKNOWN)
+    )
+    image = np.ascontiguousarray(grey.T[::-1].astype(np.uint8))
+    form = rr.components.ImageFormat(
+        width=image.shape[1], height=image.shape[0], color_model="L", channel_datatype="U8"
+    )
+    corner = [*cells.corner.tolist(), -0.01]
+    return rr.GridMap(data=image.tobytes(), format=form, cell_size=cells.side, translation=corner)
+
+
+def _layout(robot: str) -> rrb.Blueprint:
+    """The map on the left; camera, curves and words on the right."""
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial3DView(origin=f"{robot}/map", name="map"),
+            rrb.Vertical(
+                rrb.Spatial2DView(origin=f"{robot}/map/robot/camera", name="camera"),
+                rrb.TimeSeriesView(origin=f"{robot}/bearings", name="bearings against the limit, deg"),
+                rrb.TimeSeriesView(origin=f"{robot}/pose", name="uncertainty of the pose, m and rad"),
+                rrb.Tabs(
+                    rrb.TextDocumentView(origin=f"{robot}/now", name="now"),
+                    rrb.TextLogView(origin=f"{robot}/status", name="status"),
+                ),
+                row_shares=[4, 2, 2, 1],
+            ),
+        ),
+        collapse_panels=True,
+    )
+
+
+def _check_viewer(address: str) -> None:
+    parts = urlsplit(address)
+    try:
+        with socket.create_connection((parts.hostname or "", parts.port or 0), SOON):
+            return
+    except (OSError, ValueError, OverflowError):
+        raise NotConnected(f"no Rerun viewer at {address}: start it with `rerun`, or give a file") from None
+
+
+def _writable(target: str) -> Path:
+    path = Path(target)
+    if path.suffix != ".rrd":
+        raise SettingsError(f"--rerun {target}: give a file that ends with .rrd, or {CONNECT}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    except OSError as error:
+        raise SettingsError(f"--rerun {target}: cannot be written ({error.strerror})") from None
+    return path

@@ -1,0 +1,95 @@
+"""The recorded fleet beside a server: its robots move as long as it is open."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+from types import TracebackType
+
+from mapweave.agent.replication.journal import Journal
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.recorded_fleet.recording import recorded_maps
+from mapweave.recorded_fleet.robot import RecordedRobot
+from mapweave.wire.bus import Bus
+from mapweave.wire.keys import Keys
+
+EVERY = 0.5
+"""Between two statuses of a robot, s, as with agents."""
+MAPPING, STILL = "cy", 12
+"""This robot maps so many nodes before the viewer's eyes. Each is a node and the edge that leads to it."""
+
+
+def prepare(folder: Path, store: Path) -> None:
+    """Make the robots' journals, and a store that has what they have: a server shows the maps at once.
+
+    Args:
+        folder: for the journals.
+        store: of the server.
+
+    Raises:
+        MapweaveError: the disk does not take it.
+    """
+    with closing(Store(store)) as filled:
+        for map_id, changes in recorded_maps().items():
+            with closing(Journal(_journal(folder, map_id), map_id.agent)) as journal:
+                journal.open_map(map_id.epoch)
+                journal.append(map_id, _split(map_id, changes)[0], time.time_ns())
+                rows = journal.rows(map_id, 1, journal.head(map_id))
+                entries = [Entry.read(map_id, sequence, message) for sequence, message in rows]
+                filled.apply(map_id, journal.log_id(map_id), entries)
+
+
+class RecordedFleet:
+    """A context manager."""
+
+    def __init__(self, bus: Bus, keys: Keys, server: str, folder: Path) -> None:
+        """Announce the robots, and begin to move.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            server: its name.
+            folder: with the journals, see `prepare`.
+        """
+        self._stop = threading.Event()
+        self._robots = [
+            RecordedRobot(bus, keys, server, map_id, *_split(map_id, changes), _journal(folder, map_id))
+            for map_id, changes in recorded_maps().items()
+        ]
+        self._thread = threading.Thread(target=self._move, name="recorded fleet", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> RecordedFleet:
+        """Nothing more to do."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the robots."""
+        self._stop.set()
+        self._thread.join()
+        for robot in self._robots:
+            robot.close()
+
+    def _move(self) -> None:
+        while True:
+            for robot in self._robots:
+                robot.step(EVERY)
+            if self._stop.wait(EVERY):
+                return
+
+
+def _journal(folder: Path, map_id: MapId) -> Path:
+    return folder / f"journal-{map_id.agent}.sqlite"
+
+
+def _split(map_id: MapId, changes: list[ChangeBody]) -> tuple[list[ChangeBody], list[ChangeBody]]:
+    """What is mapped already, and what is still to be mapped."""
+    known = len(changes) - (2 * STILL if map_id.agent == MAPPING else 0)
+    return changes[:known], changes[known:]

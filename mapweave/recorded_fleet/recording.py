@@ -1,0 +1,25 @@
+"""The maps of the recorded fleet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.node import MapId
+from mapweave.storage.map_file import read_map_file
+from mapweave.wire.codec import element_of
+
+RECORDING = Path(__file__).with_name("fleet.mapweave")
+"""Made by `python -m synthetic.recorded_fleet`."""
+
+
+def recorded_maps() -> dict[MapId, list[ChangeBody]]:
+    """Each robot's changes, in the order in which it made them.
+
+    Raises:
+        InvalidFile: the file is damaged.
+    """
+    maps: dict[MapId, list[ChangeBody]] = {}
+    for change in read_map_file(RECORDING).changes:
+        maps.setdefault(element_of(change).map, []).append(change)
+    return maps

@@ -1,0 +1,185 @@
+"""A robot that drives along what it has recorded: journal, status and missions as an agent has them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import networkx as nx
+
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mission import Explore, GoTo, Idle, Mission
+from mapweave.agent.mission_control import MissionControl
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.mission_order import MissionKind
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.wire.bus import Bus
+from mapweave.wire.keys import Keys
+
+SPEED = 0.35
+"""m/s."""
+TURN_RATE = 1.2
+"""rad/s."""
+SIGMA, HEADING_SIGMA = 0.15, 0.03
+"""Of the pose that is reported, m and rad."""
+BATTERY_LIFE = 7200.0
+"""s."""
+CLOSE = 0.02
+"""m, within which a node is reached."""
+
+
+@dataclass
+class _Motion:
+    """Where it is in its own map, and the nodes that it still drives to."""
+
+    pose: Pose2
+    way: list[NodeId]
+    length: float = 0.0
+
+
+class RecordedRobot:
+    """Announced on a bus until closed. Call `step` again and again."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        server: str,
+        map_id: MapId,
+        known: Sequence[ChangeBody],
+        later: Sequence[ChangeBody],
+        journal: Path,
+    ) -> None:
+        """Go on from a journal, and map what is left when the robot gets there.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            server: that gets the map.
+            map_id: the robot and its map.
+            known: the part of the map that the journal has, at least one node.
+            later: the rest, in the order in which it was made.
+            journal: its file.
+        """
+        self._name, self._map, self._later = map_id.agent, HybridMap(known), list(later)
+        self._began = time.monotonic()
+        self._journal = Journal(journal, self._name)
+        self._replicator = Replicator(bus, keys, self._journal, map_id, servers=(server,))
+        self._control = MissionControl(self._name)
+        self._control.unknown_goal = self._unknown
+        self._client = FleetClient(
+            bus, keys, map_id, self._control, server=server,
+            unsent=self._replicator.unacknowledged, placed=lambda: len(self._map.nodes),
+        )  # fmt: skip
+        first = next(iter(self._map.nodes.values()))
+        self._motion = _Motion(first.map_from_robot.mean, [])
+        self._mission: Mission = Explore()
+        self._control.begin(MissionKind.EXPLORE)
+
+    def step(self, seconds: float) -> None:
+        """Drive on, and report."""
+        mission = self._control.next(True, time.monotonic(), None)
+        if mission is not None:
+            self._mission = mission
+            self._motion.way = []
+            if isinstance(mission, GoTo):
+                self._motion.way = self._way_to(mission.node)
+            self._motion.length = self._left() or 1.0
+        if isinstance(self._mission, Explore) and not self._motion.way:
+            self._motion.way = self._explore()
+        self._drive(seconds)
+        status = self._status()
+        self._control.follow(status)
+        elapsed = time.monotonic() - self._began
+        self._client.report(status, time.time_ns(), max(0.1, 0.95 - elapsed / BATTERY_LIFE))
+
+    def close(self) -> None:
+        """Withdraw from the fleet."""
+        self._client.close()
+        self._replicator.close()
+        self._journal.close()
+
+    def _discover(self) -> NodeId | None:
+        """Map the next node; None if there is none left."""
+        if not self._later:
+            return None
+        some, self._later = self._later[:2], self._later[2:]
+        for change in some:
+            self._map.apply(change)
+        self._replicator.submit(some, time.time_ns())
+        return list(self._map.nodes)[-1]
+
+    def _explore(self) -> list[NodeId]:
+        """Back to where the known map ends, then beyond; all over again once all is mapped."""
+        nodes = list(self._map.nodes)
+        here = self._nearest()
+        if here != nodes[-1]:
+            return nodes[nodes.index(here) + 1 :]
+        fresh = self._discover()
+        return nodes[::-1] if fresh is None else [fresh]
+
+    def _unknown(self, node: NodeId) -> str:
+        return "" if node in self._map.nodes else f"{self._name} is a recording and knows its own map alone"
+
+    def _way_to(self, goal: NodeId) -> list[NodeId]:
+        way: list[NodeId] = nx.shortest_path(self._map.graph, self._nearest(), goal)
+        return way
+
+    def _nearest(self) -> NodeId:
+        here = self._motion.pose
+        return min(self._map.nodes, key=lambda node: self._at(node).distance(here))
+
+    def _at(self, node: NodeId) -> Pose2:
+        return self._map.nodes[node].map_from_robot.mean
+
+    def _drive(self, seconds: float) -> None:
+        """Straight to the next node, turned to where it drives; a node ahead is passed."""
+        motion, left = self._motion, seconds
+        while motion.way and left > 0.0:
+            goal, pose = self._at(motion.way[0]), motion.pose
+            distance = math.hypot(goal.x - pose.x, goal.y - pose.y)
+            if distance < CLOSE:
+                motion.way.pop(0)
+                continue
+            course = math.atan2(goal.y - pose.y, goal.x - pose.x)
+            turn = wrap_angle(course - pose.heading)
+            turned = min(abs(turn) / TURN_RATE, left)
+            left -= turned
+            heading = pose.heading + math.copysign(turned * TURN_RATE, turn)
+            way = min(SPEED * left, distance)
+            left -= way / SPEED
+            motion.pose = Pose2(
+                pose.x + way * (goal.x - pose.x) / distance,
+                pose.y + way * (goal.y - pose.y) / distance,
+                heading,
+            )
+
+    def _left(self) -> float:
+        """m, to the end of the way."""
+        poses = [self._motion.pose, *map(self._at, self._motion.way)]
+        return sum(a.distance(b) for a, b in pairwise(poses))
+
+    def _status(self) -> Status:
+        motion, going = self._motion, isinstance(self._mission, GoTo)
+        fix = self._nearest()
+        doing, detail = "standing", ""
+        if motion.way:
+            doing = "mapping" if self._later and not going else "driving"
+            detail = f"to {motion.way[-1]}"
+        variance = SIGMA**2
+        return Status(
+            doing, detail, len(self._map.nodes), 40, motion.pose, going and not motion.way,
+            "goto" if going else "idle" if isinstance(self._mission, Idle) else "explore",
+            fix_node=fix, node_from_robot=self._at(fix).inverse() @ motion.pose,
+            progress=1.0 - min(self._left() / motion.length, 1.0) if going else 0.0, located=True,
+            covariance=(variance, 0.4 * variance, 0.5 * variance, HEADING_SIGMA**2),
+        )  # fmt: skip

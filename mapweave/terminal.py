@@ -1,0 +1,134 @@
+"""Lines and progress for people: bars on a terminal, plain lines where stderr goes to a file or a pipe.
+
+Rich takes a file for a terminal of 80 columns, wraps lines there, and reads `[words]` as markup.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sized
+from datetime import datetime
+from types import TracebackType
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+PLAIN_WIDTH = 10_000
+"""Characters of a line that is not on a terminal: none is wrapped."""
+EVERY = 10.0
+"""Between two lines of progress where there is no terminal, s."""
+STAMP = "%Y-%m-%d %H:%M:%S"
+"""Of a line of a log: local time, as systemd's own."""
+
+_T = TypeVar("_T")
+
+
+def plain_or_terminal(stderr: bool = True, quiet: bool = False) -> Console:
+    """A console that wraps nothing where there is no terminal."""
+    stream = sys.stderr if stderr else sys.stdout
+    return Console(file=stream, quiet=quiet, width=None if stream.isatty() else PLAIN_WIDTH)
+
+
+def stamped(line: str) -> str:
+    """An event as a line of a log, with the time."""
+    return f"{datetime.now().strftime(STAMP)} {' '.join(line.split())}"
+
+
+class EventLog:
+    """Prints events on stderr: one line each, with the time."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        """Take where to print."""
+        self._console = console or plain_or_terminal()
+
+    def __call__(self, line: str) -> None:
+        """Print an event."""
+        self._console.print(stamped(line), markup=False, highlight=False, soft_wrap=True)
+
+
+class Bar:
+    """Progress of long work. A context manager."""
+
+    def __init__(
+        self,
+        console: Console,
+        words: str,
+        total: float | None,
+        transient: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            console: where.
+            words: what is done.
+            total: steps, if that is known.
+            transient: whether a bar vanishes at the end.
+            clock: only grows, s.
+        """
+        self._console, self._words, self._total, self._clock = console, words, total, clock
+        self._done, self._said_at, self._said = 0.0, clock(), ""
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+        self._detail = ""
+        if console.is_terminal:
+            columns = (
+                TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(),
+                TimeElapsedColumn(), TextColumn("{task.fields[detail]}", markup=False),
+            )  # fmt: skip
+            self._bar = Progress(*columns, console=console, transient=transient)
+            self._task = self._bar.add_task(words, total=total, detail="")
+
+    def __enter__(self) -> Bar:
+        """Begin to show."""
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Show the last state. What was quick, or has failed, ends without a plain line."""
+        if self._bar is not None:
+            self._bar.stop()
+        elif self._said and error is None:
+            self._say()
+
+    def advance(self, steps: float = 1, detail: str = "") -> None:
+        """Some steps are done."""
+        self.update(self._done + steps, detail)
+
+    def update(self, done: float, detail: str = "", total: float | None = None) -> None:
+        """So many steps are done.
+
+        Args:
+            done: of all.
+            detail: in words.
+            total: where it is known only now.
+        """
+        self._done, self._detail = done, detail
+        self._total = self._total if total is None else total
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, total=self._total, detail=detail)
+        elif self._clock() - self._said_at >= EVERY:
+            self._say()
+
+    def _say(self) -> None:
+        of = "" if self._total is None else f" of {self._total:g}"
+        line = f"{self._words}: {self._done:g}{of}{', ' * bool(self._detail)}{self._detail}"
+        if line != self._said:
+            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._said, self._said_at = line, self._clock()
+
+
+def tracked(
+    items: Iterable[_T], words: str, total: int | None = None, console: Console | None = None
+) -> Iterator[_T]:
+    """Show the progress of a loop."""
+    known = len(items) if total is None and isinstance(items, Sized) else total
+    with Bar(console or plain_or_terminal(), words, known, transient=True) as bar:
+        for item in items:
+            yield item
+            bar.advance()

@@ -1,0 +1,100 @@
+"""Maps of Nav2 and ROS 1: a `map.yaml` beside an image (nav2_map_server, map_server)."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.pose import Pose2
+from mapweave.storage.atomic_file import read_whole
+
+MAX_BYTES = 8192
+"""A map.yaml has ten lines; the parser takes time by the square of what is nested."""
+SUFFIXES = (".yaml", ".yml")
+
+
+@dataclass(frozen=True, slots=True)
+class Nav2Map:
+    """What a map.yaml says.
+
+    Attributes:
+        image: path of the image.
+        resolution: m in a pixel.
+        origin: pose of the lower left corner of the image in the frame of the map.
+        negate: whether light pixels are occupied.
+        occupied_thresh: share of black from which a pixel is occupied.
+        free_thresh: share of black up to which it is free.
+    """
+
+    image: Path
+    resolution: float
+    origin: Pose2
+    negate: bool = False
+    occupied_thresh: float = 0.65
+    free_thresh: float = 0.25
+
+
+def read_nav2_map(path: Path) -> Nav2Map:
+    """Read a map.yaml; the image is not opened.
+
+    Raises:
+        InvalidFile: it cannot be read, or a field is missing or wrong; one line says which.
+    """
+    fields = _fields(path)
+    image = fields.get("image")
+    if not isinstance(image, str) or not image.strip():
+        raise InvalidFile(f"{path}: has no `image:`, the name of the image file")
+    resolution = _number(path, fields, "resolution", None)
+    if not 0.0 < resolution < 1e3:
+        raise InvalidFile(f"{path}: resolution {resolution:g}: give metres in a pixel, for example 0.05")
+    origin = fields.get("origin")
+    if not isinstance(origin, list) or len(origin) != 3 or not all(map(_is_number, origin)):
+        raise InvalidFile(f"{path}: origin {origin!r}: give [x, y, yaw], for example [-10.0, -5.2, 0.0]")
+    occupied = _number(path, fields, "occupied_thresh", 0.65)
+    free = _number(path, fields, "free_thresh", 0.25)
+    if not 0.0 <= free < occupied <= 1.0:
+        raise InvalidFile(
+            f"{path}: free_thresh {free:g} and occupied_thresh {occupied:g}: give 0 <= free < occupied <= 1"
+        )
+    negate = fields.get("negate", 0)
+    if negate not in (0, 1):
+        raise InvalidFile(f"{path}: negate {negate!r}: give 0 or 1")
+    place = path.parent / Path(image).expanduser()
+    return Nav2Map(place, resolution, Pose2(*map(float, origin)), bool(negate), occupied, free)
+
+
+def _fields(path: Path) -> dict[str, Any]:
+    # It is imported here: recordings bring it, and most programs read none.
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        data = read_whole(path)
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+    if len(data) > MAX_BYTES:
+        raise InvalidFile(f"{path}: is no map.yaml: it has {len(data)} bytes")
+    try:
+        fields = YAML(typ="safe", pure=True).load(io.BytesIO(data))
+    except (YAMLError, ValueError, RecursionError) as error:
+        raise InvalidFile(f"{path}: is no YAML ({str(error).split(chr(10))[0]})") from None
+    if not isinstance(fields, dict):
+        raise InvalidFile(f"{path}: is no map.yaml: it has no fields")
+    return fields
+
+
+def _number(path: Path, fields: dict[str, Any], name: str, default: float | None) -> float:
+    value = fields.get(name, default)
+    if value is None:
+        raise InvalidFile(f"{path}: has no `{name}:`")
+    if not _is_number(value):
+        raise InvalidFile(f"{path}: {name} {value!r}: give a number")
+    return float(value)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

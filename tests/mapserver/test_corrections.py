@@ -1,0 +1,207 @@
+"""Manual constraints by Python, HTTP and shell, over real connections, and after the server starts again."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapweave import Fleet
+from mapweave.cli import main
+from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import Linked, RetiredArea, RetiredNodes
+from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.server import MapServer
+from mapweave.storage.map_file import MapFile
+from mapweave.wire.codec import encode_change
+from mapweave.wire.keys import Keys
+from synthetic.world import room, take_map
+from tests.waiting import eventually
+from tests.wire.fleets import ZenohFleet
+
+A, B = MapId("a", 1), MapId("b", 1)
+LAST, FIRST = NodeId("a", 1, 5), NodeId("b", 1, 1)
+TRUE = Pose2(2.5, 2.5, 2.0).inverse() @ Pose2(2.7, 2.4, 2.05)
+
+
+def logs(stops: int = 3) -> dict[MapId, list[ChangeBody]]:
+    """Two robots turn on the spot in one hall; one pair of views shows the same, too little to join them."""
+    world, rng = room(0, 0, 6, 5, 300, np.random.default_rng(1)), np.random.default_rng(3)
+    begins = {A: (2.5, 2.5, 0.0), B: (2.7, 2.4, 2.05)}
+    out: dict[MapId, list[ChangeBody]] = {}
+    for map_id, (x, y, turn) in begins.items():
+        poses = [Pose2(x, y, turn + 1.0 * k) for k in range(stops)]
+        nodes, edges = take_map(world, map_id, poses, rng, None, 0.01, 0.01)
+        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+    return out
+
+
+def entries(map_id: MapId, changes: list[ChangeBody], first: int = 1) -> list[Entry]:
+    return [
+        Entry.read(map_id, first + k, encode_change(Change(map_id, first + k, 0, body)))
+        for k, body in enumerate(changes)
+    ]
+
+
+class Asking:
+    """A person with Python, a browser's connection and a shell."""
+
+    def __init__(self, fleet: Fleet, server: MapServer, port: int, endpoint: str) -> None:
+        self.fleet, self.server, self.port = fleet, server, port
+        self.at = ["--fleet", "demo", "--connect", endpoint, "--by", "carl"]
+
+    def http(self, method: str, body: object = None) -> tuple[int, dict[str, Any]]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        connection.request(method, "/constraints", None if body is None else json.dumps(body).encode())
+        reply = connection.getresponse()
+        return reply.status, json.loads(reply.read())
+
+    def merged(self) -> MapFile:
+        """Once the server has merged with all constraints."""
+        assert self.server.settle(60)
+        return self.fleet.map()
+
+
+def answers(fleet: Fleet) -> bool:
+    """Whether the server can be reached: a declaration needs a moment to get about."""
+    try:
+        fleet.constraints()
+    except NotConnected:
+        return False
+    return True
+
+
+@contextmanager
+def serving(path: Path) -> Iterator[Asking]:
+    router = ZenohFleet()
+    try:
+        with (
+            MapServer(router.join(), Keys("demo"), path, "s0") as server,
+            Web(("127.0.0.1", 0), server, 60.0) as web,
+            Fleet(router.endpoints[0], by="anna") as fleet,
+        ):
+            assert server.settle(60)
+            eventually(lambda: answers(fleet))
+            yield Asking(fleet, server, web.port, router.endpoints[0])
+    finally:
+        router.close()
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "s0.sqlite"
+    store = Store(path)
+    for map_id, changes in logs().items():
+        store.apply(map_id, 7, entries(map_id, changes), len(changes))
+    store.close()
+    return path
+
+
+def components(content: MapFile) -> int:
+    return len({number for number, _ in content.poses.values()})
+
+
+def test_corrections_by_python_http_and_shell_outlast_the_server(
+    path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with serving(path) as asking:
+        fleet = asking.fleet
+        before = asking.merged()
+        assert components(before) == 2
+        with pytest.raises(InvalidValue, match=r"do not show one place: \d+ features? match"):
+            fleet.link("a.1.1", "b.1.3")
+        said = fleet.link(str(FIRST), str(LAST), because="both see the red door", check=True)
+        assert said.startswith("only checked, nothing is changed: ") and not fleet.constraints()
+        fleet.link(str(FIRST), str(LAST), because="both see the red door")
+        joined = asking.merged()
+        assert components(joined) == 1
+        poses = {node: pose.mean for node, (_, pose) in joined.poses.items()}
+        assert (poses[LAST].inverse() @ poses[FIRST]).distance(TRUE) < 0.05
+        (made,) = fleet.constraints()
+        assert (made.who, made.because) == ("anna", "both see the red door")
+        assert isinstance(made.about, Linked) and made.about.by_images
+
+        status, answer = asking.http("POST", {"retire": ["b.1.5"], "by": "bob", "because": "repainted"})
+        assert status == 200 and "1 node of b.1" in answer["said"], answer
+        assert asking.merged().poses.keys() == before.poses.keys() - {NodeId("b", 1, 5)}
+        status, answer = asking.http("POST", {"retire": ["b.1.5"]})
+        assert status == 400 and "retired already: node b.1.5 is retired by bob" in answer["error"]
+        _, listed = asking.http("GET")
+        assert [(one["number"], one["in_force"], one["who"]) for one in listed["constraints"]] == [
+            (1, True, "anna"), (2, True, "bob")
+        ]  # fmt: skip
+        assert listed["constraints"][1]["about"] == {"kind": "nodes", "nodes": ["b.1.5"]}
+
+    # Meanwhile b maps on.
+    store = Store(path)
+    more = logs(4)[B]
+    later = [change for change in more if change not in more[:3]][:1] + more[-1:]
+    store.apply(B, 7, entries(B, later, 6), 7)
+    store.close()
+    with serving(path) as asking:
+        content = asking.merged()
+        assert components(content) == 1 and NodeId("b", 1, 7) in content.poses
+        assert NodeId("b", 1, 5) not in content.poses
+        capfd.readouterr()
+        assert main(["map", "undo", *asking.at]) == 0
+        lines = capfd.readouterr().out.splitlines()
+        assert [line.split()[0] for line in lines] == ["1", "2"] and "repainted" in lines[1]
+        assert main(["map", "undo", "2", "--because", "it was not", *asking.at]) == 0
+        assert "node b.1.5 is in use again, by carl" in capfd.readouterr().out
+        assert main(["map", "link", str(LAST), str(FIRST), "--undo", *asking.at]) == 0
+        content = asking.merged()
+        assert components(content) == 2 and NodeId("b", 1, 5) in content.poses
+        history = [event.words for event in content.history]
+        assert not content.retired and any("are no longer one map" in words for words in history)
+        area = Area(NodeId("a", 1, 1), ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)))
+        assert "map a.1 has no node left" in asking.fleet.retire(area=area)
+        assert {node.map for node in asking.merged().poses} == {B}
+        asking.fleet.undo(5)
+        assert asking.merged().poses.keys() == content.poses.keys()
+        kinds = [type(one.about) for one in asking.fleet.constraints()]
+        assert kinds == [Linked, RetiredNodes, RetiredNodes, Linked, RetiredArea, RetiredArea]
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({}, "give one of link, unmerge, retire"),
+        ({"link": ["a.1.1", "a.1.1"]}, "a.1.1 twice"),
+        ({"link": ["a.1.1"]}, "the body is no constraint"),
+        ({"link": ["a.1.1", "b.1.1"], "pose": [0, 0, 0], "unmerge": ["a.1", "b.1"]}, "give one of"),
+        ({"unmerge": ["a.1", "b.1"]}, "no link joins a.1 and b.1"),
+        ({"retire": ["z.1"]}, "there is no map z.1"),
+        ({"area": {"anchor": "a.1.1", "corners": [[0, 0], [1, 1]]}}, "3 to 64 corners"),
+        ({"window": {"map": "a.1", "begin": 5, "end": 4}}, "ends after it begins"),
+        ({"window": {"map": "a.1", "begin": "noon"}}, "'noon' is no time"),
+        ({"undo": 1}, "there is no constraint 1"),
+        ({"retired": ["a.1"]}, "unknown field"),
+    ],
+)
+def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: str) -> None:
+    status, answer = small.http("POST", body)
+    assert status == 400 and words in answer["error"], answer
+    assert small.http("GET") == (200, {"constraints": []})
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Asking]:
+    path = tmp_path_factory.mktemp("small") / "s0.sqlite"
+    store = Store(path)
+    for map_id, changes in logs().items():
+        store.apply(map_id, 7, entries(map_id, changes), len(changes))
+    store.close()
+    with serving(path) as asking:
+        yield asking

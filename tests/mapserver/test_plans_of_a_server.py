@@ -1,0 +1,236 @@
+"""Floor plans and pins of a running server, of its map file, and over HTTP."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapweave.cli import main
+from mapweave.fleet import Fleet, login
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import PIECE, PlanPiece
+from mapweave.hybridmap.map_event import MapEventKind
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import ResolveRequest
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.map_files import map_file_of, merged_of
+from mapweave.storage.map_file import read_map_file, write_map_file
+from mapweave.storage.plan_image import plan_file
+from mapweave.wire.typed import packed
+from tests.mapserver.conftest import MappedRoom
+from tests.mapserver.house import House
+from tests.mapserver.http.client import ask
+from tests.mapserver.stub_services import two_maps
+from tests.waiting import eventually
+
+SCALE = 0.02
+PLAN_FROM_MERGED = Pose2(4.0, 5.0, 0.5)
+PLACES = [(0.0, 0.0), (3.0, 0.0), (3.0, 2.5), (-1.0, 2.0)]
+PNG = plan_file(cv2.imencode(".png", np.full((500, 400), 200, np.uint8))[1].tobytes(), "flat.png")
+
+
+def pixel(x: float, y: float) -> tuple[float, float]:
+    """Of a position in the merged map."""
+    u, up = PLAN_FROM_MERGED.apply(np.array([x, y])) / SCALE
+    return float(u), 500.0 - float(up)
+
+
+def fields() -> dict[str, object]:
+    pairs = [{"at": f"{x},{y}", "u": pixel(x, y)[0], "v": pixel(x, y)[1]} for x, y in PLACES]
+    return {"pairs": pairs, "image": packed(PNG.image), "metres_per_pixel": SCALE}
+
+
+def pose_of(fleet: Fleet, node: NodeId) -> Pose2:
+    return fleet.resolve(ResolveRequest((str(node),))).found[0].merged_from_node
+
+
+@pytest.fixture
+def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
+    house = House(mapped_room())
+    yield house
+    house.close()
+
+
+def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> None:
+    fleet = house.person
+    with pytest.raises(InvalidValue, match="the image of this plan is not on the server"):
+        fleet.annotate("plan", "flat", **fields())
+    assert fleet.put_plan_image(PNG.png).sha256 == PNG.image.sha256
+    with pytest.raises(InvalidValue, match="3 are needed"):
+        fleet.annotate("plan", "flat", **{**fields(), "pairs": fields()["pairs"][:2]})  # type: ignore[index]
+    assert fleet.annotate("plan", "flat", **fields()) == "plan flat is flat.png, 4 pairs, 0.02 m/px, by anna"
+    for _ in range(2):
+        placed = fleet.plans().plan("flat")
+        assert np.allclose(placed.part().plan_from_merged.vector, PLAN_FROM_MERGED.vector, atol=1e-6)
+        assert fleet.plan_image(placed.plan.image.sha256) == PNG.png
+        house.stop_server()
+        house.start_server()
+    content = fleet.map()
+    assert content.images == {PNG.image.sha256: PNG.png}
+    fleet.withdraw("plan", "flat")
+    assert fleet.plans().plans == () and fleet.map().images == {}
+
+
+def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> None:
+    fleet, node, pose = house.person, NodeId("r0", 1, 3), Pose2(50.0, -20.0, 1.5)
+    fleet.put_plan_image(PNG.png)
+    assert house.server.settle(20.0)
+    fleet.annotate("plan", "flat", **fields())
+    before = fleet.plans().plan("flat").part().plan_from_merged @ pose_of(fleet, node)
+    said = fleet.annotate("pin", str(node), node=str(node), merged_from_node=packed(pose))
+    assert said == "pin r0.1.3 is at 50.000,-20.000 m, 85.9 deg, by anna"
+    eventually(lambda: pose_of(fleet, node) == pose)
+    # What lies on the plan does not move with the frame.
+    after = fleet.plans().plan("flat").part().plan_from_merged @ pose
+    assert np.allclose(after.vector, before.vector, atol=1e-6)
+    assert merged_of(fleet.map()).pose(node) == pose
+    house.stop_server()
+    house.start_server()
+    assert pose_of(fleet, node) == pose, "also before nodes are compared"
+    assert house.server.settle(20.0)
+    # A pin without a pose holds its node where it is.
+    fleet.annotate("pin", "second", node="r0.1.5")
+    second = fleet.annotations().last("pin", "second")
+    eventually(lambda: MapEventKind.FRAME in {event.kind for event in house.server.history()})
+    assert second is not None
+    assert np.allclose(second.body.merged_from_node.vector, pose_of(fleet, NodeId("r0", 1, 5)).vector)
+    fleet.withdraw("pin", str(node))
+    with pytest.raises(InvalidValue, match="give a position within"):
+        fleet.annotate("pin", str(node), node=str(node), merged_from_node=[2e5, 0.0, 0.0])
+
+
+def test_an_image_comes_in_pieces_and_in_order(house: House) -> None:
+    fleet, rng = house.person, np.random.default_rng(0)
+    noise = rng.integers(0, 255, (900, 900, 3)).astype(np.uint8)
+    png = cv2.imencode(".png", noise)[1].tobytes()
+    assert len(png) > 3 * PIECE
+    assert fleet.plan_image(fleet.put_plan_image(png).sha256) == png
+    sha256, plans = hashlib.sha256(png).hexdigest(), house.server._plans
+    plans.receive(PlanPiece(sha256, len(png), 0, png[:1000]))
+    with pytest.raises(InvalidValue, match="a piece of the image is missing"):
+        plans.receive(PlanPiece(sha256, len(png), 2000, png[2000:3000]))
+    with pytest.raises(InvalidValue, match="damaged on its way"):
+        plans.receive(PlanPiece(sha256, 4, 0, b"oops"))
+    for number in range(20):
+        plans.receive(PlanPiece(f"{number:064d}", 10, 0, b"begun"))
+    assert len(plans._incoming) == 4
+
+
+def test_plans_over_http(house: House) -> None:
+    with Web(("127.0.0.1", 0), house.server) as served:
+        jpeg = cv2.imencode(".jpg", np.full((500, 400), 200, np.uint8))[1].tobytes()
+        status, _, body = ask(served, "POST", "/plans", jpeg)
+        image = json.loads(body)
+        assert status == 200 and (image["width"], image["height"]) == (400, 500)
+        posted = {"name": "flat/1", "body": {"kind": "plan", **fields(), "image": image}}
+        assert ask(served, "POST", "/annotations", json.dumps(posted).encode())[0] == 200
+        status, _, body = ask(served, "GET", "/plans")
+        (plan,) = json.loads(body)["plans"]
+        (part,) = plan["parts"]
+        assert status == 200 and plan["name"] == "flat/1"
+        a, b, c, d, e, f = part["merged_from_image"]
+        u, v = pixel(3.0, 2.5)
+        assert (a * u + c * v + e, b * u + d * v + f) == pytest.approx((3.0, 2.5), abs=1e-6)
+        status, headers, png = ask(served, "GET", "/plans/flat%2F1.png")
+        assert (status, headers["Content-Type"]) == (200, "image/png")
+        assert cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (500, 400)
+        assert ask(served, "GET", "/plans/none.png")[0] == 400
+        assert ask(served, "POST", "/plans", b"a page")[0] == 400
+
+
+def test_plans_and_pins_of_a_map_file_from_the_shell(
+    house: House, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, image = tmp_path / "room.mapweave", tmp_path / "flat.pgm"
+    house.person.annotate("place", "door", node="r0.1.9")
+    write_map_file(path, house.person.map())
+    cv2.imwrite(str(image), np.full((500, 400), 200, np.uint8))
+    (tmp_path / "flat.yaml").write_text(
+        f"image: flat.pgm\nresolution: {SCALE}\norigin: [1.0, 2.0, 0.0]\nnegate: 0\n"
+    )
+    door = merged_of(read_map_file(path)).pose(NodeId("r0", 1, 9))
+    pairs = [f"{x},{y}={','.join(map(str, pixel(x, y)))}" for x, y in PLACES]
+    pairs.append(f"door={','.join(map(str, pixel(door.x, door.y)))}")
+    words = [word for pair in pairs for word in ("--pair", pair)]
+
+    def run(*words: str) -> tuple[int, str, str]:
+        status = main([*words, "--map", str(path)])
+        return status, *capsys.readouterr()
+
+    status, out, err = run("plan", "add", str(tmp_path / "flat.yaml"), *words, "--by", "anna")
+    assert (status, err) == (0, "")
+    assert out.startswith("plan flat is flat.pgm, 5 pairs, 0.02 m/px, by anna\n")
+    assert "residuals 0.00 m rms" in out and "doubtful" not in out
+    content = json.loads(run("plan", "show", "flat", "--json")[1])["plans"][0]
+    expected = Pose2(1.0, 2.0, 0.0) @ PLAN_FROM_MERGED
+    assert content["parts"][0]["plan_from_merged"] == pytest.approx(expected.vector.tolist(), abs=1e-6)
+    for name, found in {"rmf": "reference_coordinates:", "nav2": "origin: [", "tf": "--frame-id map"}.items():
+        status, out, _ = run("plan", "export", "flat", "--format", name)
+        assert status == 0 and found in out
+    picture = tmp_path / "plan.png"
+    assert run("plan", "show", "flat", "-o", str(picture))[0] == 0
+    assert cv2.imread(str(picture)).shape[0] > 300
+    # Exports in the coordinates of the plan.
+    assert main(["map", "export", str(path), "--to", "tum", "-o", str(tmp_path / "a.tum")]) == 0
+    with_plan = ["map", "export", str(path), "--to", "tum", "--plan", "flat", "-o", str(tmp_path / "b.tum")]
+    assert main(with_plan) == 0
+    free, moved = (np.loadtxt(tmp_path / f"{name}.tum")[:, 1:3] for name in "ab")
+    assert np.allclose(expected.apply(free), moved, atol=1e-5)
+    capsys.readouterr()
+    # A pin moves the poses of the file, and the plan with them.
+    assert run("map", "pin", "door", "-3,4.5,90") == (
+        0, f"pin r0.1.9 is at -3.000,4.500 m, 90.0 deg, by {login()}\n", ""
+    )  # fmt: skip
+    pinned = read_map_file(path)
+    _, pose = pinned.poses[NodeId("r0", 1, 9)]
+    assert np.allclose(pose.mean.vector, [-3.0, 4.5, math.pi / 2])
+    assert merged_of(pinned).pose(NodeId("r0", 1, 9)) == Pose2(-3.0, 4.5, math.radians(90.0))
+    assert "residuals 0.00 m rms" in run("plan", "show")[1]
+    assert "r0.1.9 at -3.000,4.500 m" in run("map", "pin")[1]
+    both = tmp_path / "both.mapweave"
+    assert main(["map", "merge", str(path), "-o", str(both)]) == 0
+    assert merged_of(read_map_file(both)).pose(NodeId("r0", 1, 9)) == Pose2(-3.0, 4.5, math.radians(90.0))
+    assert read_map_file(both).images == pinned.images != {}
+    capsys.readouterr()
+    assert run("map", "pin", "r0.1.9", "--undo")[0] == 0
+    assert run("map", "pin")[1] == "nothing is pinned: mapweave map pin NODE\n"
+    assert run("plan", "remove", "flat")[0] == 0 and run("plan", "show")[1] == "there is no plan\n"
+    assert read_map_file(path).images == {}
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["plan", "add", "none.png", "--pair", "r0.1.3=1,2"], "cannot be read"),
+        (["plan", "add", "none.yaml", "--pair", "r0.1.3=1,2"], "cannot be read"),
+        (["plan", "add", "none.png", "--pair", "r0.1.3"], "write r0.1.17=412,230"),
+        (["plan", "add", "none.png", "--pair", "=1,2"], "write r0.1.17=412,230"),
+        (
+            ["plan", "add", "none.yaml", "--pair", "r0.1.3=1,2", "--metres-per-pixel", "0.1"],
+            "has its resolution",
+        ),
+        (["plan", "add", "none.png", "--pair", "r0.1.3=1,2", "--metres-per-pixel", "-1"], "give metres"),
+        (["plan", "export", "none", "--format", "tf"], "there is no plan 'none'"),
+        (["map", "pin", "r0.1.3", "1,2"], "give x,y,heading"),
+        (["map", "pin", "r0.1.3", "nan,2,3"], "give x,y,heading"),
+        (["map", "pin", "--undo"], "name the node"),
+    ],
+)
+def test_mistakes_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], reason: str
+) -> None:
+    path = tmp_path / "room.mapweave"
+    write_map_file(path, map_file_of(two_maps()))
+    before = path.read_bytes()
+    status = main([*words, "--map", str(path)])
+    out, err = capsys.readouterr()
+    assert (status, out, err.count("\n")) == (1, "", 1) and reason in err
+    assert path.read_bytes() == before

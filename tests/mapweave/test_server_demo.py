@@ -1,0 +1,162 @@
+"""`mapweave server --demo` in a process of its own, watched and commanded through a real browser."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.request import Request, urlopen
+
+import pytest
+
+from mapweave.hybridmap.change import NodePut
+from mapweave.recorded_fleet.recording import RECORDING, recorded_maps
+from mapweave.wire.codec import encode_body
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.waiting import eventually, free_port
+
+TAB = "return document.querySelector('[role=tab][aria-selected=true]').textContent"
+ROBOT = "const r = mapweave.painter.robots.find(one => one.name === '{}'); return r ? [r.x, r.y] : null"
+TEXT = "return document.getElementById('{}').textContent"
+CLICK = """
+const v = mapweave.viewport, m = mapweave.model, [u, w] = v.toScreen({});
+const box = mapweave.painter.canvas.getBoundingClientRect();
+for (const type of ["pointerdown", "pointerup"])
+  mapweave.painter.canvas.dispatchEvent(new PointerEvent(type,
+    {{ pointerId: 1, clientX: box.left + u, clientY: box.top + w, bubbles: true }}));
+"""
+LAYOUT_SHIFT = """
+window.shift = 0;
+window.shifted = [];
+new PerformanceObserver(list => list.getEntries().forEach(one => {
+  window.shift += one.value;
+  window.shifted.push(...one.sources.map(source => source.node?.parentNode?.id));
+}))
+  .observe({ type: "layout-shift", buffered: true });
+"""
+
+
+@contextmanager
+def demo(http: int, zenoh: int) -> Iterator[subprocess.Popen[bytes]]:
+    command = [
+        sys.executable, "-m", "mapweave", "server", "--demo", "--http", str(http),
+        "--listen", f"tcp/127.0.0.1:{zenoh}",
+    ]  # fmt: skip
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=dict(os.environ))
+    try:
+        yield server
+    finally:
+        server.send_signal(signal.SIGINT)
+        server.wait(30)
+
+
+def get(http: int, path: str) -> dict:
+    try:
+        with urlopen(f"http://127.0.0.1:{http}/{path}", timeout=10) as reply:
+            return json.load(reply)
+    except OSError:
+        return {}
+
+
+def post(http: int, path: str, content: dict) -> dict:
+    request = Request(f"http://127.0.0.1:{http}/{path}", json.dumps(content).encode())
+    with urlopen(request, timeout=10) as reply:
+        return json.load(reply)
+
+
+def test_the_recording_is_small_and_whole() -> None:
+    assert RECORDING.stat().st_size < 200_000
+    maps = recorded_maps()
+    assert {map_id.agent for map_id in maps} == {"ada", "bo", "cy", "dee"}
+    for changes in maps.values():
+        nodes = [change for change in changes if isinstance(change, NodePut)]
+        assert len(nodes) > 10 and len(changes) == 2 * len(nodes) - 1
+        assert all(encode_body(change) for change in changes)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
+    http, zenoh = free_port(), free_port()
+    with Browser(tmp_path / "profile") as page:
+        page.look(1280, 800)
+        with demo(http, zenoh):
+            eventually(lambda: get(http, "status").get("nodes", 0) > 60, seconds=90)
+            page.open(f"http://127.0.0.1:{http}/")
+            page.run(LAYOUT_SHIFT)
+            eventually(lambda: page.run("return window.mapweave?.model.order.length") > 60)
+            eventually(lambda: get(http, "status")["components"] == 2, seconds=90)
+            eventually(lambda: page.run("return mapweave.model.components.length") == 2)
+            eventually(lambda: "are one map now" in page.run(TEXT.format("history")))
+            lists = page.run("return document.querySelectorAll('#robots li, #components li').length")
+            assert lists == 6, "four robots and two components, also without the canvas"
+            before = page.run(ROBOT.format("ada"))
+            eventually(lambda: page.run(ROBOT.format("ada")) != before)
+            # A node, by a click on the canvas; then a robot is sent there.
+            page.run(
+                "const m = mapweave.model, row = m.rowOf('ada.1.9');"
+                "mapweave.viewport.show(m.x[row], m.y[row], 150)"
+            )
+            page.run(CLICK.format("m.x[m.rowOf('ada.1.9')], m.y[m.rowOf('ada.1.9')]"))
+            eventually(lambda: "Node ada.1.9" in page.run(TEXT.format("selected")))
+            landmarks = page.run("return document.querySelectorAll('#selected svg circle').length")
+            assert landmarks == get(http, "nodes/ada.1.9")["landmarks"]
+            page.run(
+                "[...document.querySelectorAll('#selected button')]"
+                ".find(one => one.textContent === 'Send ada here').click()"
+            )
+            eventually(lambda: "go to ada.1.9, running" in page.run(TEXT.format("selected")))
+            eventually(lambda: "go to ada.1.9, done" in page.run(TEXT.format("selected")), seconds=120)
+            page.run(
+                "[...document.querySelectorAll('#selected button')]"
+                ".find(one => one.textContent === 'Stop').click()"
+            )
+            eventually(lambda: "stop, done" in page.run(TEXT.format("selected")))
+            # A place with a name is found by it.
+            place = {"name": "kitchen", "body": {"kind": "place", "node": "ada.1.15"}}
+            post(http, "annotations", place)
+            eventually(lambda: "kitchen place" in page.run(TEXT.format("places")))
+            page.run("document.getElementById('query').value = 'kitchen'")
+            page.run("document.getElementById('search').requestSubmit()")
+            eventually(lambda: "Node ada.1.15" in page.run(TEXT.format("selected")))
+            # A link between two maps shows what both views share.
+            page.run(
+                "const m = mapweave.model, link = m.links[0];"
+                "const [a, b] = [m.edges.a[link], m.edges.b[link]].map(row => m.name(row));"
+                "document.getElementById('tab-why').click(); const form = document.getElementById('form');"
+                "form.a.value = a; form.b.value = b; form.requestSubmit()"
+            )
+            eventually(lambda: ": linked: " in page.run(TEXT.format("result")))
+            assert page.run("return document.querySelectorAll('#result svg .agree').length") >= 10
+            assert page.run("return mapweave.painter.link") >= 0
+            # It is undone, and taken back.
+            a, b = page.run("return ['a', 'b'].map(name => document.getElementById(name).value)")
+            standing = f"explain?a={a}&b={b}"
+            page.run("document.querySelector('#result form input').value = 'two kitchens'")
+            page.run("document.querySelector('#result form').requestSubmit()")
+            eventually(lambda: "two kitchens" in page.run(TEXT.format("corrections")))
+            eventually(lambda: get(http, standing).get("standing") == "undone")
+            page.run("document.querySelector('#corrections button').click()")
+            eventually(lambda: get(http, standing).get("standing") == "linked")
+            assert not any(one["in_force"] for one in get(http, "constraints")["constraints"])
+            assert page.run("return window.shift") < 0.02, page.run("return window.shifted")
+        eventually(lambda: "no server" in page.run(TEXT.format("connection")))
+        with demo(http, zenoh):
+            eventually(lambda: page.run(TEXT.format("connection")) == "live", seconds=60)
+            eventually(lambda: page.run("return mapweave.model.order.length") > 60)
+        refused = [words for words in page.errors() if "ERR_CONNECTION_REFUSED" not in words]
+        assert all("/plans" in words or "WebSocket" in words for words in refused), refused
+
+
+def test_the_demo_keeps_nothing(tmp_path: Path) -> None:
+    begin = time.monotonic()
+    command = [sys.executable, "-m", "mapweave", "server", "--demo", "--data", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0 and done.stderr.strip() == "mapweave: --demo keeps nothing: leave out --data"
+    assert not list(tmp_path.iterdir()) and time.monotonic() < begin + 30.0

@@ -1,0 +1,119 @@
+"""What the shell sees of every command: help with examples, completion, exit statuses, logs, progress."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from mapweave.cheat_sheet import as_markdown
+from mapweave.cli import main, parser
+from mapweave.commands.completion import SHELLS
+from mapweave.commands.examples import EXAMPLES
+from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, tracked
+from tests.mapweave.command_line import parsers
+
+STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d "
+
+
+@pytest.mark.parametrize("words", parsers())
+def test_every_command_says_what_it_does_with_examples_that_parse(words: str) -> None:
+    command = parsers()[words]
+    assert command.description and command.description.rstrip().endswith("."), "a sentence"
+    assert command.epilog and "example" in command.epilog, "add one to mapweave/commands/examples.py"
+    for example in EXAMPLES[words]:
+        assert f"\n  {example}" in command.format_help(), "it stands there as a line of its own"
+        program, *arguments = shlex.split(example.partition(" > ")[0])
+        parsed = parser().parse_args(arguments)
+        assert program == "mapweave" and parsed.command.startswith(f"mapweave {words}")
+
+
+def test_no_example_is_of_a_command_that_is_gone() -> None:
+    assert set(EXAMPLES) == set(parsers())
+
+
+def test_the_cheat_sheet_is_that_of_these_commands() -> None:
+    page = Path("docs/cheat-sheet.md")
+    assert page.read_text(encoding="utf-8") == as_markdown(), f"python -m mapweave.cheat_sheet > {page}"
+
+
+def test_bash_completes_commands_options_and_choices(tmp_path: Path) -> None:
+    """In a real shell, which asks the program itself."""
+    program = tmp_path / "mapweave"
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m mapweave "$@"\n')
+    program.chmod(0o755)
+    script = """
+        source <(mapweave completion bash)
+        ask() {
+            COMP_LINE="$*" COMP_POINT=${#COMP_LINE} COMP_TYPE=9 COMP_WORDS=($*) COMP_CWORD=$(($# - 1))
+            COMP_POINT=${#COMP_LINE}
+            _python_argcomplete mapweave
+            echo "${COMPREPLY[@]}"
+        }
+        ask mapweave map sh
+        ask mapweave map explain --js
+        ask mapweave agent r0 --mission ca
+    """
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", "-c", script], env=environment, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.split() == ["show", "--json", "carried"], done.stderr
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_the_code_for_completion_is_that_shells(shell: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", shell]) == 0
+    code = capfd.readouterr().out
+    assert "mapweave" in code
+    if shutil.which(shell):
+        checked = subprocess.run([shell, "-n"], input=code, capture_output=True, text=True, check=False)
+        assert checked.returncode == 0, checked.stderr
+
+
+def test_an_agents_log_in_a_file_has_one_line_an_event_with_the_time(
+    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    long = tmp_path / ("a folder with a name that is longer than a terminal is wide " * 2).strip()
+    arguments = ["replay", recording, "--offline", "--data", long, "--epoch", 1]
+    assert main([str(a) for a in arguments]) == 0
+    lines = capfd.readouterr().err.splitlines()
+    (written,) = [line for line in lines if line.endswith(f" in {long / 'walk.1.mapweave'}")]
+    assert re.match(STAMP + "walk: ", written)
+    assert all(re.match(STAMP + "walk: ", line) for line in lines), lines
+
+
+def plain() -> tuple[Console, io.StringIO]:
+    file = io.StringIO()
+    return Console(file=file, width=PLAIN_WIDTH), file
+
+
+def test_an_event_is_one_line_whatever_is_in_it() -> None:
+    console, file = plain()
+    EventLog(console)("give [robot.options] a port,\nfor example [bold]" + 30 * " /dev/ttyUSB0")
+    line = file.getvalue()
+    assert line.count("\n") == 1 and re.match(
+        STAMP + r"give \[robot.options\] a port, for example \[bold\] /dev", line
+    )
+
+
+def test_progress_is_a_plain_line_now_and_then_where_there_is_no_terminal() -> None:
+    console, file = plain()
+    now = [0.0]
+    with Bar(console, "frames", 1000, clock=lambda: now[0]) as bar:
+        for _ in range(1000):
+            now[0] += 1 / 32
+            bar.advance(1, "[3] nodes")
+    assert file.getvalue().splitlines() == [
+        f"frames: {k} of 1000, [3] nodes" for k in (*(round(32 * EVERY * n) for n in (1, 2, 3)), 1000)
+    ]
+    console, file = plain()
+    assert list(tracked([], "frames", console=console)) == [] and file.getvalue() == ""

@@ -1,0 +1,93 @@
+"""The examples run from a checkout as they are, and what they print is so."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mapweave
+from mapweave.mapserver.server import MapServer
+from mapweave.photographs import send_map
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
+from tests.simulator import needs_simulator
+from tests.waiting import eventually, free_port
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SHORT = ("drive_in_simulator", "merge_maps", "plot_map", "relocalize_photo", "rerun_log", "watch_fleet")
+
+
+def run(folder: Path, name: str, *words: str) -> str:
+    """What an example prints."""
+    ran = subprocess.run(
+        [sys.executable, str(EXAMPLES / f"{name}.py"), *words],
+        cwd=folder, capture_output=True, text=True, timeout=200,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_they_are_short(name: str) -> None:
+    lines = (EXAMPLES / f"{name}.py").read_text().splitlines()
+    code = [line for line in lines if line.strip() and not line.strip().startswith("#")]
+    assert len(code) <= 35
+
+
+@pytest.mark.slow
+@needs_simulator
+def test_they_run(tmp_path: Path) -> None:
+    """Each by itself; what one has driven the next finds, as in a person's folder."""
+    out = tmp_path / "out" / "examples"
+    printed = run(tmp_path, "plot_map")
+    own = mapweave.open(out / "r0.mapweave")
+    assert f"{own.hash[:12]}" in printed and len(re.findall(r"r0\.1\.\d+: ", printed)) == len(own.nodes) >= 4
+    assert (out / "map.png").stat().st_size > 5000
+
+    printed = run(tmp_path, "merge_maps")
+    office = mapweave.open(out / "office.mapweave")
+    assert "r0.1 and r1.1: one map" in printed and set(office.nodes.component) == {0}
+    assert {name.split(".")[0] for name in office.nodes.ids} == {"r0", "r1"}
+
+    printed = run(tmp_path, "relocalize_photo")
+    really, found = (
+        [float(number) for number in numbers]
+        for numbers in re.findall(r"at ([+-][\d.]+) ([+-][\d.]+) m, ([+-][\d.]+) deg", printed)
+    )
+    assert "found" in printed and found[:2] == pytest.approx(really[:2], abs=0.02)
+    assert found[2] == pytest.approx(really[2], abs=1.0)
+    assert run(tmp_path, "drive_in_simulator", "r1").split()[-1] == "out/examples/r1.mapweave"
+
+    printed = run(tmp_path, "rerun_log")
+    assert "not in it: nothing" in printed and (out / "r0.rrd").stat().st_size > 100_000
+
+    endpoint, keys = f"tcp/127.0.0.1:{free_port()}", Keys("demo")
+    bus = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
+    robot = ZenohBus(BusSettings(endpoints=(endpoint,)))
+    try:
+        with MapServer(bus, keys, tmp_path / "server" / "s0.sqlite", "s0") as server:
+            watching = subprocess.Popen(
+                [sys.executable, "-u", str(EXAMPLES / "watch_fleet.py"), endpoint, "60"],
+                cwd=tmp_path, stdout=(log := (tmp_path / "watch.txt").open("w")), stderr=subprocess.STDOUT,
+            )  # fmt: skip
+            try:
+                eventually(lambda: "map: 0 nodes" in (tmp_path / "watch.txt").read_text(), 60.0)
+                for name in ("r0", "r1"):
+                    changes = mapweave.open(out / f"{name}.mapweave").content.changes
+                    journal = tmp_path / f"{name}.sqlite"
+                    assert send_map(changes, mapweave.MapId(name, 1), journal, robot, keys, "s0", 30.0)
+                assert server.settle(60.0)
+                eventually(lambda: "joined: " in (tmp_path / "watch.txt").read_text(), 60.0)
+                eventually(lambda: (out / "fleet.png").exists(), 60.0)
+            finally:
+                watching.kill()
+                watching.wait()
+                log.close()
+    finally:
+        robot.close()
+        bus.close()
