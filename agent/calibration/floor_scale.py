@@ -59,7 +59,7 @@ def floor_scale(logs: Array, sigmas: Array, blocks: NDArray[np.int64]) -> FloorS
         blocks: (N,) number of the block of pairs that each belongs to; errors within one go together.
 
     Returns:
-        None where no floor is to be told.
+        None where no floor can be found.
     """
     if len(logs) < LEAST_FLOOR or len(np.unique(blocks)) < LEAST_BLOCKS:
         return None

@@ -179,7 +179,7 @@ def _jacobian(seen: Array, z: Array, rho: Array, slope: Array, mean: float) -> A
     """(N, 2, 7) of the predicted coordinates with respect to a step and to the scale of the depths.
 
     A depth is estimated from the very residual along the line on which the point may lie. So along that line
-    the depth known beforehand stands for it: a product of one noise with itself has a mean.
+    the depth known beforehand takes its place: a product of one noise with itself has a mean.
     """
     u, v = seen.T
     jacobian = np.zeros((len(seen), 2, 6))
