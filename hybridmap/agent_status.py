@@ -128,6 +128,7 @@ class RobotEntry:
         merged_from_robot: where it is in the merged map, if that is known.
         component: number of that map's component; -1 if it is not known.
         place: the name of the place where it is; empty if it has none.
+        floor: the floor of that map's component; empty if it is not known.
     """
 
     robot: Name
@@ -137,6 +138,7 @@ class RobotEntry:
     merged_from_robot: Pose2 | None = None
     component: Annotated[int, Meta(ge=-1)] = NO_COMPONENT
     place: Annotated[str, Meta(max_length=64)] = ""
+    floor: Annotated[str, Meta(max_length=256)] = ""
 
 
 @dataclass(frozen=True)

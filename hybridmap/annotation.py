@@ -19,7 +19,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import MOST_WORDS
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.wall_time import utc_words
 
@@ -137,8 +137,39 @@ class Preference:
         return f"{_edge_or_area(self.edge, self.area)}, {verb}: cost times {self.factor:g}"
 
 
-Body = Place | Closure | Preference | FloorPlan | Pin
-BODIES: dict[str, type[Body]] = {body.TAG: body for body in (Place, Closure, Preference, FloorPlan, Pin)}
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """The floor on which a robot's map is; the name of the annotation is the map.
+
+    Attributes:
+        node: one of the map.
+        label: of the floor.
+    """
+
+    TAG: ClassVar[str] = "floor"
+    node: NodeId
+    label: Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
+
+    def __post_init__(self) -> None:
+        """Refuse labels that are no single printable line (InvalidValue)."""
+        if not 1 <= len(self.label) <= MAX_NAME or not self.label.isprintable():
+            raise InvalidValue(f"the label of a floor has 1 to {MAX_NAME} printable characters")
+
+    @property
+    def anchor(self) -> NodeId:
+        """The node by which it is known."""
+        return self.node
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        return f"on floor {self.label}"
+
+
+Body = Place | Closure | Preference | Floor | FloorPlan | Pin
+BODIES: dict[str, type[Body]] = {
+    body.TAG: body for body in (Place, Closure, Preference, Floor, FloorPlan, Pin)
+}
 """Kinds of annotations, by the word that names them in messages."""
 AnyBody = TypeVar("AnyBody", bound=Body)
 
@@ -173,6 +204,8 @@ class Annotation:
             raise InvalidValue(f"a name has 1 to {MAX_NAME} printable characters")
         if isinstance(self.body, Place):
             check_place_name(self.name)
+        if isinstance(self.body, Floor) and self.name != str(self.body.node.map):
+            raise InvalidValue(f"the floor of map {self.body.node.map} cannot be called {self.name!r}")
         for words in (self.who, self.because):
             if len(words) > MOST_WORDS or not words.isprintable():
                 raise InvalidValue(f"who and why must be one printable line, at most {MOST_WORDS} characters")
@@ -225,6 +258,11 @@ class Annotations:
         """Pins that hold, oldest first."""
         made = sorted(self.in_force(Pin), key=lambda item: item[0].stamp_ns)
         return tuple(pin for _, pin in made)
+
+    @cached_property
+    def floors(self) -> dict[MapId, str]:
+        """Labels of the maps of which people say on which floor they are."""
+        return {floor.node.map: floor.label for _, floor in self.in_force(Floor)}
 
     @cached_property
     def _last(self) -> dict[tuple[str, str], Annotation]:

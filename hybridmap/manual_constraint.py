@@ -81,14 +81,19 @@ class ManualConstraints:
         nodes: retired nodes of maps that are not retired as a whole, each with the constraint that retires
             it. Only the merge knows them, see mapweave.merge.retired_nodes.
         retired: retired maps, with the constraints that retire them.
+        floors: maps of which people say on which floor they are (mapweave.hybridmap.annotation.Floor).
     """
 
     def __init__(
-        self, made: Iterable[ManualConstraint] = (), nodes: Mapping[NodeId, ManualConstraint] | None = None
+        self,
+        made: Iterable[ManualConstraint] = (),
+        nodes: Mapping[NodeId, ManualConstraint] | None = None,
+        floors: Mapping[MapId, str] | None = None,
     ) -> None:
         """Take them over; the same one twice counts once."""
         self.made = tuple(dict.fromkeys(made))
         self.nodes: Mapping[NodeId, ManualConstraint] = {} if nodes is None else nodes
+        self.floors: Mapping[MapId, str] = {} if floors is None else floors
         self._last = {constraint.about.key: constraint for constraint in self.made}
         self.retired: dict[MapId, ManualConstraint] = {}
         self._apart: dict[Ends, ManualConstraint] = {}
@@ -102,16 +107,22 @@ class ManualConstraints:
     def __add__(self, other: ManualConstraints) -> ManualConstraints:
         """Both, by the time when they were made."""
         return ManualConstraints(
-            sorted({*self.made, *other.made}, key=lambda c: (c.stamp_ns, c.about.key, c.holds))
+            sorted({*self.made, *other.made}, key=lambda c: (c.stamp_ns, c.about.key, c.holds)),
+            floors={**self.floors, **other.floors},
         )
 
     def with_nodes(self, nodes: Mapping[NodeId, ManualConstraint]) -> ManualConstraints:
         """The same with other retired nodes."""
-        return ManualConstraints(self.made, nodes)
+        return ManualConstraints(self.made, nodes, self.floors)
+
+    def with_floors(self, floors: Mapping[MapId, str]) -> ManualConstraints:
+        """The same with other labels of floors."""
+        return ManualConstraints(self.made, self.nodes, floors)
 
     def without(self, kind: type[Subject]) -> ManualConstraints:
         """Only those that are about something else."""
-        return ManualConstraints(c for c in self.made if not isinstance(c.about, kind))
+        rest = (c for c in self.made if not isinstance(c.about, kind))
+        return ManualConstraints(rest, floors=self.floors)
 
     @property
     def in_force(self) -> tuple[ManualConstraint, ...]:

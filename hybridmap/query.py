@@ -84,6 +84,7 @@ class Whereabouts:
         probability: that this place is the right one, 0 to 1.
         distance_known: if not, the node's scale was not measured, and the covariance includes that.
         place: the name of the place where this is; empty if it has none.
+        floor: the floor of the component; empty if it is not known.
     """
 
     node: NodeId
@@ -94,6 +95,7 @@ class Whereabouts:
     probability: Probability
     distance_known: bool = True
     place: Annotated[str, Meta(max_length=64)] = ""
+    floor: Annotated[str, Meta(max_length=256)] = ""
 
 
 @dataclass(frozen=True, slots=True)

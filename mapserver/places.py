@@ -13,7 +13,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import reason_of
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
     REACH,
@@ -108,15 +108,25 @@ class Places:
                 best = min(best, (math.pi * distance**2, entry.name))
         return best[1]
 
+    def floor_of(self, component: int) -> str:
+        """The floor of a component; empty if none is known. Of several, joined by hand, all."""
+        floors = self.annotations.floors
+        if not floors or not 0 <= component < len(self.merged.graphs):
+            return ""
+        maps = {MapId(*map_id) for map_id in self.merged.graphs[component].maps}
+        return " and ".join(sorted({floors[map_id] for map_id in maps if map_id in floors}))
+
     def named(self, answer: RelocalizeAnswer) -> RelocalizeAnswer:
         """An answer to a lost robot, with the names of the places."""
-        if not self.annotations.in_force(Place):
+        if not self.annotations.made:
             return answer
         candidates = []
         for candidate in answer.candidates:
             pose = candidate.merged_from_robot
             if pose is not None:
-                candidate = replace(candidate, place=self.name_at(candidate.component, pose.mean))
+                number = candidate.component
+                name, floor = self.name_at(number, pose.mean), self.floor_of(number)
+                candidate = replace(candidate, place=name, floor=floor)
             candidates.append(candidate)
         return replace(answer, candidates=tuple(candidates))
 

@@ -70,10 +70,11 @@ class Roster:
         for name in names[:MAX_ROBOTS]:
             status, at = heard.get(name, (None, now))
             pose, component = (None, NO_COMPONENT) if status is None else whereabouts(status, merged)
-            place = "" if pose is None else places.name_at(component, pose)
-            entries.append(
-                RobotEntry(name, name in alive, max(now - at, 0.0), status, pose, component, place)
-            )
+            place, floor = "", ""
+            if pose is not None:
+                place, floor = places.name_at(component, pose), places.floor_of(component)
+            age = max(now - at, 0.0)
+            entries.append(RobotEntry(name, name in alive, age, status, pose, component, place, floor))
         return FleetStatus(tuple(entries))
 
     def _take(self, sample: Sample) -> None:

@@ -118,9 +118,9 @@ class MapServer:
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
         self._constraints = ConstraintRecord(self._store, self._base)
-        self._worker.constrain(self._constraints.constraints)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
-        self._pins = self._annotations.annotations.pins
+        self._pins, self._floors = self._annotations.annotations.pins, self._annotations.annotations.floors
+        self._constrain()
         self._worker.pin(self._pins)
         self._path = path
         self._admission = AdmissionControl(
@@ -151,7 +151,7 @@ class MapServer:
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
-            worker.constrain, lambda: worker.settled, self._settings.merge,
+            lambda _: self._constrain(), lambda: worker.settled, self._settings.merge,
             lambda: self._blockages.known(clock.monotonic()), self._events,
             lambda: self._annotations.annotations,
         )  # fmt: skip
@@ -323,15 +323,22 @@ class MapServer:
         """The merged map as a map file."""
         return self._services.map_file()
 
+    def _constrain(self) -> None:
+        """Merge by the constraints and the floors of the records."""
+        self._worker.constrain(self._constraints.constraints.with_floors(self._floors))
+
     def _hear(self, status: AgentStatus) -> None:
         self._schedule.observe(status.stamp_ns)
         self._missions.hear(status)
 
     def _apply_annotations(self, annotations: Annotations) -> None:
-        # A merge takes its time: only what moves a frame is worth one.
+        # A merge takes its time: only what moves a frame, or parts maps, is worth one.
         if annotations.pins != self._pins:
             self._pins = annotations.pins
             self._worker.pin(self._pins)
+        if annotations.floors != self._floors:
+            self._floors = annotations.floors
+            self._constrain()
 
     def _answers(self) -> Answers:
         """The newest ones, with routes by what is closed now."""

@@ -18,6 +18,7 @@ GROUPS = {
     "Command": ("status", "go", "explore", "stop", "missions", "drive"),
     "Places and closures": (
         "place add", "place list", "place remove", "close", "reopen", "prefer", "avoid", "closures",
+        "floor",
     ),
     "Floor plans": ("plan add", "plan show", "plan export", "plan remove", "map pin"),
     "Maps": (

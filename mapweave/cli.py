@@ -20,6 +20,7 @@ from mapweave.commands import (
     evaluate,
     find_cameras,
     find_port,
+    floor,
     info,
     keys,
     map_file,
@@ -79,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, drive, status, missions, place, plan, closures, keys, robots,
+        demo, server, router, sim, agent, drive, status, missions, place, plan, closures, floor, keys, robots,
         doctor, find_port, find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize,
         evaluate, settings, completion,
     ):  # fmt: skip

@@ -77,9 +77,9 @@ def parts_of(files: Mapping[Path, MapFile]) -> Parts:
         constraints += ManualConstraints(content.constraints)
     events = {hybrid_map for content in files.values() for hybrid_map in content.history}
     history = sorted(events, key=lambda hybrid_map: (hybrid_map.stamp_ns, hybrid_map.kind, hybrid_map.words))
-    said = sum((Annotations(content.annotations) for content in files.values()), Annotations())
+    said: Annotations = sum((Annotations(content.annotations) for content in files.values()), Annotations())
     images = {name: png for content in files.values() for name, png in content.images.items()}
-    return Parts(maps, constraints, tuple(notes), tuple(history), said, images)
+    return Parts(maps, constraints.with_floors(said.floors), tuple(notes), tuple(history), said, images)
 
 
 def _length(hybrid_map: HybridMap) -> int:

@@ -83,7 +83,8 @@ class OpenedMap:
         from mapweave.offline_merge import merge_parts
 
         maps = maps_of(self.content)
-        constraints = ManualConstraints(self.content.constraints)
+        floors = Annotations(self.content.annotations).floors
+        constraints = ManualConstraints(self.content.constraints, floors=floors)
         if self.source is MapSource.FILE or (len(maps) < 2 and not constraints.in_force):
             return merged_of(self.content, settings)
         of_store = self.path if self.source is MapSource.STORE else None

@@ -218,7 +218,9 @@ def _touched_by(before: ManualConstraints, now: ManualConstraints) -> set[MapId]
     """Maps of which constraints have changed."""
     maps = {which for c in {*before.in_force} ^ {*now.in_force} for which in c.about.maps}
     retired = before.nodes.keys() | now.nodes.keys()
-    return maps | {node.map for node in retired if before.nodes.get(node) is not now.nodes.get(node)}
+    maps |= {node.map for node in retired if before.nodes.get(node) is not now.nodes.get(node)}
+    labelled = before.floors.keys() | now.floors.keys()
+    return maps | {which for which in labelled if before.floors.get(which) != now.floors.get(which)}
 
 
 def _sorted_out(verdicts: Iterable[Verdict]) -> tuple[list[Link], list[RefusedLink]]:

@@ -13,6 +13,7 @@ from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints, reason_of
 from mapweave.hybridmap.node import EdgeId, MapId, NodeId
+from mapweave.merge.floors import across_floors
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse, refuse_edge
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -94,6 +95,8 @@ def apply_constraints(
 ) -> AppliedConstraints:
     """Remove what is excluded: retired maps and nodes, links, and a robot's own loop closures.
 
+    Links between maps on different floors are removed, too (mapweave.merge.floors); links by hand are not.
+
     Drives and turns that a robot measured while it mapped are kept, also across retired nodes (see
     mapweave.merge.retired_nodes). Links by hand take the place of what was verified of their nodes.
 
@@ -103,22 +106,29 @@ def apply_constraints(
         constraints: manual constraints, with the nodes that they retire.
         cut_maps: of merges before; it is filled.
     """
+    links = tuple(links)
+    apart = across_floors(links, constraints.floors) if constraints.floors else {}
+    if apart:
+        kept = tuple(link for link in links if link.maps not in apart)
+        elsewhere = tuple(refuse(link, apart[link.maps]) for link in links if link.maps in apart)
+        rest = apply_constraints(maps, kept, constraints.with_floors({}), cut_maps)
+        return replace(rest, refused=(*rest.refused, *elsewhere), constraints=constraints)
     if not constraints.in_force:
-        return AppliedConstraints(maps, tuple(links), (), (), maps, constraints)
+        return AppliedConstraints(maps, links, (), (), maps, constraints)
     cut_maps = cut_maps or CutMaps()
     by_hand = {
         pair: _with_landmarks(link_by_hand(linked), maps)
         for pair, linked in constraints.links.items()
         if all(node.map in maps and node in maps[node.map].nodes for node in pair)
     }
-    kept: list[Link] = []
+    left_links: list[Link] = []
     refused: list[RefusedLink] = []
     for link in links:
         constraint = constraints.against(*link.pair)
         if constraint is not None:
             refused.append(refuse(link, reason_of(constraint)))
         elif link.key not in by_hand:
-            kept.append(link)
+            left_links.append(link)
     left = {map_id: hybrid_map for map_id, hybrid_map in maps.items() if map_id not in constraints.retired}
     nodes_of: dict[MapId, set[NodeId]] = {}
     for node in constraints.nodes:
@@ -134,7 +144,9 @@ def apply_constraints(
         edges = frozenset(edge.id for edge, _ in out)
         if nodes or edges:
             left[map_id] = cut_maps.without(hybrid_map, nodes, edges)
-    return AppliedConstraints(left, tuple(kept), tuple(by_hand.values()), tuple(refused), maps, constraints)
+    return AppliedConstraints(
+        left, tuple(left_links), tuple(by_hand.values()), tuple(refused), maps, constraints
+    )
 
 
 @lru_cache(maxsize=4096)

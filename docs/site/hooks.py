@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -15,7 +16,9 @@ PAGES = {".md", ".png", ".svg"}
 
 def on_pre_build(config: Any) -> None:
     """Draw the pictures of the tutorials."""
-    subprocess.run([sys.executable, str(ROOT / "docs" / "site" / "pictures.py")], check=True, cwd=ROOT)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    pictures = ROOT / "docs" / "site" / "pictures.py"
+    subprocess.run([sys.executable, str(pictures)], check=True, cwd=ROOT, env=environment)
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:

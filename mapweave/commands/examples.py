@@ -36,6 +36,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "prefer": ("mapweave prefer r0.1.17 r0.1.19",),
     "avoid": ("mapweave avoid r0.1.17 r0.1.19",),
     "closures": ("mapweave closures",),
+    "floor": ("mapweave floor ground r0.1.17",),
     "keys": ("mapweave keys list",),
     "keys init": ("mapweave keys init --fleet office --at 192.168.1.10",),
     "keys add": ("mapweave keys add r0 --role robot",),

@@ -95,7 +95,7 @@ def _run_via(
         print(json.dumps({"found": found, "legs": [json_values(leg) for leg in legs]}))
     else:
         print("\n".join(line for leg in legs for line in route_words(leg)))
-    return 0 if found else 2
+    return 0 if found else NO
 
 
 def draw_route(

@@ -191,6 +191,7 @@ def _print(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> None:
         x, y, heading = place.node_from_robot.mean.vector
         sx, sy, sh = np.sqrt(np.diag(place.node_from_robot.covariance))
         named = f", {place.place}" if place.place else ""
+        named += f", floor {place.floor}" if place.floor else ""
         if not place.distance_known:
             print(
                 f"  node {place.node}{named}: somewhere near it, {math.degrees(heading):+.1f} deg "

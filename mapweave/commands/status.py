@@ -147,6 +147,7 @@ def _place(robot: RobotEntry, plan: PlacedPlan | None) -> str:
     if pose is not None:
         part = f" in part {robot.component}" if robot.component > 0 else ""
         part += f", {robot.place}" if robot.place else ""
+        part += f", floor {robot.floor}" if robot.floor else ""
         return f"{pose.x:.2f},{pose.y:.2f} {math.degrees(pose.heading):.0f}°{part}"
     if status is not None and status.status.fix_node is not None:
         return f"near {status.status.fix_node}"

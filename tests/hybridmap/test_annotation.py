@@ -12,6 +12,7 @@ from mapweave.hybridmap.annotation import (
     Annotation,
     Annotations,
     Closure,
+    Floor,
     Place,
     Preference,
     check_place_name,
@@ -66,7 +67,11 @@ def is_name(name: str) -> bool:
     return bool(name)
 
 
-entries = st.builds(Annotation, lines.filter(is_name), bodies, st.booleans(), lines, stamps, lines)
+floors = st.builds(Floor, nodes, lines.filter(bool))
+entries = st.one_of(
+    st.builds(Annotation, lines.filter(is_name), bodies, st.booleans(), lines, stamps, lines),
+    floors.map(lambda floor: Annotation(str(floor.node.map), floor, False, "anna", 1)),
+)
 
 
 @given(st.lists(entries, max_size=6))

@@ -11,6 +11,7 @@ import pytest
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
 from mapweave.cli import main
+from mapweave.exit_status import NO
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidValue
@@ -74,7 +75,7 @@ def test_what_is_closed_from_the_shell_holds_for_all(
             with pytest.raises(InvalidValue, match=r'is in kitchen, which is closed by bob .*"paint"'):
                 fleet.go("r0", "kitchen")
             status, out, _ = shell("map", "route", str(first), "kitchen")
-            assert status == 2 and "closed by bob" in out
+            assert status == NO and "closed by bob" in out
             assert "closure kitchen is an area" in shell("closures")[1]
             assert shell("reopen", "kitchen")[0] == 0
             assert shell("reopen", "kitchen")[::2] == (1, "mapweave: there is no closure kitchen\n")

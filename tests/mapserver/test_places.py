@@ -10,26 +10,36 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
 import pytest
 
 from mapweave.cli import main
+from mapweave.fleet import Fleet
 from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEventKind
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, ResolveRequest
 from mapweave.hybridmap.superseded import Superseded
+from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
+from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
+from mapweave.storage.map_file import MapFile, read_map_file, unpack_map_file, write_map_file
+from mapweave.wire.codec import encode_change
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode_view
+from synthetic.world import room, take_map, take_view
 from tests.mapserver.conftest import MappedRoom
 from tests.mapserver.house import KEYS, House
 from tests.waiting import eventually
@@ -80,7 +90,10 @@ def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house:
         "place hall",
         "place kitchen",
     ]
-    assert person.map().annotations == person.annotations().made and len(person.annotations().made) == 3
+    assert (
+        unpack_map_file(person.map_bytes()).annotations == person.annotations().made
+        and len(person.annotations().made) == 3
+    )
     link.close()
 
 
@@ -132,7 +145,7 @@ def test_places_over_http(house: House) -> None:
 @pytest.fixture(scope="module")
 def fetched(mapped_room: Callable[[], MappedRoom]) -> MapFile:
     house = House(mapped_room())
-    content = house.person.map()
+    content = unpack_map_file(house.person.map_bytes())
     house.close()
     return content
 
@@ -259,3 +272,56 @@ def test_places_of_a_map_file_from_the_shell(
     both = tmp_path / "both.mapweave"
     assert main(["map", "merge", str(path), str(other), "-o", str(both)]) == 0
     assert len(read_map_file(both).annotations) == 4
+
+
+def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two robots in twin rooms, which a running server has merged, until people say that they are not one."""
+    rng, path = np.random.default_rng(6), tmp_path / "s0.sqlite"
+    world, maps = room(0, 0, 5, 4, 700, rng), [MapId("r0", 1), MapId("r1", 1)]
+    store = Store(path)
+    for map_id in maps:
+        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        bodies = [*map(NodePut, nodes), *map(EdgePut, edges)]
+        entries = [
+            Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
+            for k, body in enumerate(bodies)
+        ]
+        store.apply(map_id, 7, entries, len(entries))
+    store.close()
+    hub = MemoryHub()
+    bus, mine = MemoryBus(hub), MemoryBus(hub)
+    person, first = Fleet(fleet="fleet", by="anna", bus=mine), NodeId("r0", 1, 1)
+    view = take_view(world, Pose2(2.45, 2.05, 0.05), np.random.default_rng(5))[0]
+    for labels in (True, False):
+        with MapServer(bus, KEYS, path, "s0") as server:
+            eventually(lambda: server.status()["components"] == (1 if labels else 2))  # noqa: B023
+            if labels:
+                assert "map r0.1" not in person.annotate("floor", "r0.1", node=str(first), label="ground")
+                with pytest.raises(InvalidValue, match=r"floor of map r1\.1 cannot be called 'r0.1'"):
+                    person.annotate("floor", "r0.1", node="r1.1.1", label="upper")
+                person.annotate("floor", "r1.1", node="r1.1.1", label="upper")
+                eventually(lambda: server.status()["components"] == 2)
+            answer = server.locate(lambda: view, 1).result(20.0)
+            assert {candidate.floor for candidate in answer.candidates} <= {"ground", "upper"}
+            assert answer.candidates and answer.certainty is not Certainty.FOUND, "it may be on either floor"
+            if not labels:
+                person.withdraw("floor", "r1.1")
+                eventually(lambda: server.status()["components"] == 1)
+    for one in (bus, mine):
+        one.close()
+
+
+def test_a_map_that_a_server_is_given_brings_its_annotations(fetched: MapFile, tmp_path: Path) -> None:
+    named = replace(fetched, annotations=record("kitchen", Place(THERE)).made)
+    hub = MemoryHub()
+    bus, mine = MemoryBus(hub), MemoryBus(hub)
+    person = Fleet(fleet="fleet", by="bob", bus=mine)
+    with MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0", base=BaseMap.of("room", named)) as server:
+        eventually(lambda: server.status()["nodes"] == 7)
+        assert person.resolve(ResolveRequest(("kitchen",))).found[0].node == THERE
+        person.withdraw("place", "kitchen")
+    with MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0", base=BaseMap.of("room", named)):
+        assert [entry.removed for entry in person.annotations().made] == [False, True]
+    bus.close()
+    mine.close()

@@ -22,7 +22,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveRequest
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.map_files import map_file_of, merged_of
-from mapweave.storage.map_file import read_map_file, write_map_file
+from mapweave.storage.map_file import MapFile, read_map_file, unpack_map_file, write_map_file
 from mapweave.storage.plan_image import plan_file
 from mapweave.wire.typed import packed
 from tests.mapserver.conftest import MappedRoom
@@ -52,6 +52,10 @@ def pose_of(fleet: Fleet, node: NodeId) -> Pose2:
     return fleet.resolve(ResolveRequest((str(node),))).found[0].merged_from_node
 
 
+def map_of(fleet: Fleet) -> MapFile:
+    return unpack_map_file(fleet.map_bytes())
+
+
 @pytest.fixture
 def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
     house = House(mapped_room())
@@ -73,10 +77,10 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
         assert fleet.plan_image(placed.plan.image.sha256) == PNG.png
         house.stop_server()
         house.start_server()
-    content = fleet.map()
+    content = map_of(fleet)
     assert content.images == {PNG.image.sha256: PNG.png}
     fleet.withdraw("plan", "flat")
-    assert fleet.plans().plans == () and fleet.map().images == {}
+    assert fleet.plans().plans == () and map_of(fleet).images == {}
 
 
 def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> None:
@@ -91,7 +95,7 @@ def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> No
     # What lies on the plan does not move with the frame.
     after = fleet.plans().plan("flat").part().plan_from_merged @ pose
     assert np.allclose(after.vector, before.vector, atol=1e-6)
-    assert merged_of(fleet.map()).pose(node) == pose
+    assert merged_of(map_of(fleet)).pose(node) == pose
     house.stop_server()
     house.start_server()
     assert pose_of(fleet, node) == pose, "also before nodes are compared"
@@ -151,7 +155,7 @@ def test_plans_and_pins_of_a_map_file_from_the_shell(
 ) -> None:
     path, image = tmp_path / "room.mapweave", tmp_path / "flat.pgm"
     house.person.annotate("place", "door", node="r0.1.9")
-    write_map_file(path, house.person.map())
+    write_map_file(path, map_of(house.person))
     cv2.imwrite(str(image), np.full((500, 400), 200, np.uint8))
     (tmp_path / "flat.yaml").write_text(
         f"image: flat.pgm\nresolution: {SCALE}\norigin: [1.0, 2.0, 0.0]\nnegate: 0\n"

@@ -85,6 +85,7 @@ CASES: list[tuple[str, str, str]] = [
     ("prefer", "r0.1.1 r0.1.3 --connect {closed}", WITHOUT_SERVER),
     ("avoid", "r0.1.1 r0.1.3 --connect {closed}", WITHOUT_SERVER),
     ("closures", "--map {merged}", SERVER),
+    ("floor", "ground r0.1.1 --connect {closed}", WITHOUT_SERVER),
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said
     ("map show", "{own} --out {tmp}/own.png", VIZ),

@@ -151,7 +151,7 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
             eventually(lambda: page.run(TEXT.format("connection")) == "live", seconds=60)
             eventually(lambda: page.run("return mapweave.model.order.length") > 60)
         refused = [words for words in page.errors() if "ERR_CONNECTION_REFUSED" not in words]
-        assert all("/plans" in words or "WebSocket" in words for words in refused), refused
+        assert all("WebSocket" in words for words in refused), refused
 
 
 def test_the_demo_keeps_nothing(tmp_path: Path) -> None:

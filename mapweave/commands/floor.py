@@ -1,0 +1,44 @@
+"""`mapweave floor`: on which floor a map is."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from mapweave.commands.annotating import add_record_options, record_of
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "floor",
+        help="say on which floor a map is",
+        description="Label the map of a node with its floor: `mapweave floor first r0.1.17`. Maps on "
+        "different floors are never linked, so twin rooms above each other are kept apart; answers name the "
+        "floor. Maps without a label are on the floor of those with which they have most in common. "
+        "`mapweave floor --undo r0.1.17` withdraws the label.",
+    )
+    parser.add_argument("label", nargs="?", metavar="NAME", help="of the floor")
+    parser.add_argument("node", metavar="NODE|PLACE", help="any node of the map")
+    parser.add_argument("--undo", action="store_true", help="take it back")
+    add_record_options(parser, changes=True)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Label a map, or withdraw its label."""
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.query import ResolveRequest
+
+    if (arguments.label is None) != arguments.undo:
+        raise InvalidValue("give the name of a floor and a node; with --undo a node alone")
+    with record_of(arguments) as record:
+        node = record.resolve(ResolveRequest((arguments.node,))).found[0].node
+        name, because = str(node.map), arguments.because
+        if arguments.undo:
+            print(record.withdraw("floor", name, because))
+        else:
+            print(record.annotate("floor", name, because, node=str(node), label=arguments.label))
+    if arguments.map is not None:
+        print("links between floors fall when the file is merged again: mapweave map merge FILE -o OUT")
+    return 0
