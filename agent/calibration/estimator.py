@@ -17,28 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, predict
+from mapweave.agent.calibration.floor_scale import LEAST_FLOOR, floor_scale
 from mapweave.agent.calibration.pair_information import ImagePair, PairInformation, reduce_pair
+from mapweave.agent.calibration.parameter_sigmas import DELAY_SHARE, MODEL_SIGMAS, PRIOR_SIGMAS, useful
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.hybridmap.pose import Array
 
 P = Parameter
-PRIOR_SIGMAS = {
-    P.WHEEL_SCALE: 0.15, P.TURN_SCALE: 0.15, P.DRIFT: 0.05, P.FORWARD: 1.5, P.LEFT: 0.5, P.HEADING: 0.15,
-    P.PITCH: 0.15, P.ROLL: 0.05, P.HEIGHT: 0.01, P.DELAY: 0.15,
-}  # fmt: skip
-"""How far a declared value may be off before anything is seen. Floor and wheels show the height only as a
-multiple of the way: the height, which a tape measures to a percent, is held; the wheels' scale follows."""
-USEFUL_SIGMAS = {
-    P.WHEEL_SCALE: 0.02, P.TURN_SCALE: 0.02, P.DRIFT: 0.005, P.FORWARD: 0.15, P.LEFT: 0.05, P.HEADING: 0.01,
-    P.PITCH: 0.01, P.ROLL: 0.01, P.HEIGHT: 0.02, P.DELAY: 0.02,
-}  # fmt: skip
-"""A drive shows a parameter if its sigma is below this: smaller errors do not show in a map of a room."""
-MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.035, 0.002, 0.001, 0.001, 0.002, 0.002])
-"""Errors of the estimator itself, in the order of `Parameter`: depths are not Gaussian, pairs short. Measured
-on synthetic drives, where turns come out up to 0.5 % short and the camera up to 5 cm
-aside; no sigma is smaller."""
-DELAY_SHARE = 0.12
-"""And of the delay, as a share of the time between two readings: nothing is known of what happens within."""
+STALE = 0.25
+"""A pair is reduced again when a parameter has moved by this share of a useful sigma since."""
 STEP = np.array([1e-5, 1e-5, 1e-6, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
 """Of the numeric derivative."""
 SLIP_STEP = 1e-5
@@ -46,30 +33,24 @@ NOISE_STEPS = 4
 """Of expectation maximisation in each Gauss-Newton step."""
 STALE_PITCH = 0.004
 """Pairs that were reduced with another pitch than the present, rad, tell nothing of the floor."""
+FLOOR_BELOW = 0.2
+"""How far below the horizon floor is seen, rad: a wrong pitch moves it away by its share of this."""
 DELAY_SMOOTH_S = 0.5
 """Over which the wheels' speed is averaged where it serves as an instrument for the delay."""
-NO_FLOOR_SIGMA = 1e-3
-"""Of the wheels' scale while no floor is seen: epipolar lines know no scale."""
 STUDENT = 5.0
 """Degrees of freedom of the pairs' weights."""
+SIGNIFICANT = 3.5
+"""Sigmas from the declared value at which a parameter is declared wrongly."""
 BLOCK = 4
 """Pairs in a row whose errors may go together."""
 FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
 """Variances before any is estimated, per metre or per pair: see `_noise_basis`."""
+LEAST_SIGMA = 0.2
+"""Least standard deviation of a track as a share of what is assumed beforehand: lenses are not quite as they
+were calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels
+that slip count for more than what is seen."""
 ROUNDS = 3
 """Of a batch: reductions of all pairs."""
-FLOOR_WIDTHS = (0.1, 0.06)
-"""Widths of the mode of floor ratios, ever narrower: what stands on the floor is left out."""
-FLOOR_FLAT = 0.03
-"""Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
-FLOOR_CONTRAST = 3.0
-"""The mode must be so many times as dense as what seems to lie below it, else it is not the floor."""
-FLOOR_SIGMA = 0.005
-"""Least standard deviation of a scale by the floor: contact edges, mats, slopes."""
-LEAST_BLOCKS = 8
-"""Blocks of pairs that see the floor; the scatter of fewer tells no sigma."""
-LEAST_FLOOR = 60
-"""Points on the floor; with fewer nothing is said of it."""
 INNER = 6
 """Gauss-Newton steps between two reductions of the pairs."""
 
@@ -110,11 +91,10 @@ class Estimate:
 
         Without the floor nothing tells a scale.
         """
-        useful = np.array([USEFUL_SIGMAS[p] for p in P])
         assumed = np.array([PRIOR_SIGMAS[p] for p in P])
         if self.keep_wheels:
             assumed[[P.WHEEL_SCALE, P.HEIGHT]] = assumed[[P.HEIGHT, P.WHEEL_SCALE]]
-        shown = np.asarray((self.sigmas < useful) & (self.sigmas < 0.5 * assumed))
+        shown = np.asarray((self.sigmas < useful(self.declared)) & (self.sigmas < 0.5 * assumed))
         shown[[P.WHEEL_SCALE, P.HEIGHT, P.LEFT]] &= self.floor_tracks >= LEAST_FLOOR
         return shown
 
@@ -149,10 +129,12 @@ class Estimator:
         if keep_wheels:
             prior[[P.WHEEL_SCALE, P.HEIGHT]] = prior[[P.HEIGHT, P.WHEEL_SCALE]]
         self._prior = np.diag(1.0 / prior**2)
-        self._sigma, self._keep_wheels = sigma, keep_wheels
+        self._sigma = self._most_sigma = sigma
+        self._keep_wheels = keep_wheels
         self._noise: Array = FIRST_NOISE.copy()
         self._depth = (0.3, 0.5)
         self.reduced_at: list[Array] = []
+        self._reduced_sigmas: list[float] = []
         self._floor: tuple[float, float] | None = None
         self.floor_tracks = 0
         self.pairs: list[ImagePair] = []
@@ -164,32 +146,36 @@ class Estimator:
         self.pairs.append(pair)
         self.informations.append(self._reduced(pair, wheels))
         self.reduced_at.append(self.vector.copy())
+        self._reduced_sigmas.append(self._sigma)
         return self.informations[-1]
 
     def drop(self, index: int) -> None:
         """Forget a pair."""
-        del self.pairs[index], self.informations[index], self.reduced_at[index]
+        del self.pairs[index], self.informations[index], self.reduced_at[index], self._reduced_sigmas[index]
+
+    def stale(self, index: int) -> bool:
+        """Whether a pair was reduced with parameters, or a sigma of tracks, that differ from the present."""
+        moved = np.abs(self.vector - self.reduced_at[index]) > STALE * useful(self.declared)
+        return bool(moved.any()) or abs(math.log(self._sigma / self._reduced_sigmas[index])) > STALE
 
     def refresh(self, index: int, wheels: WheelTrack) -> None:
         """Reduce a pair again at the present parameters."""
         self.informations[index] = self._reduced(self.pairs[index], wheels)
         self.reduced_at[index] = self.vector.copy()
+        self._reduced_sigmas[index] = self._sigma
 
     def _reduced(self, pair: ImagePair, wheels: WheelTrack) -> PairInformation:
         first, last = np.array([pair.first_s]), np.array([pair.last_s])
         predicted = predict(self.vector, wheels, first, last)
         noise = self._noises(self.vector, wheels, first, last, predicted)[0]
-        return reduce_pair(pair, predicted[0], noise, self._sigma, self._depth)
+        return reduce_pair(pair, predicted[0], noise, self._sigma, self._depth, self._most_sigma)
 
     def solve(self, wheels: WheelTrack, iterations: int = INNER) -> Estimate:
         """Estimate from the pairs as they are reduced now."""
         first = np.array([pair.first_s for pair in self.pairs])
         last = np.array([pair.last_s for pair in self.pairs])
-        information = self._prior.copy()
         floor = np.zeros(COUNT)
-        if self._floor is None:
-            information[P.WHEEL_SCALE, P.WHEEL_SCALE] = 1.0 / NO_FLOOR_SIGMA**2
-        else:
+        if self._floor is not None:
             floor[[P.WHEEL_SCALE, P.HEIGHT]] = 1.0, -1.0
         at = CameraMotions(
             *(np.stack([getattr(i.at, name) for i in self.informations])
@@ -217,32 +203,29 @@ class Estimator:
             pull = np.einsum("nij,nj->ni", keep, rest)
             scores = weight[:, None] * np.einsum("nji,nj->ni", jacobian, pull)
             data = np.einsum("n,nji,njk,nkl->il", weight, jacobian, marginal, jacobian)
-            hessian = data + information + fixed
-            gradient: Array = scores.sum(0) - information @ (self.vector - self.declared)
+            hessian = data + self._prior + fixed
+            gradient: Array = scores.sum(0) - self._prior @ (self.vector - self.declared)
             gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
             self.vector = self.vector + np.linalg.solve(hessian, gradient)
         self._learn_scene()
-        # What is not known of the scale is not known of all that is measured by it.
-        inverse_hessian = np.linalg.inv(hessian - information + self._prior)
+        inverse_hessian = np.linalg.inv(hessian)
         self._covariance = _wider(inverse_hessian, self._scatter(inverse_hessian, scores))
         model = MODEL_SIGMAS.copy()
         model[P.DELAY] = max(model[P.DELAY], DELAY_SHARE * float(np.median(np.diff(wheels.stamps))))
         self._covariance = self._covariance + np.diag(model**2)
-        if self._floor is None:
-            self._covariance[P.WHEEL_SCALE, P.WHEEL_SCALE] = 1.0 / self._prior[P.WHEEL_SCALE, P.WHEEL_SCALE]
-        floor_tracks = self.floor_tracks if self._floor else 0
         return Estimate(
             self.vector.copy(),
             self._covariance,
             self.declared,
             len(self.pairs),
-            floor_tracks,
+            self.floor_tracks,
             self._keep_wheels,
         )
 
     def batch(self, pairs: Sequence[ImagePair], wheels: WheelTrack) -> Estimate:
         """Estimate from many pairs at once, all reduced again in each round."""
         self.pairs, self.informations, self.reduced_at, self._floor = [], [], [], None
+        self._reduced_sigmas = []
         for pair in pairs:
             self.add(pair, wheels)
         estimate = self.solve(wheels)
@@ -254,48 +237,29 @@ class Estimator:
         return estimate
 
     def find_floor(self) -> None:
-        """Take the mode of depths below the horizon for the floor: it ties the way's scale to the height.
+        """Find the floor below the horizon: it ties the way's scale to the height.
 
         Nothing else is learnt from the floor: a pavement or a carpet must not bend the rest.
         """
         used = self.vector[P.WHEEL_SCALE] - self.vector[P.HEIGHT]
-        counts = [len(i.floor_ratios) for i in self.informations]
-        which = np.repeat(np.arange(len(counts)), counts)
-        at = np.array(self.reduced_at).reshape(-1, COUNT)
-        scales = [
-            i.floor_ratios + v[P.WHEEL_SCALE] - v[P.HEIGHT]
-            for i, v in zip(self.informations, at, strict=True)
+        fresh = [
+            k for k, at in enumerate(self.reduced_at) if abs(at[P.PITCH] - self.vector[P.PITCH]) < STALE_PITCH
         ]
-        fresh = np.repeat(np.abs(at[:, P.PITCH] - self.vector[P.PITCH]) < STALE_PITCH, counts)
-        logs = np.concatenate([*scales, np.zeros(0)]) - used
-        sigmas = np.hypot(
-            np.concatenate([*(i.floor_sigmas for i in self.informations), np.zeros(0)]), FLOOR_FLAT
+        ratios = [
+            self.informations[k].floor_ratios
+            + self.reduced_at[k][P.WHEEL_SCALE]
+            - self.reduced_at[k][P.HEIGHT]
+            for k in fresh
+        ]
+        blocks = np.repeat(np.array(fresh, np.int64) // BLOCK, [len(r) for r in ratios])
+        found = floor_scale(
+            np.concatenate([*ratios, np.zeros(0)]) - used,
+            np.concatenate([*(self.informations[k].floor_sigmas for k in fresh), np.zeros(0)]),
+            blocks,
         )
-        which, logs, sigmas = which[fresh], logs[fresh], sigmas[fresh]
-        self.floor_tracks = 0
-        if len(logs) < LEAST_FLOOR or len(np.unique(which // BLOCK)) < LEAST_BLOCKS:
-            self._floor = None
-            return
-        centres = np.arange(-0.6, 0.6, 0.02)
-        density = _kernel(logs - centres[:, None], sigmas, FLOOR_WIDTHS[0]).sum(1)
-        # Things stand on the floor and nothing is below it: it is where the density rises.
-        below = _kernel(logs - (centres[:, None] - 4.0 * FLOOR_WIDTHS[0]), sigmas, FLOOR_WIDTHS[0]).sum(1)
-        plausible = np.exp(-0.5 * (centres / PRIOR_SIGMAS[P.WHEEL_SCALE]) ** 2)
-        mode = centres[int(((density - below) * plausible).argmax())]
-        for width in FLOOR_WIDTHS:
-            for _ in range(10):
-                weight = _kernel(logs - mode, sigmas, width) / (width**2 + sigmas**2)
-                mode = float((weight * logs).sum() / weight.sum())
-        off = logs - mode
-        pulls = np.bincount(which // BLOCK, weight * off)
-        stiffness = (weight * (1.0 - off**2 / (width**2 + sigmas**2))).sum()
-        sigma = math.sqrt(float((pulls**2).sum())) / max(float(stiffness), 1e-9)
-        self.floor_tracks = int((np.abs(off) < 2.0 * width).sum())
-        heights = _kernel(logs - np.array([[mode], [mode - 4.0 * width]]), sigmas, width).sum(1)
-        clear = (
-            self.floor_tracks >= LEAST_FLOOR and stiffness > 0.0 and heights[0] > FLOOR_CONTRAST * heights[1]
-        )
-        self._floor = (float(used + mode), max(sigma, FLOOR_SIGMA)) if clear else None
+        pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) / FLOOR_BELOW
+        self._floor = None if found is None else (float(used + found.log), math.hypot(found.sigma, pitch))
+        self.floor_tracks = 0 if found is None else found.tracks
 
     def _jacobian(
         self, wheels: WheelTrack, first: Array, last: Array, at: CameraMotions, off: Array
@@ -305,6 +269,10 @@ class Estimator:
         for k in range(COUNT):
             moved = self.vector.copy()
             moved[k] += STEP[k]
+            if k == P.WHEEL_SCALE:
+                # The floor alone tells it: epipolar lines know no scale, and assumed depths must not.
+                columns.append(0.0 * off)
+                continue
             if k == P.DELAY:
                 columns.append(self._delay_column(moved, wheels, first, last, at))
                 continue
@@ -380,12 +348,28 @@ class Estimator:
         if len(depths):
             mean, spread = np.median(depths, axis=0)
             self._depth = (float(mean), float(max(spread, 0.5 * mean)))
+            scatter = float(np.median([i.scatter for i in self.informations if i.tracks > 5]))
+            self._sigma = float(np.clip(scatter, LEAST_SIGMA * self._most_sigma, self._most_sigma))
 
     def _scatter(self, inverse_hessian: Array, scores: Array) -> Array:
-        """(10, 10) covariance by how blocks of pairs pull apart."""
+        """(10, 10) covariance by how blocks of pairs pull apart.
+
+        Neighbours count together (Newey and West 1987), since slip goes on from one block to the next.
+        """
         blocks = np.add.reduceat(scores, np.arange(0, len(scores), BLOCK))
+        cross = 0.5 * blocks[:-1].T @ blocks[1:]
+        pulls = _few_blocks(len(blocks)) ** 2 * (blocks.T @ blocks + cross + cross.T)
         prior = inverse_hessian @ self._prior @ inverse_hessian
-        return np.asarray(inverse_hessian @ (blocks.T @ blocks) @ inverse_hessian + prior)
+        return np.asarray(inverse_hessian @ pulls @ inverse_hessian + prior)
+
+
+def _few_blocks(blocks: int) -> float:
+    """Quantile of Student's t over that of a Gaussian, where both are SIGNIFICANT: few blocks tell no sigma.
+
+    Abramowitz and Stegun 26.7.5.
+    """
+    z, free = SIGNIFICANT, max(blocks - 1, 1)
+    return 1.0 + (z**2 + 1.0) / (4.0 * free) + (5.0 * z**4 + 16.0 * z**2 + 3.0) / (96.0 * free**2)
 
 
 def _weights(cost: Array) -> Array:
@@ -394,12 +378,6 @@ def _weights(cost: Array) -> Array:
     What even slip does not explain is what tracks refuse, and these have weights of their own.
     """
     return np.asarray((STUDENT + 6.0) / (STUDENT + np.maximum(cost, 0.0) + 4.0))
-
-
-def _kernel(off: Array, sigmas: Array, width: float) -> Array:
-    """Weights of ratios at a distance from the mode."""
-    variance = width**2 + sigmas**2
-    return np.asarray(np.exp(-0.5 * off**2 / variance) / np.sqrt(variance))
 
 
 def _wider(one: Array, other: Array) -> Array:

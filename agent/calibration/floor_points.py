@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.calibration.image_pairs import centres
+from mapweave.agent.calibration.image_pairs import centres, corners
 from mapweave.agent.calibration.pair_information import FLOOR_STEEPNESS
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
@@ -18,6 +18,10 @@ QUALITY, APART_PX = 0.005, 7
 WINDOW_PX = 13
 BACKWARD_PX = 0.5
 """A point that does not come back to within this is lost."""
+MARGIN_PX = 32
+"""Above the horizon; what is higher is not needed."""
+CONTRAST = 2
+"""By which the image is stretched about its local mean."""
 
 
 class FloorPoints:
@@ -26,6 +30,7 @@ class FloorPoints:
     def __init__(self, camera: Camera) -> None:
         """Take the camera of the images."""
         self._top = math.ceil(camera.cy + camera.fy * math.tan(FLOOR_STEEPNESS))
+        self._above = min(self._top, MARGIN_PX)
         self.clear()
 
     def clear(self) -> None:
@@ -41,30 +46,41 @@ class FloorPoints:
         self.clear()
         if self._top >= image.shape[0] - 16:
             return
-        part = np.ascontiguousarray(image[self._top :])
-        found = cv2.goodFeaturesToTrack(part, CORNERS, QUALITY, APART_PX)
-        if found is not None:
-            self._image = image
-            self.begin = found[:, 0].astype(np.float64) + np.array([0.0, self._top])
-            self._centre = centres(part, found[:, 0].astype(np.float64), WINDOW_PX) - found[:, 0]
+        part = self._levelled(image)
+        found = corners(part[self._above :], CORNERS, QUALITY, APART_PX, WINDOW_PX)
+        if len(found):
+            self._image = part
+            self.begin = found + np.array([0.0, self._top])
+            self._centre = centres(part[self._above :], found, WINDOW_PX) - found
             self.here, self._count = self.begin.copy(), len(self.begin)
 
     def follow(self, image: NDArray[np.uint8]) -> None:
         """Follow them into the next image."""
-        before, self._image = self._image, image
-        if before is None or not len(self.here) or before.shape != image.shape:
+        if self._image is None or not len(self.here):
             return
-        # What is above the horizon is not needed.
-        top = max(self._top - 32, 0)
-        one, two = np.ascontiguousarray(before[top:]), np.ascontiguousarray(image[top:])
+        before, self._image = self._image, self._levelled(image)
+        top = self._top - self._above
+        if before.shape != self._image.shape:
+            self.clear()
+            return
         start = (self.here - [0.0, top]).astype(np.float32)[:, None]
-        there, kept = _followed(one, two, start)
-        back, kept_back = _followed(two, one, there)
+        there, kept = _followed(before, self._image, start)
+        back, kept_back = _followed(self._image, before, there)
         kept &= kept_back & (np.linalg.norm((back - start)[:, 0], axis=1) <= BACKWARD_PX)
         place = there[:, 0].astype(np.float64) + np.array([0.0, top])
         height, width = image.shape
         kept &= ((place >= 3) & (place < [width - 3, height - 3])).all(axis=1)
         self.begin, self.here, self._centre = self.begin[kept], place[kept], self._centre[kept]
+
+    def _levelled(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """What matters of an image, without its local mean.
+
+        A floor has little texture: a gain that follows the light passes for motion along the shade of lamps
+        and lens. With a simulated phone motions come out 7 % too short; 2 % so.
+        """
+        part = np.ascontiguousarray(image[self._top - self._above :])
+        mean = cv2.blur(part, (WINDOW_PX, WINDOW_PX))
+        return np.asarray(cv2.addWeighted(part, CONTRAST, mean, -CONTRAST, 128.0), np.uint8)
 
     @property
     def left(self) -> float:

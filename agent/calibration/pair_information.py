@@ -58,6 +58,7 @@ class PairInformation:
         vector: (6,) b.
         tracks: how many agree with each other.
         inverse_depths: median and standard deviation, 1/m.
+        scatter: standard deviation of what is left across the lines of unknown depth, by its median.
         floor_ratios: (K,) see `floor_ratios`, at the motion `at`.
         floor_sigmas: (K,) theirs.
     """
@@ -67,12 +68,18 @@ class PairInformation:
     vector: Array
     tracks: int
     inverse_depths: tuple[float, float]
+    scatter: float
     floor_ratios: Array
     floor_sigmas: Array
 
 
 def reduce_pair(
-    pair: ImagePair, predicted: CameraMotions, noise: Array, sigma: float, depth: tuple[float, float]
+    pair: ImagePair,
+    predicted: CameraMotions,
+    noise: Array,
+    sigma: float,
+    depth: tuple[float, float],
+    floor_sigma: float,
 ) -> PairInformation:
     """Reduce a pair about the motion that tracks and wheels together make most likely.
 
@@ -82,11 +89,14 @@ def reduce_pair(
         noise: (6, 6) covariance of the wheels' errors, as a step.
         sigma: standard deviation of a track, in normalised coordinates.
         depth: mean and standard deviation of inverse depths beforehand, 1/m.
+        floor_sigma: of a track on the floor, which has less texture than what stands on it.
     """
     x = np.column_stack([pair.before, np.ones(len(pair.before))])
     prior = np.linalg.inv(noise)
     at = predicted[None]
     mean, spread = depth
+    field = _field(pair.before)
+    columns = 6 + field.shape[1]
     for iteration in range(ITERATIONS):
         step_to_at = at.since(predicted[None])[0]
         turned = x @ at.rotation[0].T
@@ -96,28 +106,30 @@ def reduce_pair(
         z = np.where(good, y[:, 2], 1.0)
         seen = y[:, :2] / z[:, None]
         slope = _projected(at.translation[0], seen, z)
-        # A free depth is a Gaussian that is eliminated; about its own estimate its mean is off by the rest.
-        mean = max(float(np.median(rho)), 0.1 * depth[0])
         residual = pair.after - seen - slope * (mean - rho)[:, None]
-        jacobian = _jacobian(seen, z, rho, slope)
+        jacobian = np.concatenate(
+            [_jacobian(seen, z, rho, slope, mean), slope[:, :, None] * field[:, None]], axis=2
+        )
         # (sigma^2 I + spread^2 g g')^-1 by Sherman and Morrison.
-        gain = 1.0 / ((sigma / (FREE_DEPTH * spread)) ** 2 + (slope**2).sum(1))
+        gain = 1.0 / ((sigma / spread) ** 2 + (slope**2).sum(1))
         along_r = (slope * residual).sum(1)
         along_j = np.einsum("ni,nij->nj", slope, jacobian)
         chi2 = ((residual**2).sum(1) - gain * along_r**2) / sigma**2
         weight = good / (1.0 + chi2 / CAUCHY**2) / sigma**2
-        left = (weight[:, None, None] * jacobian).reshape(-1, 7)
-        matrix = left.T @ jacobian.reshape(-1, 7) - ((weight * gain)[:, None] * along_j).T @ along_j
+        left = (weight[:, None, None] * jacobian).reshape(-1, columns)
+        matrix = left.T @ jacobian.reshape(-1, columns) - ((weight * gain)[:, None] * along_j).T @ along_j
         vector = left.T @ residual.reshape(-1) - along_j.T @ (weight * gain * along_r)
-        matrix, vector = _without_last(matrix, vector)
+        matrix, vector = _without_field(matrix, vector, FREE_DEPTH * spread)
         step = np.linalg.solve(matrix + prior, vector - prior @ step_to_at)
         if iteration < ITERATIONS - 1:
             at = at.stepped(step[None])
     agreeing = good & (chi2 < 9.0)
     depths = rho[agreeing]
     typical = (float(np.median(depths)), float(depths.std())) if agreeing.sum() > 5 else depth
-    ratios, sigmas = floor_ratios(pair, at[0], sigma)
-    return PairInformation(at[0], matrix, vector, int(agreeing.sum()), typical, ratios, sigmas)
+    across = np.abs(residual[:, 0] * slope[:, 1] - residual[:, 1] * slope[:, 0])
+    scatter = 1.4826 * float(np.median(across / np.maximum(np.linalg.norm(slope, axis=1), 1e-12)))
+    ratios, sigmas = floor_ratios(pair, at[0], floor_sigma)
+    return PairInformation(at[0], matrix, vector, int(agreeing.sum()), typical, scatter, ratios, sigmas)
 
 
 def floor_ratios(pair: ImagePair, at: CameraMotions, sigma: float) -> tuple[Array, Array]:
@@ -163,22 +175,35 @@ def _inverse_depths(
     return np.maximum(best, 0.0)
 
 
-def _jacobian(seen: Array, z: Array, rho: Array, slope: Array) -> Array:
-    """(N, 2, 7) of the predicted coordinates with respect to a step and to the scale of the depths."""
+def _jacobian(seen: Array, z: Array, rho: Array, slope: Array, mean: float) -> Array:
+    """(N, 2, 7) of the predicted coordinates with respect to a step and to the scale of the depths.
+
+    A depth is estimated from the very residual along the line on which the point may lie. So along that line
+    the depth known beforehand takes its place: a product of one noise with itself has a mean.
+    """
     u, v = seen.T
-    jacobian = np.zeros((len(seen), 2, 7))
-    scale = rho / z
-    jacobian[:, 0, 0], jacobian[:, 0, 2] = scale, -scale * u
-    jacobian[:, 1, 1], jacobian[:, 1, 2] = scale, -scale * v
+    jacobian = np.zeros((len(seen), 2, 6))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+    jacobian[:, :, 2] = -seen
+    along = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+    shared = (mean - rho)[:, None] * np.einsum("ni,nij->nj", along, jacobian[:, :, :3])
+    jacobian[:, :, :3] *= rho[:, None, None]
+    jacobian[:, :, :3] += along[:, :, None] * shared[:, None]
+    jacobian[:, :, :3] /= z[:, None, None]
     # omega x y, projected; y / z = (u, v, 1).
     jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 0, 5] = -u * v, 1.0 + u * u, -v
     jacobian[:, 1, 3], jacobian[:, 1, 4], jacobian[:, 1, 5] = -1.0 - v * v, u * v, u
-    jacobian[:, :, 6] = rho[:, None] * slope
     return jacobian
 
 
-def _without_last(matrix: Array, vector: Array) -> tuple[Array, Array]:
-    """Eliminate the scale of the free depths: what is assumed of depths must tell nothing of the way."""
-    size = matrix[-1, -1] + 1e-3
-    cross = matrix[:-1, -1] / size
-    return matrix[:-1, :-1] - np.outer(cross, matrix[-1, :-1]), vector[:-1] - cross * vector[-1]
+def _field(before: Array) -> Array:
+    """(N, 6) shapes of which the inverse depths of a scene are made: a polynomial over the image."""
+    u, v = (before / np.abs(before).max(axis=0)).T
+    return np.column_stack([1.0 + 0.0 * u, u, v, u * u, u * v, v * v])
+
+
+def _without_field(matrix: Array, vector: Array, spread: float) -> tuple[Array, Array]:
+    """Eliminate the field of depths: what is assumed of depths must tell nothing of the way."""
+    inner = matrix[6:, 6:] + np.eye(len(matrix) - 6) / spread**2
+    cross = np.linalg.solve(inner, np.column_stack([matrix[6:, :6], vector[6:]]))
+    return matrix[:6, :6] - matrix[:6, 6:] @ cross[:, :6], vector[:6] - matrix[:6, 6:] @ cross[:, 6]

@@ -32,7 +32,7 @@ class DriveCalibration:
 
     Attributes:
         estimate: from all pairs.
-        declared_px: median distance by which the wheels, with the declared geometry, misplace far points in
+        declared_px: mean distance by which the wheels, with the declared geometry, misplace far points in
             the second images of pairs that were held out, px.
         estimated_px: the same with what the other pairs show.
     """
@@ -92,7 +92,7 @@ def calibrate(
 
 
 def _miss(estimator: Estimator, pairs: list[ImagePair], wheels: WheelTrack, vector: Array) -> float:
-    """Median angle between where the wheels expect a point ahead of typical depth and where it is, rad."""
+    """Mean angle between where the wheels expect a point ahead of typical depth and where it is, rad."""
     estimator.vector = vector
     misses = []
     for pair in pairs:
@@ -101,4 +101,4 @@ def _miss(estimator: Estimator, pairs: list[ImagePair], wheels: WheelTrack, vect
         off = predicted.since(seen.at[None])[0]
         rho = seen.inverse_depths[0]
         misses.append(np.hypot(off[4] + rho * off[0], -off[3] + rho * off[1]))
-    return float(np.median(misses))
+    return float(np.mean(misses))

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapweave.agent.calibration.estimator import USEFUL_SIGMAS, Estimate
+from mapweave.agent.calibration.estimator import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.parameter_sigmas import useful
 from mapweave.agent.drive_geometry import Parameter
 from mapweave.hybridmap.pose import Array
 
 P = Parameter
-SIGNIFICANT = 3.5
-"""Sigmas from the declared value at which a parameter is declared wrongly."""
 NAMES = {
     P.WHEEL_SCALE: "wheel scale", P.TURN_SCALE: "turn scale", P.DRIFT: "drift, deg/m",
     P.FORWARD: "camera forward, m", P.LEFT: "camera left, m", P.HEADING: "camera heading, deg",
@@ -97,8 +96,7 @@ def causes(estimate: Estimate, declared: Array | None = None) -> list[Cause]:
     """
     declared = estimate.declared if declared is None else declared
     off = np.abs(estimate.vector - declared)
-    useful = np.array([USEFUL_SIGMAS[p] for p in P])
-    wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > useful)
+    wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > useful(estimate.declared))
     value, was, sigma = readable(estimate.vector), readable(declared), readable_sigmas(estimate)
     found = [
         Cause(p, float(was[p]), float(value[p]), float(sigma[p]), float(off[p] / estimate.sigmas[p]))

@@ -1,0 +1,94 @@
+"""The floor among points below the horizon: the scale of the way, by the height of the camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.pose import Array
+
+FLOOR_WIDTH = 0.1
+"""Of the kernel with which the floor is first looked for among logarithms of depth ratios."""
+PLAUSIBLE = 0.15
+"""Standard deviation of the logarithm of wheel scale beforehand."""
+FLOOR_STEPS = 20
+"""Of expectation maximisation."""
+LEAST_SPREAD = 0.4
+"""Points of the floor scatter by no less of what is assumed."""
+FLOOR_RANGE = 1.4
+"""Of logarithms of depth ratios over which all else is spread."""
+FLOOR_FLAT = 0.03
+"""Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
+FLOOR_CONTRAST = 3.0
+"""The floor must be so many times as dense as all else where it is densest, else it is not the floor."""
+FLOOR_SIGMA = 0.005
+"""Least standard deviation of a scale by the floor: contact edges, mats, slopes."""
+LEAST_BLOCKS = 8
+"""Blocks of pairs that see the floor; the scatter of fewer tells no sigma."""
+LEAST_FLOOR = 60
+"""Points on the floor; with fewer nothing is said of it."""
+
+
+@dataclass(frozen=True)
+class FloorScale:
+    """What the floor shows.
+
+    Attributes:
+        log: logarithm of true over assumed way, for the height that was assumed.
+        sigma: its standard deviation.
+        tracks: how many points are on the floor.
+    """
+
+    log: float
+    sigma: float
+    tracks: int
+
+
+def floor_scale(logs: Array, sigmas: Array, blocks: NDArray[np.int64]) -> FloorScale | None:
+    """Tell the floor from what stands on it.
+
+    Points of the floor scatter about one ratio, all others are spread evenly: a mixture of two, by
+    expectation maximisation, begun where the density rises: things stand on the floor, nothing is below it.
+
+    Args:
+        logs: (N,) logarithms of depth ratios (`pair_information.floor_ratios`).
+        sigmas: (N,) standard deviations of them by their tracks.
+        blocks: (N,) number of the block of pairs that each belongs to; errors within one go together.
+
+    Returns:
+        None where no floor can be found.
+    """
+    if len(logs) < LEAST_FLOOR or len(np.unique(blocks)) < LEAST_BLOCKS:
+        return None
+    sigmas = np.hypot(sigmas, FLOOR_FLAT)
+    centres = np.arange(-0.6, 0.6, 0.02)
+    density = _kernel(logs - centres[:, None], sigmas, FLOOR_WIDTH).sum(1)
+    below = _kernel(logs - (centres[:, None] - 4.0 * FLOOR_WIDTH), sigmas, FLOOR_WIDTH).sum(1)
+    plausible = np.exp(-0.5 * (centres / PLAUSIBLE) ** 2)
+    mode = float(centres[int(((density - below) * plausible).argmax())])
+    floor, scale = 0.5, 1.0
+    for _ in range(FLOOR_STEPS):
+        spread, off = scale * sigmas, logs - mode
+        on = floor * np.exp(-0.5 * (off / spread) ** 2) / (math.sqrt(math.tau) * spread)
+        share = on / (on + (1.0 - floor) / FLOOR_RANGE)
+        floor, pull = float(share.mean()), share / spread**2
+        mode += float((pull * off).sum() / max(pull.sum(), 1e-9))
+        square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
+        scale = float(np.clip(math.sqrt(square), LEAST_SPREAD, 1.0))
+    off = logs - mode
+    pulls = np.bincount(blocks, pull * off)
+    stiffness = float((pull * (1.0 - (1.0 - share) * (off / spread) ** 2)).sum())
+    tracks = int(share.sum())
+    densest = floor / (math.sqrt(math.tau) * float(np.median(spread)))
+    if tracks < LEAST_FLOOR or stiffness <= 0.0 or densest < FLOOR_CONTRAST * (1.0 - floor) / FLOOR_RANGE:
+        return None
+    return FloorScale(mode, max(float(np.linalg.norm(pulls)) / stiffness, FLOOR_SIGMA), tracks)
+
+
+def _kernel(off: Array, sigmas: Array, width: float) -> Array:
+    """Weights of ratios at a distance from the mode."""
+    variance = width**2 + sigmas**2
+    return np.asarray(np.exp(-0.5 * off**2 / variance) / np.sqrt(variance))
