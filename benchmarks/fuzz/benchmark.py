@@ -67,6 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep findings there")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
+    if options.seed < 0 or options.seconds <= 0.0:
+        parser.error("give a seed of 0 or more, and seconds above 0")
     console = Console(stderr=True)
     share = AT_ONCE * options.seconds / len(options.targets)
     with tempfile.TemporaryDirectory() as temporary, Progress(console=console) as progress:

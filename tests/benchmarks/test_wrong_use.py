@@ -22,6 +22,7 @@ WRONG = [
     ("landmarks", "--pairs 1", "at least 2 pairs, 0 places and seed 0"),
     ("landmarks", "--places -1", "at least 2 pairs, 0 places and seed 0"),
     ("landmarks", "--pairs x", "--pairs"),
+    ("fuzz", "--seconds 0", "seconds above 0"),
     ("life_sim", "--drives 0", "at least one drive"),
     ("mapping_run", "--out {file}", "name a folder that can be written"),
     ("mapping_run", "--out {file}/below", "name a folder that can be written"),
