@@ -145,6 +145,7 @@ def again(begun: Begun, tmp_path_factory: pytest.TempPathFactory) -> tuple[Life,
     return life, begun.truth | life.truth()
 
 
+@pytest.mark.slow
 def test_an_agent_that_was_killed_goes_on_with_its_map(
     begun: Begun, again: tuple[Life, dict[NodeId, Pose2]]
 ) -> None:
@@ -229,6 +230,7 @@ def test_after_a_drive_to_a_goal_it_maps_on(begun: Begun, tmp_path: Path) -> Non
 # Kidnapped while it maps
 
 
+@pytest.mark.slow
 def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_path: Path) -> None:
     """It knows where it is, drives on, and is put down elsewhere between two ticks, turned around."""
     life, _ = resumed(begun, tmp_path, begun.standing, 1.0)

@@ -48,6 +48,7 @@ def test_an_invalid_value_is_noticed() -> None:
         check_again(3, lambda value: bytes([value]), lambda data: data[0] + 1)
 
 
+@pytest.mark.slow
 def test_the_command_prints_its_counts(capsys: pytest.CaptureFixture[str]) -> None:
     assert benchmark.main(["--seconds", "1", "--targets", "lines", "poses", "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -166,6 +166,7 @@ def test_of_what_is_not_on_the_map_nothing_is_held(router: Router) -> None:
 robots = st.sampled_from(["r0", "r1", "r2"])
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(st.lists(st.tuples(robots, st.integers(0, 8), st.integers(0, 3)), max_size=20))
 def test_robots_that_drive_no_further_than_granted_never_meet(

@@ -333,6 +333,7 @@ def test_random_legal_contents_change_nothing_for_sound_robots(part: int, beside
         beside.check(seed)
 
 
+@pytest.mark.slow
 def test_nodes_that_show_the_same_break_nothing(beside: Beside) -> None:
     """They are linked with correct maps, and may move these; nothing fails, and no map is left out."""
     seen = [body.node for _, body in beside.sound if isinstance(body, NodePut)]

@@ -31,6 +31,7 @@ from tests.waiting import eventually
 FLEET = "kept"
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_killed(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]

@@ -38,6 +38,7 @@ def wait_for(condition, seconds, children, what):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 @needs_simulator
 @pytest.mark.timeout(420)
 def test_two_robots_map_and_one_finds_its_way_back(tmp_path):

@@ -347,6 +347,7 @@ def serving(folder: Path, port: int) -> Iterator[None]:
         children.end("server")
 
 
+@pytest.mark.slow
 def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path: Path) -> None:
     store = Store(tmp_path / "s0.sqlite")
     for map_id, changes in logs().items():

@@ -31,6 +31,7 @@ def everything(run: MappingRun) -> np.ndarray:
     return np.ones(len(run.points), np.bool_)
 
 
+@pytest.mark.slow
 def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     ratios = []
     for run, filter_ in runs[:6]:

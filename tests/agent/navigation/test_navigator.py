@@ -72,6 +72,7 @@ def test_a_blocked_robot_reports_the_obstacle_and_waits(home):
     assert trial.navigator.tally.blocks == 1 and trial.navigator.tally.relocalizations == 1
 
 
+@pytest.mark.slow
 def test_a_block_is_forgotten_after_a_while_and_for_longer_each_time(home):
     trial, routes = blocked_trial(home, forget=5.0)
     trial.run(200.0, lambda: trial.navigator.tally.blocks == 3)

@@ -18,6 +18,7 @@ WALL_OF_POINTS = np.array([[3.0, y, 0.3] for y in np.linspace(-1.2, 1.2, 13)])
 NOTHING = np.zeros((0, 2))
 
 
+@pytest.mark.slow
 def test_parks_from_random_starts_in_view_and_without_endless_switching(
     robot: RobotDescription, simulate: Callable[..., Any], draw: Draw
 ) -> None:

@@ -14,6 +14,7 @@ from tests.waiting import eventually
 SERVER = """
 import hashlib, json, sys, time
 from pathlib import Path
+import pytest
 import numpy as np
 from synthetic.world import room, take_map
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
@@ -68,6 +69,7 @@ def reported_and_killed(store: Path) -> dict[str, Any]:
     return collected
 
 
+@pytest.mark.slow
 def test_a_server_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     first = reported_and_killed(tmp_path / "store")
     second = reported_and_killed(tmp_path / "store")

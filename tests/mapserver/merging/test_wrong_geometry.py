@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+import pytest
+
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId
@@ -32,6 +34,7 @@ def answer_outcomes(merger: Merger, fleet: Fleet, scene: str) -> Counter[AnswerO
     return Counter(judged(answers, view, at, fleet.truth) for view, at in views)
 
 
+@pytest.mark.slow
 def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     fleet = draw_fleet(SEED, SCENES["room"], Fault.SLIP, stops=2)
     alone = answer_outcomes(merged_fleet(fleet, frozenset({ODD})), fleet, "room")

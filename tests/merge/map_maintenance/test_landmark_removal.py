@@ -194,6 +194,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     assert shares[-1][0].mean() < 0.2
 
 
+@pytest.mark.slow
 def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """From drive to drive, superseded nodes included, as a remover that sees only the last map."""
     rng = np.random.default_rng(4)
