@@ -174,6 +174,7 @@ def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, 
         assert kept.edges[number].a_from_b.mean.distance(edge.a_from_b.mean) < 1e-5
 
 
+@pytest.mark.slow
 def test_resuming_again_is_the_same_to_the_last_bit(
     begun: Begun, again: tuple[Life, dict[NodeId, Pose2]], tmp_path: Path
 ) -> None:

@@ -50,6 +50,7 @@ def test_parking_is_judged_by_the_truth(scene):
     assert first.believed_m == pytest.approx(first.error_m, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_command_prints_figures_and_draws(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("benchmarks.parking.run.TIME_LIMIT", 6.0)
     out = tmp_path / "deep" / "out"

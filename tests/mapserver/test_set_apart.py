@@ -327,6 +327,7 @@ def beside(tmp_path: Path) -> Iterator[Beside]:
     faiss.omp_set_num_threads(threads)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(2))
 def test_random_legal_contents_change_nothing_for_sound_robots(part: int, beside: Beside) -> None:
     for seed in range(60 * part, 60 * (part + 1)):

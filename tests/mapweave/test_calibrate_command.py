@@ -56,6 +56,7 @@ def calibrated(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[st
     return figures
 
 
+@pytest.mark.slow
 def test_a_drive_is_calibrated_under_the_robots_name(
     recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

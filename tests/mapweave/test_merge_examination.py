@@ -77,6 +77,7 @@ def evaluate(folder: Path, out: Path, capsys: pytest.CaptureFixture[str], *more:
     return report
 
 
+@pytest.mark.slow
 def test_two_robots_of_one_walk_become_one_map(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

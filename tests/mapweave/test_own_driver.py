@@ -60,6 +60,7 @@ def settings(folder: Path, name: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     driver = tmp_path / "still.py"

@@ -108,6 +108,7 @@ def fleet(tmp_path: Path) -> Iterator[tuple[Children, list[str], list[Robot], in
         yield children, serve, collected, http
 
 
+@pytest.mark.slow
 def test_a_merge_that_loses_its_support_is_undone_and_reported(
     fleet: tuple[Children, list[str], list[Robot], int], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from mapweave.agent.mission import Answer, Question, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.navigator import Stage
@@ -62,6 +64,7 @@ def test_without_a_server_it_waits_for_one_before_it_gives_up(home):
     assert NO_ANSWER in trial.navigator.detail and "60 s" in trial.navigator.detail
 
 
+@pytest.mark.slow
 def test_a_way_that_stays_blocked_is_given_up(home):
     """The server has a way each time that the block is forgotten; the robot never gets through."""
     eyes = Eyes(home, Pose2(2.5, 2.0))

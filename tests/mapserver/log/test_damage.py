@@ -113,7 +113,9 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     fleet.stop_server()
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(k, marks=[pytest.mark.slow] if k >= 16 else []) for k in range(60)]
+)
 def test_a_flipped_bit_anywhere_is_repaired_or_reported_in_one_line(
     whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from mapweave.mapserver.merging.verification_cache_keeper import SUFFIX
 from tests.waiting import eventually
 
