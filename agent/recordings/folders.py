@@ -13,7 +13,14 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_in, images_of, read_increments, read_times
 from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Images, Recording, Stamps, assembled, without_odometry
+from mapweave.agent.recordings.recording import (
+    Images,
+    Recording,
+    Stamps,
+    assembled,
+    stamps_of,
+    without_odometry,
+)
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
@@ -53,7 +60,7 @@ def euroc(folder: Path, options: RecordingOptions) -> Recording:
     paths = [cam / "data" / row[-1].strip() for row in rows]
     try:
         stamps = np.array([int(row[0]) for row in rows], np.int64)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise DeviceError(f"{cam / 'data.csv'}: {error}") from None
     text = "\n".join(_lines(cam / "sensor.yaml"))
     intrinsics, lens = (
@@ -85,9 +92,8 @@ def tum_rgbd(folder: Path, options: RecordingOptions) -> Recording:
     rows = [line.split() for line in _lines(folder / "rgb.txt") if line.strip() and not line.startswith("#")]
     if not all(len(row) == 2 for row in rows) or not rows:
         raise DeviceError(f"{folder / 'rgb.txt'}: lines are `stamp file`")
-    stamps = np.array(
-        [round(1e9 * t) for t in _numbers(folder / "rgb.txt", [row[0] for row in rows])], np.int64
-    )
+    path = folder / "rgb.txt"
+    stamps = stamps_of(path, _numbers(path, [row[0] for row in rows]))
     return _folder(folder, "TUM RGB-D", [folder / row[1] for row in rows], stamps, None, options)
 
 
@@ -102,10 +108,8 @@ def four_seasons(folder: Path, options: RecordingOptions) -> Recording:
     lost = [path for path in paths if path.stem not in rows]
     if lost:
         raise DeviceError(f"{folder / 'times.txt'}: no line for {lost[0].name}")
-    stamps = np.array(
-        [round(1e9 * t) for t in _numbers(folder / "times.txt", [rows[path.stem] for path in paths])],
-        np.int64,
-    )
+    times = folder / "times.txt"
+    stamps = stamps_of(times, _numbers(times, [rows[path.stem] for path in paths]))
     return _folder(folder, "4Seasons", paths, stamps, None, options)
 
 
@@ -117,7 +121,8 @@ def images_folder(folder: Path, options: RecordingOptions) -> Recording:
     """
     paths = images_of(folder)
     camera, distortion = read_camera(options.camera or folder / "camera.toml")
-    stamps = np.array([round(1e9 * t) for t in read_times(folder / "times.txt", len(paths))], np.int64)
+    times = folder / "times.txt"
+    stamps = stamps_of(times, read_times(times, len(paths)))
     path, images = folder / "odometry.csv", _images(paths, stamps, camera)
     if options.odometry is not None or _is_poses(path):
         poses = read_poses(options.odometry or path)
@@ -187,7 +192,7 @@ def _seconds(path: Path, count: int) -> Stamps:
     times = _numbers(path, "\n".join(_lines(path)).split())
     if len(times) != count:
         raise DeviceError(f"{path}: {len(times)} times for {count} images")
-    return np.array([round(1e9 * t) for t in times], np.int64)
+    return stamps_of(path, times)
 
 
 def _yaml_list(folder: Path, text: str, name: str, count: int) -> list[float]:

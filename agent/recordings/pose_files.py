@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapweave.agent.recordings.recording import StampedPoses
+from mapweave.agent.recordings.recording import StampedPoses, stamps_of
 from mapweave.agent.ros_messages.values import heading_of
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
@@ -38,7 +38,7 @@ def read_poses(path: Path) -> StampedPoses:
         raise DeviceError(damage or f"{path}: {len(rows)} poses; there must be two or more")
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     rows = rows[np.append(True, np.diff(rows[:, 0]) > 0)]
-    stamps = np.array([round(1e9 * t) for t in rows[:, 0]], np.int64)
+    stamps = stamps_of(path, rows[:, 0])
     return StampedPoses(stamps, rows[:, 1:], f"{damage}; the poses before it are used" if damage else "")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,22 @@ class NoOdometry(DeviceError):
         """Take the line for people, and what there is."""
         super().__init__(message)
         self.recording = recording
+
+
+def stamps_of(path: Path, seconds: Iterable[float]) -> Stamps:
+    """Stamps, ns.
+
+    Args:
+        path: of the file that they are in, for the error.
+        seconds: since 1970, or since the start.
+
+    Raises:
+        DeviceError: one is no time.
+    """
+    try:
+        return np.array([round(1e9 * time) for time in seconds], np.int64)
+    except (ValueError, OverflowError):
+        raise DeviceError(f"{path}: times are seconds since 1970 or since the start") from None
 
 
 def increments_between(odometry: StampedPoses, stamps_ns: Stamps) -> tuple[NDArray[np.bool_], Array]:

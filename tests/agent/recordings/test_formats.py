@@ -258,6 +258,7 @@ def test_a_large_image_is_reduced_with_its_camera(drive: Drive) -> None:
         ("1 2 3\n", "line 1: a pose is `stamp x y z qx qy qz qw`"),
         ("", "0 poses; there must be two or more"),
         ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "line 2: all numbers must be finite"),
+        ("1 0 0 0 0 0 0 1\n1e10 0 0 0 0 0 0 1\n", "times are seconds since 1970 or since the start"),
         ("# only a comment\n1 0 0 0 0 0 0 1\n", "1 poses"),
     ],
 )
