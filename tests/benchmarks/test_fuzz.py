@@ -50,8 +50,10 @@ def test_an_invalid_value_is_noticed() -> None:
 
 @pytest.mark.slow
 def test_the_command_prints_its_counts(capsys: pytest.CaptureFixture[str]) -> None:
-    assert benchmark.main(["--seconds", "1", "--targets", "lines", "poses", "--json"]) == 0
+    status = benchmark.main(["--seconds", "1", "--targets", "lines", "poses", "--json"])
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["inputs"] > 20
-    assert (result["crashes"], result["hangs"], result["accepted_invalid"]) == (0, 0, 0)
+    # It goes on looking: what it finds one day is no fault of the command.
+    found = sum(result[name] for name in ("crashes", "hangs", "accepted_invalid"))
+    assert status == (1 if found else 0)
     assert result["peak_rss_mb"] > 10
