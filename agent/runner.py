@@ -90,7 +90,10 @@ class Runner:
         return step
 
     def _hand_over(self, observation: Observation, step: Step) -> None:
-        """Changes come last: the thread that writes them works while the robot waits for its next image."""
+        """Changes come before the status: one that counts a node also counts that it is not sent yet."""
+        if step.changes:
+            self._replicator.submit(step.changes, observation.stamp_ns)
+            self._synchronization.changes_submitted(self._replicator, self._fleet)
         line = self._monitor.see(observation, step.status, step.command)
         if line:
             self._print(line)
@@ -100,9 +103,6 @@ class Runner:
         self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
         self._ticks += 1
         self._on_step(observation, step)
-        if step.changes:
-            self._replicator.submit(step.changes, observation.stamp_ns)
-            self._synchronization.changes_submitted(self._replicator, self._fleet)
 
     @property
     def curious(self) -> bool:

@@ -8,13 +8,16 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission import Idle
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Step
 from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.agent_status import Status
@@ -91,6 +94,31 @@ def test_a_disk_that_hangs_holds_up_no_tick(walls, description, tmp_path, monkey
         ticks_over.set()
         agent.close()
         bus.close()
+
+
+def test_a_status_that_counts_a_node_counts_it_as_unsent_too(
+    walls, description, tmp_path, monkeypatch
+) -> None:
+    """Else the last node of a robot that is switched off then is taken for sent."""
+    order: list[str] = []
+    submit, report = Replicator.submit, FleetClient.report
+
+    def submitted(replicator: Replicator, *args: Any) -> None:
+        order.append("changes")
+        submit(replicator, *args)
+
+    def reported(fleet: FleetClient, *args: Any) -> None:
+        order.append("status")
+        report(fleet, *args)
+
+    monkeypatch.setattr(Replicator, "submit", submitted)
+    monkeypatch.setattr(FleetClient, "report", reported)
+    run(forth_and_back(walls, description), MemoryBus(MemoryHub()), tmp_path).close()
+    assert "changes" in order and order.count("status") == 48
+    assert all(order[k + 1] == "status" for k, what in enumerate(order) if what == "changes")
+    assert order[-1] == "status"
+    ticks = "".join(what[0] for what in order)
+    assert "sc" in ticks and "cc" not in ticks
 
 
 def test_a_disk_that_hangs_holds_up_no_mission() -> None:
