@@ -135,7 +135,7 @@ class ZenohBus:
         Its clients connect again by themselves. What is published meanwhile is lost, as without a connection.
 
         Raises:
-            NotConnected: it cannot listen any more, or is closed.
+            NotConnected: it cannot listen now, or is closed. Until it is opened again it has no connection.
         """
         with self.owner.lock:
             if self._closed.is_set():
@@ -148,8 +148,12 @@ class ZenohBus:
             if session is not None:
                 session.close()  # type: ignore[no-untyped-call]
             session = _open_router(settings)
-            for entity in self.owner.declared:
-                entity.declare(session)
+            try:
+                for entity in self.owner.declared:
+                    entity.declare(session)
+            except BaseException:
+                session.close()  # type: ignore[no-untyped-call]
+                raise
             self._settings, self._session = settings, session
             self._watch_links(session)
 

@@ -14,6 +14,7 @@ from mapweave.connection import SOON
 
 if TYPE_CHECKING:
     from mapweave.identities.key_folder import KeyFolder
+    from mapweave.identities.key_renewal import KeyRenewal
     from mapweave.settings import NetworkSettings, Settings
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.keys import Keys
@@ -116,24 +117,18 @@ def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings,
     return folder.router(server, listen), folder
 
 
-def renew_access(bus: ZenohBus, folder: KeyFolder, settings: BusSettings, server: str) -> BusSettings:
-    """Let the router read its keys again if they have changed; robots connect again by themselves.
-
-    Returns:
-        The settings in use.
-    """
-    from mapweave.hybridmap.errors import MapweaveError
+def key_renewal(
+    bus: ZenohBus, folder: KeyFolder | None, server: str, settings: BusSettings
+) -> KeyRenewal | None:
+    """What keeps a router's rules up to date, if it has keys; it says on stderr what it does."""
+    from mapweave.identities.key_renewal import KeyRenewal
     from mapweave.terminal import stamped
 
-    try:
-        if not folder.changed():
-            return settings
-        settings = folder.router(server, settings.listen)
-        bus.reopen(settings)
-        print(stamped("the keys have changed: all connect again"), flush=True)
-    except MapweaveError as error:
-        print(stamped(f"the keys cannot be read again: {error}"), file=sys.stderr, flush=True)
-    return settings
+    if folder is None:
+        return None
+    return KeyRenewal(
+        bus, folder, server, settings.listen, lambda line: print(stamped(line), file=sys.stderr, flush=True)
+    )
 
 
 def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[ZenohBus, Keys]:

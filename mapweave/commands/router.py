@@ -7,8 +7,8 @@ from typing import Any
 
 from mapweave.commands.network import (
     add_network,
+    key_renewal,
     network_of,
-    renew_access,
     router_settings,
     settings_of,
     stop_on_signals,
@@ -39,9 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
     bus = ZenohBus(settings)
     try:
         print(stamped(f"router listens at {', '.join(settings.listen)}"), flush=True)
+        renewal = key_renewal(bus, keys, network.server, settings)
         while not stop.wait(1.0):
-            if keys is not None:
-                settings = renew_access(bus, keys, settings, network.server)
+            if renewal is not None:
+                renewal.check()
     finally:
         bus.close()
     return 0

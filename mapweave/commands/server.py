@@ -12,8 +12,8 @@ from typing import Any
 from mapweave.commands.map_input import SOURCES, opened
 from mapweave.commands.network import (
     add_network,
+    key_renewal,
     network_of,
-    renew_access,
     router_settings,
     settings_of,
     stop_on_signals,
@@ -119,12 +119,13 @@ def run(arguments: argparse.Namespace) -> int:
                 print(stamped(f"for people: http://{':'.join(map(str, address))}/"), flush=True)
             if arguments.demo:
                 stack.enter_context(RecordedFleet(bus, keys, name, data))
+            renewal = key_renewal(bus, folder, name, router)
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):
                 manager.alive()
-                if folder is not None:
-                    router = renew_access(bus, folder, router, name)
+                if renewal is not None:
+                    renewal.check()
                 now = server.summary()
                 if now != last_line:
                     print(stamped(now), flush=True)

@@ -8,6 +8,7 @@ NAME.key.toml     key file of NAME: copy it there
 
 from __future__ import annotations
 
+import re
 import secrets
 import socket
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ from mapweave.wire.credentials import Access, Credentials, Member, Role
 CATALOGUE = "fleet.json"
 AUTHORITY, AUTHORITY_KEY, PASSWORDS = "authority.pem", "authority.key", "passwords"
 PORT = 7447
+HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*")
 SERVER_DAYS = 825
 DAYS = 365
 """For which a key holds, unless it is said otherwise."""
@@ -121,11 +123,15 @@ class KeyFolder:
         """Make the authority and the server's key.
 
         Raises:
-            SettingsError: there are keys already.
+            SettingsError: there are keys already, or a host is no name or address.
         """
         if (path / CATALOGUE).exists():
             raise SettingsError(f"{path}: there are keys already; add to them with `mapweave keys add`")
         check_name(fleet)
+        check_name(server)
+        for host in hosts:
+            if not HOST.fullmatch(host):
+                raise SettingsError(f"--at {host!r}: write a name or an address, such as 192.168.1.10")
         scheme = "tls" if profile is Profile.PRODUCTION else "tcp"
         reached = tuple(hosts) or ("127.0.0.1",)
         known = dict.fromkeys((*reached, "localhost", "127.0.0.1", "::1", socket.gethostname()))

@@ -72,6 +72,10 @@ def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.Capture
     assert "r9 has no key" in complaint(capfd, "keys", "revoke", "r9", *where)
     assert "r0 is a robot already" in complaint(capfd, "keys", "add", "r0", "--role", "viewer", *where)
     assert "no keys are here" in complaint(capfd, "server", "--keys", tmp_path, "--data", tmp_path / "d")
+    fresh = ("--keys", tmp_path / "fresh")
+    for host in ('a"b', "a b", "-x", "a/b", ""):
+        assert "write a name or an address" in complaint(capfd, "keys", "init", *fresh, f"--at={host}")
+    assert not (tmp_path / "fresh").exists()
     (keys / "fleet.json").write_text('{"fleet": 3}')
     assert "fleet.json" in complaint(capfd, "keys", "list", *where)
 

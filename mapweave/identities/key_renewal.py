@@ -1,0 +1,50 @@
+"""A running router takes note when keys come and go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.identities.key_folder import KeyFolder
+from mapweave.wire.zenoh_bus import ZenohBus
+
+
+class KeyRenewal:
+    """Opens the router again with new rules; its clients connect again by themselves.
+
+    What fails is tried again at each check, and said once: a router that could not open its port again must
+    not stay closed.
+    """
+
+    def __init__(
+        self, bus: ZenohBus, folder: KeyFolder, server: str, listen: Sequence[str], say: Callable[[str], None]
+    ) -> None:
+        """Begin with the keys that the router has.
+
+        Args:
+            bus: the router.
+            folder: of the keys, as they were when the router was opened.
+            server: name of the map server whose key the router has.
+            listen: endpoints at which it listens.
+            say: takes a line for people.
+        """
+        self._bus, self._folder, self._server, self._say = bus, folder, server, say
+        self._listen = tuple(listen)
+        self._behind = False
+        self._complaint = ""
+
+    def check(self) -> None:
+        """Read the catalogue of keys, and open the router again if it has changed."""
+        try:
+            if not self._folder.changed() and not self._behind:
+                self._complaint = ""
+                return
+            self._behind = True
+            self._bus.reopen(self._folder.router(self._server, self._listen))
+        except MapweaveError as error:
+            if str(error) != self._complaint:
+                self._say(f"the keys cannot be used, which is tried again: {error}")
+            self._complaint = str(error)
+            return
+        self._behind, self._complaint = False, ""
+        self._say("the keys have changed: all connect again")
