@@ -79,6 +79,28 @@ def drive(robot: Robot, command: Command, seconds: float) -> list[Observation]:
     return seen
 
 
+def drive_until(
+    robot: Robot, command: Command, happened: Callable[[], bool], seconds: float = 10.0
+) -> list[Observation]:
+    """Let the robot drive until something has happened, however long a busy machine takes."""
+    seen: list[Observation] = []
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end, f"did not happen within {seconds:g} s of driving"
+        seen += drive(robot, command, 0.001)
+    return seen
+
+
+def drive_way(robot: Robot, command: Command, way: float) -> list[Observation]:
+    """Let the robot drive until its odometry has told of `way`, m, forward."""
+    seen: list[Observation] = []
+    while sum(observation.odometry.forward for observation in seen) < way:
+        before = len(seen)
+        seen += drive(robot, command, 0.001)
+        assert before < 500, f"did not drive {way:g} m"
+    return seen
+
+
 class RobotContract:
     """Derive from it, and give `emulator`, `DRIVER` and the other values."""
 
@@ -126,7 +148,7 @@ class RobotContract:
         robot.sense()
         start = emulator.wheels.way()
         axle = robot.describe().axle
-        seen = [*drive(robot, Command(0.2, 0.0), 0.8), *drive(robot, Command(0.1, 0.5), 0.8)]
+        seen = [*drive_way(robot, Command(0.2, 0.0), 0.12), *drive_way(robot, Command(0.1, 0.5), 0.06)]
         seen += drive(robot, Command(), 0.4)
         left, right = (b - a for a, b in zip(start, emulator.wheels.way(), strict=True))
         assert left + right > 0.3
@@ -162,17 +184,15 @@ class RobotContract:
             robot.act(Command(float("nan"), 0.0))
 
     def test_wheels_stop_when_commands_cease(self, robot: Robot, emulator: Any) -> None:
-        drive(robot, Command(0.2, 0.0), 0.5)
-        assert emulator.wheels.speeds[0] > 0.1
+        drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         last = time.monotonic()
         until(lambda: emulator.wheels.speeds == (0.0, 0.0), 1.5)
         assert emulator.wheels.stopped_at - last < STOPS_WITHIN + SLACK
         # It drives on with the next command.
-        drive(robot, Command(0.2, 0.0), 0.3)
-        assert emulator.wheels.speeds[0] > 0.1
+        drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
 
     def test_wheels_stop_when_it_is_closed(self, robot: Robot, emulator: Any) -> None:
-        drive(robot, Command(0.2, 0.0), 0.3)
+        drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         robot.close()
         until(lambda: emulator.wheels.speeds == (0.0, 0.0), STOPS_WITHIN)
         assert robot.sense() is None
@@ -199,15 +219,14 @@ class RobotContract:
             child.communicate()
 
     def test_it_comes_back_when_the_port_has_vanished(self, robot: Robot, emulator: Any) -> None:
-        drive(robot, Command(0.2, 0.0), 0.3)
+        drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         emulator.unplug()
         gone = drive(robot, Command(0.2, 0.0), 0.8)
         assert sum(o.odometry.forward for o in gone[4:]) == pytest.approx(0.0, abs=1e-9)
         assert not len(gone[-1].proximity)
         emulator.plug_in()
-        until(lambda: bool(drive(robot, Command(0.2, 0.0), 0.1)) and emulator.wheels.speeds[0] > 0.1, 4.0)
-        back = drive(robot, Command(0.2, 0.0), 0.5)
-        assert sum(o.odometry.forward for o in back) > 0.05
+        drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
+        back = drive_way(robot, Command(0.2, 0.0), 0.05)
         assert len(back[-1].proximity) == len(robot.describe().ranger_bearings)
 
     def test_a_stalled_line_holds_up_nothing(self, robot: Robot, emulator: Any) -> None:
@@ -226,4 +245,4 @@ class RobotContract:
         assert np.median(acts) < ANSWERS_WITHIN
         assert np.median(senses) < 2 * tick + ANSWERS_WITHIN
         assert max(acts) < 0.25
-        until(lambda: len(drive(robot, Command(0.1, 0.0), 0.1)) > 0 and emulator.wheels.speeds[0] > 0.05, 4.0)
+        drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)

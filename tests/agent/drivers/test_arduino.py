@@ -11,7 +11,7 @@ import pytest
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Command
-from tests.agent.drivers.contract import RobotContract, drive
+from tests.agent.drivers.contract import RobotContract, drive, drive_until
 from tests.agent.drivers.emulators import ArduinoSketch
 
 
@@ -39,5 +39,4 @@ class TestArduino(RobotContract):
 
     def test_lines_that_are_no_lines_are_passed_over(self, robot: Robot, emulator: Any) -> None:
         emulator.say(b"S 12 x\nrubbish\n\n")
-        drive(robot, Command(0.1, 0.0), 0.4)
-        assert emulator.wheels.speeds[0] > 0.05
+        drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)

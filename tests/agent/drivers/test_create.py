@@ -10,7 +10,7 @@ import pytest
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Command
-from tests.agent.drivers.contract import RobotContract, drive, until
+from tests.agent.drivers.contract import RobotContract, drive, drive_until, drive_way, until
 from tests.agent.drivers.emulators import Create2
 
 
@@ -29,9 +29,8 @@ class TestCreate(RobotContract):
         drive(robot, Command(0.1, 0.0), 0.3)
         emulator.lift()
         until(lambda: emulator.wheels.speeds == (0.0, 0.0), 0.5)
-        drive(robot, Command(0.1, 0.0), 0.5)
+        drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)
         assert emulator.mode == 2
-        assert emulator.wheels.speeds[0] > 0.05
 
     def test_the_bumper_is_the_two_lowest_bits(self, robot: Robot, emulator: Any) -> None:
         for bumps, bumped in ((0b0000, False), (0b0001, True), (0b0010, True), (0b1100, False)):
@@ -51,5 +50,5 @@ class TestCreate(RobotContract):
         # What the counter says at the start is the past's.
         emulator.wheels._way = (way, way)
         drive(robot, Command(), 0.3)
-        seen = drive(robot, Command(0.2, 0.0), 0.5)
-        assert 0.05 < sum(o.odometry.forward for o in seen) < 0.15
+        seen = drive_way(robot, Command(0.2, 0.0), 0.05)
+        assert sum(o.odometry.forward for o in seen) < 0.15

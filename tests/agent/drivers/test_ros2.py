@@ -22,7 +22,7 @@ from mapweave.hybridmap.errors import DeviceError, SettingsError
 from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.ros2.messages import decode
 from tests import ros2_peer as peer
-from tests.agent.drivers.contract import HEIGHT, WIDTH, RobotContract, drive, until
+from tests.agent.drivers.contract import HEIGHT, WIDTH, RobotContract, drive, drive_way, until
 from tests.agent.drivers.ros2_robot import Ros2Robot
 
 Start = Callable[..., CheckedRobot]
@@ -206,9 +206,8 @@ def test_another_clock_is_translated(start: Start) -> None:
     emulator = Ros2Robot()
     emulator.clock_ns = -1_700_000_000 * 10**9
     robot = start(emulator)
-    seen = drive(robot, Command(0.2, 0.0), 0.8)
+    seen = drive_way(robot, Command(0.2, 0.0), 0.05)
     assert abs(time.time_ns() - seen[-1].stamp_ns) < 1e9
-    assert sum(o.odometry.forward for o in seen) > 0.05
     assert sum(o.image is not None for o in seen) > len(seen) - 3
 
 
