@@ -252,7 +252,7 @@ class Pipeline:
         changes, self._changes = tuple(self._changes), []
         own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
         self._command = safe if own else None
-        return Step(safe, changes, tuple(questions), self._status(warning), self._sensors.fault)
+        return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
 
     @property
     def _explores(self) -> bool:
@@ -268,8 +268,16 @@ class Pipeline:
     @property
     def _blind(self) -> str:
         """Why its sensors forbid an autonomous robot to drive; empty if it may."""
-        fault = self._sensors.fault
+        fault = self._fault
         return fault.words if fault is not None and isinstance(self._mission, Explore | GoTo) else ""
+
+    @property
+    def _fault(self) -> Fault | None:
+        """The sensor that cannot be believed. Who is moved by a person needs no rangers."""
+        fault = self._sensors.fault
+        if fault is not None and fault.sensor == "rangers" and not isinstance(self._mission, Explore | GoTo):
+            return None
+        return fault
 
     def _lose_pose(self) -> None:
         """The encoders have failed, or are back: what was measured since is void, nodes made before stay."""
@@ -460,8 +468,8 @@ class Pipeline:
         if self._lifted or self._put_elsewhere:
             doing, detail = "lifted", "the robot begins a new map once it is on the floor"
         mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
-        if self._sensors.fault is not None and not self._blind:
-            warning = "; ".join(part for part in (self._sensors.fault.words, warning) if part)
+        if self._fault is not None and not self._blind:
+            warning = "; ".join(part for part in (self._fault.words, warning) if part)
         for more in (self._mapper.health if mapping else "", warning):
             detail = "; ".join(part for part in (detail, more) if part)
         nodes = len(self.map.nodes)

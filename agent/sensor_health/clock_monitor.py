@@ -43,7 +43,7 @@ class ClockMonitor:
                 self.fault = "the clock of the observations stands still"
         elif 0.0 < step <= self._ahead:
             self._stood, self._steady = 0.0, self._steady + self._tick
-            if self._steady >= STEADY:
+            if self._steady > STEADY:
                 self.fault = ""
         else:
             self._stood = self._steady = 0.0

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.vision.image_quality import LEAST_CORNERS, strongest_corners
 from mapweave.agent.vision.visual_odometry import visual_motion
 from mapweave.hybridmap.pose import Array
 
@@ -211,6 +212,10 @@ class EncoderMonitor:
     def _seen(self) -> _Seen | None:
         """How the robot has moved by its images; None if they show too little."""
         images = [moment.image for moment in self._moments][:: self._stride]
+        for end in (images[0], images[-1]):
+            # On a bare wall the noise is followed, and that stands.
+            if end is None or len(strongest_corners(end)) < LEAST_CORNERS:
+                return None
         turn = expansion = gross = 0.0
         for before, now in pairwise(images):
             if before is None or now is None:
