@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ from mapweave.agent.observation import Command
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import Lockstep
 from mapweave.fleet import send_order
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -213,11 +215,17 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json, width=180)
-    building = mapped_office(arguments.seed, arguments.rooms)
-    outcomes = []
-    for name in arguments.lies:
-        outcomes.append(drive(building, name, arguments.seed, arguments.lying))
-        console.print(outcomes[-1])
+    try:
+        if arguments.seed < 0 or not arguments.lying > 0.0:
+            raise InvalidValue("a seed of 0 or more, and lies that last longer than 0 s")
+        building = mapped_office(arguments.seed, arguments.rooms)
+        outcomes = []
+        for name in arguments.lies:
+            outcomes.append(drive(building, name, arguments.seed, arguments.lying))
+            console.print(outcomes[-1])
+    except MapweaveError as error:
+        print(f"trust: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
     console.print(_table(outcomes, arguments.seed))
     if arguments.json:
         print(json.dumps({"seed": arguments.seed, **summary(outcomes)}))
