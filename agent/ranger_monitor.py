@@ -52,7 +52,7 @@ class RangerMonitor:
     A robot that promises no rangers drives without them, by the choice of who described it. One that
     promises some and sends none, or another number, has a broken sensor or driver: its readings belong to
     no known bearing, and everywhere counts as free. Readings that stay the same to the last bit while the
-    robot moves toward or past what they hit are old. Where all are at their maximum that cannot be told.
+    robot moves toward or past what they hit are old. Where all are at their maximum that does not show.
 
     Attributes:
         frozen: whether the readings are old.

@@ -346,7 +346,7 @@ class Navigator:
     def _compared(self, route: tuple[RouteLeg, ...], fix: Fix) -> Fix:
         """The fix, or the robot's own if it sees the node by which the fleet has localized it.
 
-        The robot still stands where it asked. What it recognises itself comes before what it is told.
+        The robot still stands where it asked. What it recognises itself comes before any answer.
         """
         node = next((leg.node for leg in route if leg.node.id == fix.node), None)
         image = self._motion.observation.image

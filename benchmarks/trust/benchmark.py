@@ -1,4 +1,4 @@
-"""A map server that lies to a lost robot: what does the robot do, and does it arrive when the truth is told?
+"""A map server that lies to a lost robot: what does the robot do, and does it arrive when the lies end?
 
     python -m benchmarks.trust [--seed N] [--lies NAME ...] [--lying S] [--json]
 
@@ -48,7 +48,7 @@ ROBOT = "r1"
 CLOSE = 0.1
 """Within this of where the goal's image was taken a robot has arrived, m."""
 HONEST = 240.0
-"""s that it has for this once the truth is told."""
+"""s that it has for this once the answers are true."""
 APART = (2.0, 5.0)
 """Least and largest distance of start and goal, m."""
 
@@ -66,7 +66,7 @@ class Outcome:
         said: by the robot at the end of that.
         gave_up: whether it had given up by then.
         false_arrival: whether it said that it had arrived, and had not.
-        arrived: whether it arrived once the truth was told.
+        arrived: whether it arrived once the answers were true.
         honest_s: how long that took.
     """
 

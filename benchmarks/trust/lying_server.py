@@ -209,7 +209,7 @@ def cyclic(server: LyingServer, asked: View | RouteRequest, honest: object) -> W
 
 
 def endless(server: LyingServer, asked: View | RouteRequest, honest: object) -> Words:
-    """The goal is always some way ahead, beyond nodes that nobody has heard of."""
+    """The goal is always some way ahead, beyond nodes that are in no map."""
     if isinstance(asked, View) or asked.start not in server.map.nodes:
         return honest  # type: ignore[return-value]
     goal = server.map.nodes[asked.goal]
