@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor, Place, Preference
@@ -11,32 +13,34 @@ from mapweave.mapserver.route_rules import RouteRules
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
-def effects_of(annotation: Annotation, places: Places) -> str:
-    """Counts of the nodes, ways or links that it is about; empty for what is about none.
+def effects_of(annotation: Annotation, places: Places) -> Iterator[str]:
+    """Counts of the nodes, ways or links that it is about, and the entry that it replaces.
 
     Args:
         annotation: not in the record yet; its nodes are in the merged map.
         places: of the newest merged map, with the record.
     """
-    body = annotation.body
     if annotation.removed:
-        return ""
-    match body:
+        return
+    match annotation.body:
         case Place(area=Area() as area):
-            return f"{_counted(_nodes_in(area, places.merged), 'node')} in it"
-        case Closure() | Preference():
+            yield f"{_counted(_nodes_in(area, places.merged), 'node')} in it"
+        case Closure() | Preference() as body:
             # A closure of tomorrow has no effect now: at its beginning it has the one that is meant.
             when = (body.begin_ns or 0) if isinstance(body, Closure) else annotation.stamp_ns
             rules = RouteRules(places.router.roads, Annotations((annotation,)), when)
-            return f"{_counted(len(rules.closed or rules.factors), 'way')} of robots"
+            yield f"{_counted(len(rules.closed or rules.factors), 'way')} of robots"
         case Floor(node, label):
             floors = {**places.annotations.floors, node.map: label}
             apart = sum(
                 node.map in link.maps and floors.get(link.a.map, label) != floors.get(link.b.map, label)
                 for link in places.merged.links
             )
-            return f"{_counted(apart, 'link')} between this map and maps on other floors" if apart else ""
-    return ""
+            if apart:
+                yield f"{_counted(apart, 'link')} between this map and maps on other floors"
+    before = places.annotations.last(annotation.kind, annotation.name)
+    if before is not None:
+        yield f"it takes the place of: {before.words}"
 
 
 def _nodes_in(area: Area, merged: MergedMap) -> int:

@@ -120,9 +120,7 @@ class Annotator:
             check_annotation(places.merged, self._record.annotations, annotation)
             self._check(annotation)
             if check:
-                before = self._record.annotations.last(annotation.kind, annotation.name)
-                replaced = f"it takes the place of: {before.words}" if before and not annotation.removed else ""
-                words = "; ".join(filter(None, (annotation.words, effects_of(annotation, places), replaced)))
+                words = "; ".join((annotation.words, *effects_of(annotation, places)))
                 return f"only checked, nothing is changed: {words}"
             self._record.add(annotation)
             self._changed(self._record.annotations)

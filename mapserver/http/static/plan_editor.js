@@ -57,6 +57,7 @@ export class PlanEditor {
     this.origin = origin || null;
     if (scale) byId("plan-scale").value = scale;
     if (!byId("plan-name").value) byId("plan-name").value = (yaml || image).name.replace(/\.[^.]*$/, "").slice(0, 64);
+    byId("plan-answer").textContent = "";
     this.shown();
     this.changed();
   }
@@ -108,7 +109,7 @@ export class PlanEditor {
     this.fit = null;
     this.words();
     this.report();
-    if (!this.image || !this.pairs.length) { this.drafted(); return; }
+    if (!this.image || this.pairs.length < LEAST) { this.drafted(); return; }
     const answer = await change("annotations", { ...this.content(byId("plan-name").value.trim() || "plan"), check: true });
     if (number !== this.number) return;
     this.fit = answer.error ? { reason: answer.error, parts: [] } : answer.plan;
@@ -148,7 +149,7 @@ export class PlanEditor {
       const item = add(list, "li"), off = fitted.get(k + 1);
       const place = pair.x || pair.y ? `${pair.node} ${pair.x.toFixed(2)}, ${pair.y.toFixed(2)} m` : pair.node;
       item.append(`${place} = ${pair.u.toFixed(0)}, ${pair.v.toFixed(0)} px `);
-      if (off) add(item, "span", `off by ${off.off.toFixed(2)} m, from the others by ${off.off_others.toFixed(2)} m `,
+      if (off) add(item, "span", `off by ${off.off.toFixed(2)} m, from the others ${off.off_others.toFixed(2)} m `,
         off.chance * this.pairs.length < 0.01 ? "bad" : "soft");
       button(item, "Remove", () => {
         this.pairs.splice(k, 1);

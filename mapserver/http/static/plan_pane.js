@@ -23,7 +23,7 @@ export class PlanPane {
   }
   fit() {
     const { naturalWidth: width, naturalHeight: height } = this.image || {};
-    if (width) this.viewport.fit([0, -height, width, 0], 8);
+    if (width) this.viewport.fit([0, -height, width, 0], { most: 8, margin: 12, tools: 0 });
     this.viewport.touched = false;
     this.draw();
   }
