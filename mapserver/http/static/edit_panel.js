@@ -33,7 +33,10 @@ export class EditPanel {
     byId("edit-within").addEventListener("click", () => selection.set(selection.rows().map(row => model.name(row))));
     byId("draw-finish").addEventListener("click", () => drawing.finish());
     for (const shape of ["rectangle", "polygon"])
-      byId(`draw-${shape}`).addEventListener("click", () => drawing.begin(drawing.shape === shape ? "" : shape));
+      byId(`draw-${shape}`).addEventListener("click", () => {
+        drawing.begin(drawing.shape === shape ? "" : shape);
+        if (drawing.shape) byId("canvas").focus();
+      });
     byId("edit-name").value = permission.name;
     byId("edit-name").addEventListener("change", () => callMe(byId("edit-name").value.trim()));
     onPermission(({ allowed, why }) => {
@@ -73,6 +76,7 @@ export class EditPanel {
       // What is hidden must not keep the form from being sent.
       for (const input of Object.values(inputs)) input.disabled = id !== kind;
     }
+    byId("edit-answer").textContent = "";
     this.drawing.cancel();
     this.forget();
     this.planning();
@@ -136,6 +140,7 @@ export class EditPanel {
     const answer = add(box, "div", "", `box ${kind}`);
     add(answer, "p", words);
     if (more) add(answer, "p", more);
+    answer.scrollIntoView({ block: "nearest" });
   }
   request() {
     const { path, content } = this.editor.request(this.selection, this.values());

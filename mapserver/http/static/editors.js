@@ -16,6 +16,11 @@ function where({ names, area }, what, radius) {
   if (names.length === 2) return { edge: names };
   return lacks(`${what} is about an area, one node with the floor around it, or two nodes with the way between them.`);
 }
+// All of some numbers, or none of them.
+function numbers(texts, words) {
+  if (texts.every(text => text === "")) return null;
+  return texts.some(text => text === "") ? lacks(words) : texts.map(Number);
+}
 const named = ({ names, area }, given) =>
   given || (area ? lacks("Give the area a name.") : names.join(" "));
 const time = text => text ? new Date(text).toISOString() : undefined;
@@ -23,22 +28,22 @@ const constraint = content => ({ path: "constraints", content });
 const annotation = (name, body) => ({ path: "annotations", content: { name, body } });
 const mapOf = name => name.slice(0, name.lastIndexOf("."));
 
-const RADIUS = { name: "radius", label: "Around a single node, m", type: "number", value: 1, min: 0.1, step: 0.1 };
+const RADIUS = { name: "radius", label: "Radius, m", type: "number", value: 1, min: 0.1, step: 0.1 };
 
 export const EDITORS = [
   { id: "link", group: "What is merged", label: "Link two places",
     hint: "Two nodes that see one place. The server asks their images, and whether the map allows it.",
-    more: "Pose by hand, if the images do not agree but you know that it is one place", moreWhen: /--pose/,
+    // Shown when the server asks for it.
+    more: "By hand: where the second node is, seen from the first", moreWhen: /--pose/,
     fields: [
-      { name: "x", label: "Second node ahead of the first, m", type: "number", step: "any", more: true },
-      { name: "y", label: "to its left, m", type: "number", step: "any", more: true },
-      { name: "deg", label: "turned to the left, degrees", type: "number", step: "any", more: true },
+      { name: "x", label: "Ahead, m", type: "number", step: "any", more: true },
+      { name: "y", label: "To the left, m", type: "number", step: "any", more: true },
+      { name: "deg", label: "Turned left, deg", type: "number", step: "any", more: true },
     ],
     request(selection, { x, y, deg }) {
-      const link = nodes(selection, 2, "A link"), pose = [x, y, deg];
-      if (pose.every(one => one === "")) return constraint({ link });
-      if (pose.some(one => one === "")) lacks("A pose by hand has three numbers: ahead, left and turned.");
-      return constraint({ link, pose: pose.map(Number) });
+      const link = nodes(selection, 2, "A link");
+      const pose = numbers([x, y, deg], "A pose by hand has three numbers: ahead, left and turned.");
+      return constraint(pose ? { link, pose } : { link });
     } },
   { id: "unmerge", group: "What is merged", label: "Undo a link",
     hint: "Two nodes, or two maps, that do not show one place. They are not linked again.",
@@ -63,10 +68,10 @@ export const EDITORS = [
     request: (selection, { name }) => annotation(name, { kind: "place",
       ...selection.area ? { area: selection.area } : { node: nodes(selection, 1, "A place")[0] } }) },
   { id: "closure", group: "What is said about it", label: "Close a way or an area",
-    hint: "No route leads through it. Two nodes: the way between them.",
+    hint: "No route leads through an area, the floor around one node, or the way between two. Times are this device's.",
     fields: [{ name: "name", label: "Name", type: "text", maxLength: 64, placeholder: "of an area" }, RADIUS,
-      { name: "begin", label: "From, your local time", type: "datetime-local" },
-      { name: "end", label: "Until, your local time", type: "datetime-local" }],
+      { name: "begin", label: "From", type: "datetime-local" },
+      { name: "end", label: "Until", type: "datetime-local" }],
     request: (selection, { name, radius, begin, end }) => annotation(named(selection, name), { kind: "closure",
       ...where(selection, "A closure", radius), begin_ns: time(begin), end_ns: time(end) }) },
   { id: "preference", group: "What is said about it", label: "Prefer or avoid",
@@ -84,10 +89,15 @@ export const EDITORS = [
       return annotation(mapOf(node), { kind: "floor", node, label });
     } },
   { id: "pin", group: "What is said about it", label: "Pin a frame",
-    hint: "The node keeps its present pose, so the frame of its component never jumps.",
-    fields: [],
-    request(selection) {
-      const [node] = nodes(selection, 1, "A pin");
-      return annotation(node, { kind: "pin", node });
+    hint: "The node keeps its present pose, or gets the one that you give, so the frame of its component never jumps.",
+    fields: [
+      { name: "x", label: "x, m", type: "number", step: "any", placeholder: "as it is" },
+      { name: "y", label: "y, m", type: "number", step: "any", placeholder: "as it is" },
+      { name: "deg", label: "Heading, deg", type: "number", step: "any", placeholder: "as it is" },
+    ],
+    request(selection, { x, y, deg }) {
+      const [node] = nodes(selection, 1, "A pin"), pose = numbers([x, y, deg], "A pose has x, y and a heading.");
+      return annotation(node, { kind: "pin", node,
+        ...pose ? { merged_from_node: [pose[0], pose[1], pose[2] * Math.PI / 180] } : {} });
     } },
 ];

@@ -171,7 +171,7 @@ painter.overlays.push(drawAnnotations, (c, v) => {
   selection.draw(c, v);
   drawing.draw(c, v);
   planEditor.drawMarks(c, v);
-  if ((drawing.shape || planEditor.open) && byId("canvas").matches(":focus-visible")) crosshair(c, v);
+  if (isOpen("edit") && (drawing.shape || planEditor.open) && byId("canvas").matches(":focus-visible")) crosshair(c, v);
 }, (c, v) => {
   for (const { merged_from_robot, component, probability } of page.photo) {
     if (!merged_from_robot || component < 0) continue;

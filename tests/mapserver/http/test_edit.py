@@ -263,7 +263,12 @@ def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, t
     assert annotation(server).body == Floor(FIRST, "upper") and annotation(server).name == str(B)
     person.edit("pin", "the door is here")
     person.apply()
-    assert isinstance(annotation(server).body, Pin)
+    held = annotation(server).body
+    assert isinstance(held, Pin) and held.merged_from_node == server.merged().pose(FIRST)
+    assert "has x, y and a heading" in person.edit("pin", "the door is here", x=3)
+    person.edit("pin", "the door is here", x=3, y=-2, deg=90)
+    person.apply()
+    assert annotation(server).body == Pin(FIRST, Pose2(3.0, -2.0, np.pi / 2.0))
     person.edit("retire", "test drive", scope="map")
     person.apply()
     assert last(server) == RetiredMap(B)
