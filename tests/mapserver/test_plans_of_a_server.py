@@ -153,7 +153,7 @@ def test_plans_over_http(house: House) -> None:
 
 
 def test_a_plan_is_tried_over_http_before_it_is_kept(house: House) -> None:
-    """The image may come with its map.yaml; the fit is told without anything being kept."""
+    """The image may come with its map.yaml; the fit comes without anything being kept."""
     assert house.server.settle(20.0)
     described = "image: flat.pgm\nresolution: 0.02\norigin: [1.0, -2.0, 0.5]\nnegate: 1\n"
     pgm = cv2.imencode(".pgm", np.full((500, 400), 200, np.uint8))[1].tobytes()

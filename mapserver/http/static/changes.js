@@ -1,5 +1,5 @@
-// The one place where changes of the map leave the page: POST /constraints, /annotations and /plans. Whoever may not
-// change the map is told why here, and everything that changes it is disabled.
+// The one place where changes of the map leave the page: POST /constraints, /annotations and /plans. For those who may
+// not change the map it holds the reason, and everything that changes it is disabled.
 import { ask } from "./dom.js";
 
 const NAME = "mapweave.name";

@@ -174,7 +174,7 @@ export class EditPanel {
     this.say("Asking ...", "");
     const answer = await change(path, check ? { ...content, check } : content);
     if (number !== this.number) {
-      // What was done is told in any case.
+      // What was done is shown in any case.
       if (!check) this.say(answer.error || answer.said, answer.error ? "failed" : "good");
       else if (byId("edit-answer").textContent === "Asking ...") byId("edit-answer").textContent = "";
       return null;
