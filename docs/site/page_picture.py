@@ -85,6 +85,7 @@ def lay_plan(page: Browser, building: Building, image_path: Path) -> None:
     eventually(lambda: "rms" in page.run("return document.getElementById('plan-fit').textContent"))
     page.run("document.getElementById('fit').click()")
     page.type("#plan-because", "drawing of 2024")
+    page.run("document.activeElement.blur()")
 
 
 def main() -> None:

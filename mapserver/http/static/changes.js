@@ -22,7 +22,10 @@ export function callMe(name) {
 // `check: true` the server only says what the change would do.
 export async function change(path, content) {
   if (!permission.allowed) return { error: permission.why, status: 403 };
-  if (content instanceof Blob || content instanceof FormData) return ask(path, { method: "POST", body: content });
+  if (content instanceof FormData) return ask(path, { method: "POST", body: content });
+  // A file is what it contains, whatever its ending.
+  if (content instanceof Blob)
+    return ask(path, { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: content });
   const by = permission.name || "page";
   const body = JSON.stringify({ [path === "annotations" ? "who" : "by"]: by, ...content });
   const answer = await ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body });

@@ -114,7 +114,8 @@ export class EditPanel {
         words += a === b ? ` Both are in component ${a} already.`
           : ` It joins component ${a} (${model.members[a].length} nodes) and component ${b} (${model.members[b].length} nodes).`;
     }
-    byId("edit-counts").textContent = words;
+    // A status that has not changed is not read out again.
+    if (byId("edit-counts").textContent !== words) byId("edit-counts").textContent = words;
   }
   typed() {
     const input = byId("edit-nodes"), names = input.value.split(/[\s,]+/).filter(Boolean);

@@ -13,7 +13,7 @@ const YAML = /\.ya?ml$/i;
 export class PlanEditor {
   constructor(model, viewport, moved) {
     Object.assign(this, { model, viewport, moved, open: false, image: null, origin: null, pairs: [], place: null, pixel: null,
-      fit: null, number: 0 });
+      fit: null, number: 0, saved: "" });
     this.pane = new PlanPane(byId("plan-canvas"), (u, v) => this.clickedPlan(u, v));
     byId("plan-file").addEventListener("change", () => this.take([...byId("plan-file").files]));
     byId("plan-choice").addEventListener("change", () => this.load(byId("plan-choice").value));
@@ -34,9 +34,12 @@ export class PlanEditor {
   }
   // Plans come and go while the form is open.
   list() {
-    const choice = byId("plan-choice"), names = planNames(), kept = choice.value;
-    choice.replaceChildren(new Option("A new plan", ""), ...names.map(name => new Option(name, name)));
+    const choice = byId("plan-choice"), names = planNames(), kept = names.includes(this.saved) ? this.saved : choice.value;
+    // A list that is open stays open.
+    if (names.join("\n") !== [...choice.options].slice(1).map(one => one.value).join("\n") || !choice.options.length)
+      choice.replaceChildren(new Option("A new plan", ""), ...names.map(name => new Option(name, name)));
     choice.value = names.includes(kept) ? kept : "";
+    if (choice.value === this.saved) this.saved = "";
     byId("plan-delete").hidden = !choice.value;
   }
   // An image, or a map.yaml with its image.
@@ -163,6 +166,8 @@ export class PlanEditor {
     const because = byId("plan-because").value.trim(), name = byId("plan-name").value.trim();
     this.say("Saving ...", "");
     const answer = await change("annotations", { ...this.content(name), because });
+    if (!answer.error) this.saved = name;
+    this.list();
     this.say(answer.error || answer.said, answer.error ? "failed" : "good");
   }
   async remove() {

@@ -320,6 +320,10 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
             )
             person.mouse(tuple(there))
 
+        # With the keyboard Enter clicks the middle of the plan; another click takes its place.
+        browser.run("document.getElementById('plan-canvas').focus()")
+        person.key("Enter")
+        eventually(lambda: browser.run("return mapweave.planEditor.pixel?.u") == 250)
         person.press("fit")
         browser.run("mapweave.viewport.zoom(0.3)")
         node, pose = next(iter(poses.items()))
@@ -349,6 +353,7 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
         eventually(lambda: "plan map is hall.pgm, 5 pairs" in person.text("plan-answer"))
         placed = server.plans().plan("map").part()
         assert np.allclose(placed.plan_from_merged.vector, PLAN_FROM_MERGED.vector, atol=0.05)
+        eventually(lambda: browser.run("return document.getElementById('plan-choice').value") == "map")
         # Another time it is opened, changed and deleted.
         browser.open(f"http://127.0.0.1:{web.port}/")
         eventually(lambda: "map" in person.text("plan-choice"))
