@@ -240,7 +240,7 @@ def main() -> None:
         "seed": options.seed, "cores": os.cpu_count(), "load_before": round(os.getloadavg()[0], 1),
     }  # fmt: skip
     with (
-        tempfile.TemporaryDirectory(dir=Path.cwd()) as folder,
+        tempfile.TemporaryDirectory() as folder,
         Progress(console=Console(stderr=True)) as progress,
     ):
         floor = measure_floor(Path(folder))
