@@ -223,7 +223,7 @@ def endless(server: LyingServer, asked: View | RouteRequest, honest: object) -> 
 
 def garbage(server: LyingServer, asked: View | RouteRequest, honest: object) -> Words:
     """Noise, a message with no numbers in it, a cut one, and one that is huge."""
-    good = encode(honest)  # type: ignore[arg-type]
+    good = encode(honest)
     choice = server.asked % 4
     if choice == 0:
         return server.rng.bytes(int(server.rng.integers(0, 4000)))
