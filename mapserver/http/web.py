@@ -17,6 +17,7 @@
     POST /plans       an image: keeps it for a plan that an annotation adds; JSON: its name and size
     GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
+    POST /robots/ROBOT/portal-done   it was taken through the portal at which it waits, JSON
     POST /stop        stops every robot, JSON
     POST /constraints links, unmerges, retires, or takes back, JSON in and out; see constraint_request.py
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
@@ -77,13 +78,15 @@ MOST_AT_ONCE = 32
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
+PORTAL_DONE = "portal-done"
+OF_ROBOTS = tuple(f"/robots/ROBOT/{word}" for word in ("explore", "stop", PORTAL_DONE))
 METHODS = {
     **dict.fromkeys(
         (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
     ),
     **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png"), "GET"),
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
-    **dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST"),
+    **dict.fromkeys(("/relocalize", MISSION, *OF_ROBOTS, "/stop"), "POST"),
 }
 BY = "http"
 """Gives a mission, if the request does not say."""
@@ -273,6 +276,9 @@ class Questions:
     async def _give(self, request: Request) -> Mapping[str, Any]:
         self._check_commands(request)
         robot, kind = request.path_params["robot"], request.path_params["kind"]
+        if kind == PORTAL_DONE:
+            done = self._server.portal_done, robot, request.query_params.get("by", BY)
+            return {"said": await run_in_threadpool(*done)}
         if kind not in (MissionKind.GO, MissionKind.EXPLORE, MissionKind.STOP):
             raise HTTPException(HTTPStatus.NOT_FOUND, f"there is no mission {kind!r}: go, explore, stop")
         query = request.query_params
