@@ -16,8 +16,7 @@
     GET /plans        floor plans, and where they lie under the merged map, JSON; /plans/NAME.png is the image
     POST /plans       an image: keeps it for a plan that an annotation adds; JSON: its name and size
     GET /constraints  what people have linked, unmerged and retired, JSON
-    POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
-    POST /robots/ROBOT/portal-done   it was taken through the portal at which it waits, JSON
+    POST /robots/ROBOT/go?goal=GOAL, .../explore, .../stop   a mission; .../portal-done   it is through, JSON
     POST /stop        stops every robot, JSON
     POST /constraints links, unmerges, retires, or takes back, JSON in and out; see constraint_request.py
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
@@ -78,8 +77,7 @@ MOST_AT_ONCE = 32
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
-PORTAL_DONE = "portal-done"
-OF_ROBOTS = tuple(f"/robots/ROBOT/{word}" for word in ("explore", "stop", PORTAL_DONE))
+OF_ROBOTS = tuple(f"/robots/ROBOT/{word}" for word in ("explore", "stop", "portal-done"))
 METHODS = {
     **dict.fromkeys(
         (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
@@ -276,12 +274,11 @@ class Questions:
     async def _give(self, request: Request) -> Mapping[str, Any]:
         self._check_commands(request)
         robot, kind = request.path_params["robot"], request.path_params["kind"]
-        if kind == PORTAL_DONE:
-            done = self._server.portal_done, robot, request.query_params.get("by", BY)
-            return {"said": await run_in_threadpool(*done)}
+        query = request.query_params
+        if kind == "portal-done":
+            return {"said": await run_in_threadpool(self._server.portal_done, robot, query.get("by", BY))}
         if kind not in (MissionKind.GO, MissionKind.EXPLORE, MissionKind.STOP):
             raise HTTPException(HTTPStatus.NOT_FOUND, f"there is no mission {kind!r}: go, explore, stop")
-        query = request.query_params
         goal, by, mission_id = query.get("goal", ""), query.get("by", BY), query.get("id", "")
         report = await run_in_threadpool(
             self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id,
