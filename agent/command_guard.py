@@ -8,6 +8,7 @@ from mapweave.agent.camera_occupancy import CameraOccupancyGrid
 from mapweave.agent.cautious_driving import ALONG_EDGES, CautiousDriving, speed_for
 from mapweave.agent.exploration.camera_exploration import with_readings
 from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.servo.proximity import guard
 from mapweave.hybridmap.pose import Pose2
 
@@ -26,7 +27,8 @@ class CommandGuard:
         observation: Observation,
         description: RobotDescription,
         driven: bool,
-        seen: tuple[CameraOccupancyGrid, Pose2] | None,
+        floor: OccupancyGrid | None,
+        pose: Pose2,
     ) -> tuple[Command, str]:
         """The command as far as it is safe, and why it is not the one that was wanted.
 
@@ -35,9 +37,10 @@ class CommandGuard:
             observation: what the robot senses now.
             description: of the robot.
             driven: whether a person drives.
-            seen: the floor that an exploring robot without rangers has seen, and where it is on it.
+            floor: that an exploring robot knows; one without rangers keeps to what its camera has seen of it.
+            pose: `map_from_robot`.
         """
-        safe, warning = self._by_distances(command, observation, description, driven, seen)
+        safe, warning = self._by_distances(command, observation, description, driven, floor, pose)
         if observation.bumped and safe.forward * self._direction > 0:
             return Command(0.0, safe.turn), "stopped: the bumper is pressed"
         if not observation.bumped and safe.forward:
@@ -50,15 +53,15 @@ class CommandGuard:
         observation: Observation,
         description: RobotDescription,
         driven: bool,
-        seen: tuple[CameraOccupancyGrid, Pose2] | None,
+        floor: OccupancyGrid | None,
+        pose: Pose2,
     ) -> tuple[Command, str]:
         if self._caution is None:
             return guard(command, observation.proximity, description)
         if driven:
             return self._caution.command(command, description.max_forward, follow=True), ""
         warning, most = "", ALONG_EDGES
-        if seen is not None:
-            floor, pose = seen
+        if isinstance(floor, CameraOccupancyGrid):
             command, warning = guard(command, floor.readings(pose), with_readings(description))
             direction = 0.0 if command.forward >= 0.0 else math.pi
             most = speed_for(floor.known_ahead(pose, direction, 0.5))

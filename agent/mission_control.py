@@ -186,7 +186,7 @@ class MissionControl:
         return f"{self._robot} was taken through {wait.portal.title}: it looks where it is"
 
     def taken_through(self) -> bool:
-        """Whether the robot was told since the last call that it was taken through a portal."""
+        """Whether a person has said since the last call that the robot was taken through a portal."""
         with self._lock:
             through, self._through = self._through, False
         return through

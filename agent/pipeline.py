@@ -203,9 +203,9 @@ class Pipeline:
                 )  # fmt: skip
 
     def taken_through(self) -> None:
-        """The robot is told that it was taken through the portal at which it waits."""
+        """A person says that the robot was taken through the portal at which it waits."""
         if self._navigator is not None:
-            self._navigator.crossing.told()
+            self._navigator.crossing.taken_through()
 
     @property
     def _progress(self) -> tuple[int, PortalWait | None]:
@@ -319,10 +319,9 @@ class Pipeline:
 
     def _safe(self, command: Command, observation: Observation) -> tuple[Command, str]:
         """The command as far as it is safe, and why it is not the one that was wanted."""
-        floor, seen = self._floor, None
-        if isinstance(self._mission, Explore) and isinstance(floor, CameraOccupancyGrid):
-            seen = floor, self._mapper.map_from_robot.mean
-        return self._guard.safe(command, observation, self._description, self._driven is not None, seen)
+        floor = self._floor if isinstance(self._mission, Explore) else None
+        pose, driven = self._mapper.map_from_robot.mean, self._driven is not None
+        return self._guard.safe(command, observation, self._description, driven, floor, pose)
 
     def _see_changes(self) -> None:
         """Take what was changed in the map; nodes show a robot without rangers where the floor is free."""

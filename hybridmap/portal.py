@@ -101,7 +101,7 @@ class PortalWait:
     Attributes:
         portal: at which it has parked.
         asked: how often it has asked.
-        done: whether it was told that it has been taken through; it then looks where it is.
+        done: whether a person says that it was taken through; it then looks where it is.
     """
 
     portal: PortalStop

@@ -23,7 +23,7 @@ class RouteSettings:
         per_turn: a radian between the headings of two nodes.
         per_undriven: 1/m; an edge that was recognised but never driven costs more by its length times
             this: there may be an obstacle in between, as a wall where a room is seen through its door.
-        per_portal: a portal; the robot stands there until somebody has come, two minutes perhaps, in which it
+        per_portal: a portal; the robot stands there until a person has come, two minutes perhaps, in which it
             drives as far as this.
     """
 

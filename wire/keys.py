@@ -110,7 +110,7 @@ class Keys:
         return f"{self.root}/agent/{check_name(agent)}/drive"
 
     def portal(self, agent: str) -> str:
-        """Where an agent is told that it was taken through a portal."""
+        """Where an agent takes reports that it was taken through a portal."""
         return f"{self.root}/agent/{check_name(agent)}/portal"
 
     # Keys of a server.

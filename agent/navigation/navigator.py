@@ -218,7 +218,7 @@ class Navigator:
             self._behaviour = self._stand()
 
     def _cross(self) -> Behaviour:
-        """Ask to be taken through a portal; once it is told so, look where it is."""
+        """Ask to be taken through a portal; then look where it is."""
         crossing = self.crossing
         while crossing.wait is not None and not crossing.wait.done:
             if late := crossing.late(self._motion.now):

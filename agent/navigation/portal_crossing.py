@@ -1,6 +1,6 @@
-"""A robot at a portal: it asks to be taken through, is told so, and looks where it is then.
+"""A robot at a portal: it asks to be taken through, and looks where it is then.
 
-It is a kidnapping of which the robot is told: it knows on which floor it must be, and its own view confirms
+It is a kidnapping that is announced: the robot knows on which floor it must be, and its own view confirms
 that. Only then does it believe that it was taken through.
 """
 
@@ -74,8 +74,8 @@ class PortalCrossing:
         portal, why = self.wait.portal, f": {self.trouble}" if self.trouble else ""
         return f"not taken through {portal.title} within {self._patience:g} s{why}"
 
-    def told(self) -> None:
-        """The robot is told that it was taken through."""
+    def taken_through(self) -> None:
+        """A person says that the robot was taken through."""
         if self.wait is not None:
             self.wait = replace(self.wait, done=True)
 

@@ -73,7 +73,7 @@ class Positioning:
         return self._fix((yield from self._localization.search(expected)))
 
     def look(self, detail: str) -> FixSearch:
-        """Stand for one view, which may be less exact; None if it shows no place for certain."""
+        """Stand still for one view, which may be less exact; None if it shows no place for certain."""
         self.search, self._localization.detail = self._localization, detail
         yield from self._motion.stand(STILL)
         return self._fix((yield from self._localization.look(LENIENT)))

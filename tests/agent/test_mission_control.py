@@ -167,7 +167,7 @@ def test_a_robot_that_is_switched_on_again_goes_on_from_the_stop_and_the_portal_
     portal = PortalWait(PortalStop("lift", PortalMeans.LIFT, HOME, GOAL, "2"))
     disk.robot().take(replace(order(1), via=stops))
 
-    def after(*events: tuple[int, PortalWait | None], told: bool = False) -> GoTo:
+    def after(*events: tuple[int, PortalWait | None], through: bool = False) -> GoTo:
         """What a new process begins with, once an old one has got so far."""
         control = disk.robot()
         control.next(True, 0.0, None)
@@ -175,7 +175,7 @@ def test_a_robot_that_is_switched_on_again_goes_on_from_the_stop_and_the_portal_
             assert control.follow(replace(status(), passed=passed, portal=wait)), "it is on the disk"
             assert not control.follow(replace(status(), passed=passed, portal=wait)), "and not again"
             assert control.next(True, 0.0, None) is None, "the drive goes on"
-        if told:
+        if through:
             control.portal_done("anna")
         mission = disk.robot().next(True, 0.0, None)
         assert isinstance(mission, GoTo)
@@ -184,7 +184,7 @@ def test_a_robot_that_is_switched_on_again_goes_on_from_the_stop_and_the_portal_
     assert after() == GoTo(GOAL, stops)
     assert after((1, None)) == GoTo(GOAL, stops, 1)
     assert after((2, None), (2, portal)) == GoTo(GOAL, stops, 2, portal)
-    assert after(told=True) == GoTo(GOAL, stops, 2, replace(portal, done=True))
+    assert after(through=True) == GoTo(GOAL, stops, 2, replace(portal, done=True))
     with pytest.raises(InvalidValue, match="r0 looks where it is already"):
         disk.robot().portal_done("bob")
     assert after((2, None)) == GoTo(GOAL, stops, 2)

@@ -194,7 +194,7 @@ def test_over_http_robots_are_sent_stopped_and_seen(house: House) -> None:
     link.close()
 
 
-def test_a_robot_at_a_portal_is_told_by_anyone_that_it_was_taken_through(house: House) -> None:
+def test_a_robot_at_a_portal_takes_it_from_any_client_that_it_was_taken_through(house: House) -> None:
     link, control = house.robot()
     asking = Status(
         "waiting at a portal", "take me up", 7, 0, Pose2(), False, "goto", portal=PortalWait(LIFT)

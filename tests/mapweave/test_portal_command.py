@@ -32,16 +32,18 @@ class Trial:
         return bool(self.done or self.lines)
 
 
-def test_it_is_run_once_a_request_and_told_where_the_robot_is_to_go(tmp_path: Path) -> None:
-    told = 'echo "$MAPWEAVE_ROBOT, $MAPWEAVE_KIND $MAPWEAVE_PORTAL, $MAPWEAVE_FLOOR, $MAPWEAVE_ASKED" >> told'
-    trial = Trial("sh", "-c", f"cd '{tmp_path}' && {told}")
+def test_it_is_run_once_a_request_and_knows_where_the_robot_is_to_go(tmp_path: Path) -> None:
+    report = (
+        'echo "$MAPWEAVE_ROBOT, $MAPWEAVE_KIND $MAPWEAVE_PORTAL, $MAPWEAVE_FLOOR, $MAPWEAVE_ASKED" >> report'
+    )
+    trial = Trial("sh", "-c", f"cd '{tmp_path}' && {report}")
     trial.command.see(None)
     eventually(lambda: trial.seen(PortalWait(LIFT)))
     assert trial.done == ["the portal command"] and trial.lines == []
     trial.command.see(PortalWait(LIFT, done=True))
     trial.done.clear()
     eventually(lambda: trial.seen(PortalWait(LIFT, asked=2)))
-    assert (tmp_path / "told").read_text() == "r0, lift east lift, 2, 1\nr0, lift east lift, 2, 2\n"
+    assert (tmp_path / "report").read_text() == "r0, lift east lift, 2, 1\nr0, lift east lift, 2, 2\n"
 
 
 @pytest.mark.parametrize(
@@ -59,7 +61,9 @@ def test_one_that_fails_leaves_the_robot_to_people(command: tuple[str, ...], lin
     assert len(trial.lines) == 1, "it is not tried again"
 
 
-def test_one_that_hangs_is_ended_with_its_children_and_so_is_one_that_nobody_needs(tmp_path: Path) -> None:
+def test_one_that_hangs_is_ended_with_its_children_and_so_is_one_that_is_needed_no_more(
+    tmp_path: Path,
+) -> None:
     hang = f"echo $$ > '{tmp_path}/pid'; sleep 600 & wait"
     for leave in (False, True):
         trial = Trial("sh", "-c", hang)

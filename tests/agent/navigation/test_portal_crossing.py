@@ -84,7 +84,7 @@ def test_it_parks_asks_and_goes_on_from_where_it_sees_that_it_is(lift: Lift) -> 
     lift.carry()
     lift.trial.run(1.0, lambda: nav.given_up)
     assert nav.stage == Stage.PORTAL, "what it sees meanwhile is no reason to leave"
-    lift.crossing.told()
+    lift.crossing.taken_through()
     lift.trial.run(30.0, lambda: nav.progress == 1.0 or nav.tally.edges > 1)
     looks = [question for question in lift.trial.asked if isinstance(question, WhereAmI)]
     assert looks[-1].near == B, "it knows on which floor it is"
@@ -94,11 +94,11 @@ def test_it_parks_asks_and_goes_on_from_where_it_sees_that_it_is(lift: Lift) -> 
 
 def test_said_too_early_it_finds_itself_on_its_own_floor_says_so_and_asks_again(lift: Lift) -> None:
     lift.run_until_it_asks()
-    lift.crossing.told()
+    lift.crossing.taken_through()
     lift.run_until_it_asks(times=2)
     assert lift.trial.navigator.detail.startswith("I am still on this side of lift 'east lift'; at lift")
     lift.carry()
-    lift.crossing.told()
+    lift.crossing.taken_through()
     nav = lift.trial.navigator
     lift.trial.run(60.0, lambda: nav.fix is not None and nav.fix.node == B)
     assert nav.fix is not None and nav.fix.node == B
@@ -109,7 +109,7 @@ def test_where_nothing_is_known_it_asks_again_and_at_last_gives_up(home: World, 
     lift.run_until_it_asks()
     lift.carry()
     lift.seen_upstairs = False
-    lift.crossing.told()
+    lift.crossing.taken_through()
     lift.run_until_it_asks(times=2)
     nav = lift.trial.navigator
     assert nav.detail.startswith("I cannot find myself on floor 2; at lift 'east lift'")
@@ -122,7 +122,7 @@ def test_its_own_map_of_a_floor_that_looks_the_same_does_not_mislead_it(lift: Li
     lift.run_until_it_asks()
     lift.upstairs = lift.eyes.world
     lift.carry()
-    lift.crossing.told()
+    lift.crossing.taken_through()
     nav = lift.trial.navigator
     lift.trial.run(30.0, lambda: nav.fix is not None)
     assert nav.fix is not None and nav.fix.node == B
@@ -136,7 +136,7 @@ def test_a_robot_that_was_switched_off_at_a_portal_waits_there_and_looks_where_i
     lift.run_until_it_asks()
     assert {*lift.trial.commands} == {Command()} and not lift.trial.asked
     lift.carry()
-    lift.crossing.told()
+    lift.crossing.taken_through()
     nav = lift.trial.navigator
     lift.trial.run(30.0, lambda: nav.fix is not None)
     assert nav.fix is not None and nav.fix.node == B
