@@ -291,6 +291,10 @@ class Keys:
         """Under which a server is alive."""
         return self._of_server("alive", server)
 
+    def servers_alive(self) -> str:
+        """Likewise of every server."""
+        return f"{self.root}/server/*/alive"
+
     # Keys of a robot base.
 
     def robot_describe(self, robot: str) -> str:
