@@ -10,6 +10,7 @@ from copy import copy
 import numpy as np
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.node import EdgeId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -159,10 +160,18 @@ class Router:
                 apart = self.merged.set_apart.get(node.map)
                 why = f": {reason_of(retired)}" if retired is not None else ""
                 why = why or (f": map {node.map} is set apart, {apart}" if apart is not None else "")
-                return f"{name} {node} is not in the merged map{why}"
+                return f"{name} {node} is not in the merged map{why or self._nearest(node)}"
         if self.merged.component_of(start) != self.merged.component_of(goal):
             return f"{start} and {goal} are in parts of the map that nothing joins yet"
         return self.closed_goal(goal)
+
+    def _nearest(self, node: NodeId) -> str:
+        """Which maps or nodes there are instead of one that is not there."""
+        try:
+            self.merged.check(node)
+        except InvalidValue as error:
+            return f": {error}"
+        return ""
 
     def closed_goal(self, goal: NodeId) -> str:
         """Why a goal is closed, in words; empty if it is not."""

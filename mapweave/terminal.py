@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
 PLAIN_WIDTH = 10_000
 """Characters of a line that is not on a terminal: none is wrapped."""
@@ -74,11 +75,14 @@ class Bar:
         self._task = TaskID(0)
         self._detail = ""
         if console.is_terminal:
+            # Of a line that is too long the detail is cut, not the numbers.
+            whole, rest = Column(no_wrap=True), Column(no_wrap=True, overflow="ellipsis", ratio=1)
             columns = (
-                TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(),
-                TimeElapsedColumn(), TextColumn("{task.fields[detail]}", markup=False),
+                TextColumn("{task.description}", table_column=whole), BarColumn(20, table_column=whole),
+                MofNCompleteColumn(table_column=whole), TimeElapsedColumn(table_column=whole),
+                TextColumn("{task.fields[detail]}", markup=False, table_column=rest),
             )  # fmt: skip
-            self._bar = Progress(*columns, console=console, transient=transient)
+            self._bar = Progress(*columns, console=console, transient=transient, expand=True)
             self._task = self._bar.add_task(words, total=total, detail="")
 
     def __enter__(self) -> Bar:
