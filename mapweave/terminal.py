@@ -5,6 +5,7 @@ Rich takes a file for a terminal of 80 columns, wraps lines there, and reads `[w
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
@@ -30,6 +31,11 @@ def plain_or_terminal(stderr: bool = True, quiet: bool = False) -> Console:
     """A console that wraps nothing where there is no terminal."""
     stream = sys.stderr if stderr else sys.stdout
     return Console(file=stream, quiet=quiet, width=None if stream.isatty() else PLAIN_WIDTH)
+
+
+def log_with_time() -> None:
+    """Let warnings of any part be lines of the log, with the time like all others."""
+    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
 
 
 def stamped(line: str) -> str:

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -126,3 +127,18 @@ def test_a_long_detail_leaves_the_numbers_of_a_bar() -> None:
         bar.update(324, "11 nodes, 51 of 53 features left after 0.6 m; 36 landmarks in view are too few")
     last = file.getvalue().split("\r")[-1]
     assert "drive " in last and " 324/1475 " in last and "11 nodes, 51 of 53" in last and "…" in last
+
+
+@pytest.mark.parametrize("words", ["agent r0", "router", "server", "sim serve office"])
+def test_warnings_of_any_part_have_the_time(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`a tick took 459 ms instead of 100` stood without it among lines that have it."""
+
+    class Asked(Exception):
+        pass
+
+    def asked(**options: str) -> None:
+        raise Asked(time.strftime(options["datefmt"]) + options["format"].removeprefix("%(asctime)s"))
+
+    monkeypatch.setattr("logging.basicConfig", asked)
+    with pytest.raises(Asked, match=f"^{STAMP}"):
+        main(words.split())
