@@ -45,7 +45,7 @@ def reach(settings: BusSettings, advice: str = "give --connect") -> ZenohBus:
 
 
 def _listens(endpoint: str) -> bool:
-    """Whether somebody takes a connection there."""
+    """Whether a program takes connections there."""
     host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), LOOK):
