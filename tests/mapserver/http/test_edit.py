@@ -18,6 +18,7 @@ from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredArea, RetiredMap
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.store import Store
@@ -261,6 +262,19 @@ def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, t
     person.edit("floor", "upstairs", label="upper")
     person.apply()
     assert annotation(server).body == Floor(FIRST, "upper") and annotation(server).name == str(B)
+    person.fill("edit-nodes", f"{LAST} {FIRST}")
+    assert "a lift leads to another floor" in person.edit(
+        "portal", "the only way up", name="east lift", means="lift"
+    )
+    person.fill("edit-nodes", str(LAST))
+    person.edit("floor", "downstairs", label="ground")
+    person.apply()
+    person.fill("edit-nodes", f"{LAST} {FIRST}")
+    said = person.edit("portal", "the only way up", name="east lift", means="lift", note="key at the desk")
+    assert "only checked, nothing is changed: portal east lift" in said
+    person.apply()
+    assert annotation(server).body == Portal(LAST, FIRST, PortalMeans.LIFT, "key at the desk")
+    person.fill("edit-nodes", str(FIRST))
     person.edit("pin", "the door is here")
     person.apply()
     held = annotation(server).body
