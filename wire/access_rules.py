@@ -21,8 +21,8 @@ ASKS = (
 COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})
 """Those that change something."""
 WATCHES = ("liveliness_query", "declare_liveliness_subscriber")
-OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve", "status"})
-"""Those of robots."""
+OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve"})
+"""Those of robots, each in its own name."""
 
 
 def access_control(keys: Keys, access: Access, certified: bool) -> dict[str, object]:
@@ -82,8 +82,8 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/drive",
                   f"{base}/describe", f"{base}/step"]),
         *_reads([*addressed, f"{keys.root}/server/*/alive", f"{base}/driver/*", f"{agent}/alive/*"]),
-        *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
-                f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
+        *_asks([*addressed, *(keys.in_name_of(name, f"{keys.root}/server/*/{what}") for what in sorted(OF_ROBOTS)),
+                f"{keys.root}/server/*/status", f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
     ]  # fmt: skip
 
 
