@@ -1,13 +1,14 @@
 """What one robot may send and ask: more waits, so that a robot that floods the server harms itself.
 
-Nothing is lost by a quota. A change that is held back is not acknowledged: it stays on the robot's disk and is
-pulled later. A question is refused with a time to retry.
+Nothing is lost by a quota. A change that is held back is not acknowledged: it stays on the robot's disk and
+is pulled later. A question is refused with a time to retry.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -19,11 +20,13 @@ from mapweave.hybridmap.errors import Busy
 log = logging.getLogger(__name__)
 
 BURST = 20.0
-"""s of its rate that a robot may send or ask at once: a kilobyte of changes is a robot's minute."""
+"""s of its rate that a robot may send or ask at once: half an hour of mapping without a network."""
 CHANGE_BYTES = 16_384
-"""Of a change, on average. A node of an honest robot has 3 kB; its largest is 128 kB."""
+"""Of a change, on average. Those of the demo have 1 kB on average and 3.2 kB at most; 128 kB is allowed."""
 LANDMARKS = 500
-"""Of a node, on average over a robot's maps. An honest robot's have about 100, a photograph's at most 400."""
+"""Of a node, on average over a robot's maps. Those of the demo have 100, those of photographs at most 400."""
+MOST_ROBOTS = 4096
+"""Robots of which this is remembered: without keys, names cost nothing."""
 REMEMBERED = 10.0
 """s after which a robot that is within its quotas again is no longer shown."""
 
@@ -33,11 +36,11 @@ class QuotaSettings:
     """What the server takes of one robot at most.
 
     Attributes:
-        changes: of its maps, per second, over 20 s. A robot that maps sends about one in 2 s; the rest serves
-            a robot that sends what it has mapped without a network.
-        questions: per second, over 20 s. A robot asks two at most.
-        maps: that are not retired. A robot begins a new one when it cannot find itself in the last.
-        nodes: of its maps together. A robot makes one in 10 s.
+        changes: of its maps, per second, over 20 s. Robots of the demo send 0.7, and 8 within a second. More
+            is for those that send what they mapped without a network.
+        questions: per second, over 20 s. A robot asks one after the other.
+        maps: that are not retired. A robot begins one when it cannot find itself in its last.
+        nodes: of its maps together. Robots of the demo make one in 4 s.
     """
 
     changes: Annotated[float, Meta(gt=0.0)] = 50.0
@@ -80,17 +83,19 @@ class TokenBucket:
 
 @dataclass
 class _Excess:
-    """What was held back of one robot: how often by kind, and when last."""
+    """What was held back of one robot: how often by kind, and when last. And what it may ask."""
 
+    asked: TokenBucket
     counts: dict[str, int] = field(default_factory=dict)
     last: float = 0.0
-    asked: TokenBucket | None = None
 
 
 class Quotas:
     """Counts what is over the quotas, by robot, and admits questions. Thread-safe."""
 
-    def __init__(self, settings: QuotaSettings | None = None, clock: Callable[[], float] = lambda: 0.0) -> None:
+    def __init__(
+        self, settings: QuotaSettings | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         """Start with no robot.
 
         Args:
@@ -104,8 +109,10 @@ class Quotas:
 
     def hold_back(self, robot: str, what: str, count: int = 1) -> None:
         """Note that something of a robot is held back, and log it at each power of two."""
+        if not robot:
+            return
         with self._lock:
-            excess = self._robots.setdefault(robot, _Excess())
+            excess = self._excess(robot)
             before = excess.counts.get(what, 0)
             after = excess.counts[what] = before + count
             excess.last = self.clock()
@@ -122,9 +129,7 @@ class Quotas:
             return
         now = self.clock()
         with self._lock:
-            excess = self._robots.setdefault(robot, _Excess())
-            if excess.asked is None:
-                excess.asked = TokenBucket(self.settings.questions, now)
+            excess = self._excess(robot)
             wait = excess.asked.wait(1.0, now)
             if wait <= 0.0:
                 excess.asked.spend(1.0, now)
@@ -132,17 +137,20 @@ class Quotas:
         self.hold_back(robot, "questions")
         raise Busy(wait)
 
-    def words(self, robot: str) -> str:
-        """What is held back of a robot that was over its quotas just now; empty if it was not."""
-        with self._lock:
-            excess = self._robots.get(robot)
-            if excess is None or not excess.counts or self.clock() > excess.last + REMEMBERED:
-                return ""
-            held = ", ".join(f"{count} {what}" for what, count in sorted(excess.counts.items()))
-        return f"over its quota: {held} held back"
+    def _excess(self, robot: str) -> _Excess:
+        if robot not in self._robots:
+            if len(self._robots) >= MOST_ROBOTS:
+                del self._robots[next(iter(self._robots))]
+            self._robots[robot] = _Excess(TokenBucket(self.settings.questions, self.clock()))
+        return self._robots[robot]
 
-    def over(self) -> str:
-        """All robots that were over their quotas just now, in words; empty without any."""
+    def over(self) -> dict[str, str]:
+        """Robots that were over their quotas just now, with what is held back of each, in words."""
+        now = self.clock()
         with self._lock:
-            names = sorted(self._robots)
-        return "; ".join(f"{name} is {words}" for name in names if (words := self.words(name)))
+            return {
+                name: "over its quota: "
+                + ", ".join(f"{n} {what}" for what, n in sorted(excess.counts.items()))
+                for name, excess in sorted(self._robots.items())
+                if excess.counts and now <= excess.last + REMEMBERED
+            }

@@ -76,14 +76,15 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
 
 def _robot(keys: Keys, name: str) -> list[_Rule]:
     agent, base = f"{keys.root}/agent/{name}", f"{keys.root}/robot/{name}"
+    questions = [keys.in_name_of(name, f"{keys.root}/server/*/{what}") for what in sorted(OF_ROBOTS)]
     addressed = [f"{keys.root}/server/*/{what}/{name}" for what in ("ack", "poses")]
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/drive",
                   f"{base}/describe", f"{base}/step"]),
         *_reads([*addressed, f"{keys.root}/server/*/alive", f"{base}/driver/*", f"{agent}/alive/*"]),
-        *_asks([*addressed, *(keys.in_name_of(name, f"{keys.root}/server/*/{what}") for what in sorted(OF_ROBOTS)),
-                f"{keys.root}/server/*/status", f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
+        *_asks([*addressed, *questions, f"{keys.root}/server/*/status",
+                f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
     ]  # fmt: skip
 
 

@@ -3,8 +3,8 @@
 Transports must never wait for a handler: Zenoh stalls a whole session when a callback falls behind. So a
 callback only puts a task into this queue. The queue is bounded, and nothing is dropped silently: a message
 that finds it full is counted and logged (replication repairs it), a question is refused so that its asker
-knows, and liveliness news always find room, because they are not repeated. Robots take turns (`FairQueue`): one
-that floods a server waits for itself.
+knows, and liveliness news always find room, because they are not repeated. Robots take turns (`FairQueue`):
+one that floods a server waits for itself.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import MapId, check_name
+from mapweave.hybridmap.node import NAME, MapId, check_name
 
 VERSION = "1"
 MAX_EPOCH = 2**53
@@ -381,7 +381,7 @@ class Keys:
 def robot_of(key: str) -> str:
     """In whose name a message or a question comes: a robot's; empty for people and servers."""
     match key.split("/")[3:]:
-        case ["agent" | "robot", name, *_] | ["server", _, _, name]:
+        case ["agent" | "robot", name, *_] | ["server", _, _, name] if NAME.fullmatch(name):
             return name
         case _:
             return ""

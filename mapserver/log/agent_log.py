@@ -131,10 +131,6 @@ class AgentLog:
         """Whether a settled change was found damaged on the disk."""
         return any(first <= sequence <= last for _, first, last in self.damaged)
 
-    def rest(self, until: float) -> None:
-        """Pull nothing before this time, whatever is heard."""
-        self.resting_until = until
-
     def pulled(self, now: float, *, gained: bool) -> None:
         """A pull is over. After one that gained nothing the pause doubles."""
         self.pulling = False

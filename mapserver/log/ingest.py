@@ -3,8 +3,8 @@
     change -------> in order? -> store (commit) -> acknowledge -> on_change
     beacon -------> gap? ------> ask the agent's log for it, in chunks -> store ...
 
-Robots take turns, a few changes each, and have quotas (mapweave.mapserver.quotas): what is beyond them is dropped
-and pulled later, at the rate of the quota.
+Robots take turns, a few changes each, and have quotas (mapweave.mapserver.quotas): what is beyond them is
+dropped, and pulled later at the rate of the quota.
 
 A change that does not decode when it is published is treated as lost and pulled: it may have been damaged
 on the way. If it does not decode when it is pulled either, the agent's log itself has it like that, and it is
@@ -44,7 +44,7 @@ AT_ONE_TURN = 16
 QUOTA_PAUSE = 10.0
 """s after which a log is tried again that the robot's quota has no room for."""
 MOST_UNKNOWN = 1024
-"""Logs that were heard of and of which nothing has come; of more, those are forgotten that were silent longest."""
+"""Logs of which nothing has come but beacons; of more, the one that is silent longest is forgotten."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,9 +323,9 @@ class Ingest:
             del self._unknown[oldest], self._logs[oldest]
             self._pulls.forget(oldest)
 
-    def _refuse(self, map_id: MapId, log_id: int, reason: str) -> None:
-        """Notify an agent that its log is not taken."""
-        ack = Ack(map_id, log_id, 0, (Refusal(0, reason),), self._store.id)
+    def _refuse(self, map_id: MapId, log_id: int, reason: str, watermark: int = 0) -> None:
+        """Notify an agent that its log is not taken, or not beyond the watermark."""
+        ack = Ack(map_id, log_id, watermark, (Refusal(0, reason),), self._store.id)
         self._bus.publish(self._keys.ack(self._name, map_id.agent), ack.encode())
 
     def _apply(self, agent_log: AgentLog, entries: list[Entry], covered: int | None) -> None:
@@ -339,6 +339,9 @@ class Ingest:
             return
         fits, full = self._intakes.of(agent_log.map.agent).fitting(entries)
         if full:
+            self._rest(agent_log, full)
+            if not fits:
+                return
             covered = None if covered is None else entries[fits].sequence - 1
             entries = entries[:fits]
         try:
@@ -356,11 +359,13 @@ class Ingest:
         self._pass_on(applied.changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.
         self._acknowledge(agent_log)
-        if full:
-            self._quotas.hold_back(agent_log.map.agent, "nodes")
-            agent_log.forget_ahead()
-            agent_log.rest(time.monotonic() + QUOTA_PAUSE)
-            self._refuse(agent_log.map, agent_log.log_id, full)
+
+    def _rest(self, agent_log: AgentLog, reason: str) -> None:
+        """There is no room for more of a log now: it stays on the robot's disk."""
+        self._quotas.hold_back(agent_log.map.agent, "nodes")
+        agent_log.forget_ahead()
+        agent_log.resting_until = time.monotonic() + QUOTA_PAUSE
+        self._refuse(agent_log.map, agent_log.log_id, reason, agent_log.watermark)
 
     def _commit_failed(self, agent_log: AgentLog, error: MapweaveError) -> None:
         agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)

@@ -9,14 +9,12 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.quotas import CHANGE_BYTES, Quotas, TokenBucket
+from mapweave.mapserver.quotas import CHANGE_BYTES, MOST_ROBOTS, Quotas, TokenBucket
 from mapweave.wire.log_messages import MAX_ROWS
 
 WORTHWHILE = 16
 """Changes for which it is worth asking a robot; fewer wait until so many may come."""
 ADVICE = "retire maps with `mapweave map retire`, or raise in [quotas]"
-MOST_ROBOTS = 4096
-"""Robots whose rates are remembered: names cost nothing where robots have no keys."""
 MOST_UNMERGED = 1024
 """Changes of a robot that wait to be merged; further ones stay on its disk."""
 
@@ -34,6 +32,7 @@ class Intake:
         self._bytes = TokenBucket(rate * CHANGE_BYTES, now)
         self._beacons = TokenBucket(rate, now)
         self._current: AgentLog | None = None
+        self._nodes = self._landmarks = 0
         self._count()
 
     def beacon(self) -> bool:
@@ -110,7 +109,8 @@ class Intake:
     def _count(self) -> None:
         kept, retired = self._store.kept(self._agent), self._retired()
         counts = [count for map_id, count in kept.items() if map_id not in retired]
-        self._nodes, self._landmarks = (sum(count[k] for count in counts) for k in range(2))
+        self._nodes = sum(nodes for nodes, _ in counts)
+        self._landmarks = sum(landmarks for _, landmarks in counts)
 
 
 class Intakes:
