@@ -339,8 +339,8 @@ class Ingest:
             return
         fits, full = self._intakes.of(agent_log.map.agent).fitting(entries)
         if full:
-            self._rest(agent_log, full)
             if not fits:
+                self._rest(agent_log, full)
                 return
             covered = None if covered is None else entries[fits].sequence - 1
             entries = entries[:fits]
@@ -359,6 +359,8 @@ class Ingest:
         self._pass_on(applied.changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.
         self._acknowledge(agent_log)
+        if full:
+            self._rest(agent_log, full)
 
     def _rest(self, agent_log: AgentLog, reason: str) -> None:
         """There is no room for more of a log now: it stays on the robot's disk."""
