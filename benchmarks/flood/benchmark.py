@@ -3,15 +3,15 @@
     python -m benchmarks.flood [--seconds S] [--rate N] [--seed N] [--json]
 
 A real `mapweave server` process, over Zenoh on loopback. Four honest robots send a change a second with the
-real journal and replicator, and ask once a second where they are. First they are alone (`quiet`), then a fifth
-process floods the server, each time in another way: `changes`, `--rate` node puts a second and another map each
-200; `beacons`, as many of maps whose logs never answer; `questions`, relocalize, route and known from four
-threads without a pause.
+real journal and replicator, and ask once a second where they are. First they are alone (`quiet`), then a
+fifth process floods the server, each time in another way: `changes`, `--rate` node puts a second, and a new
+map each 200; `beacons`, as many of maps whose logs never answer; `questions`, relocalize, route and known
+from four threads without a pause.
 
 Of the honest robots: `ack_p50_ms` and `ack_p99_ms` from handing over a change to its acknowledgement;
 `answer_p50_ms` and `answer_p95_ms` from asking to an answer, refusals and their pauses included; `lost`,
-changes and questions that waited for 60 s in vain. Of the server at the end of each part: `rss_mb`, its memory,
-and `nodes` in the merged map; the honest robots have 80.
+changes and questions that waited for 60 s in vain. Of the server at the end of each part: `rss_mb`, its
+memory; `nodes` in the merged map, of which the honest robots have 80.
 """
 
 from __future__ import annotations

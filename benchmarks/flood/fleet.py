@@ -28,7 +28,7 @@ NODES = 20
 PATIENCE = 60.0
 """Longest wait for an acknowledgement or an answer, s."""
 PERIOD = 1.0
-"""s between two changes of a robot, and between two questions: a robot of the demo sends 0.7 changes a second,
+"""s between two changes of a robot, and between two questions: one of the demo sends 0.7 changes a second,
 and one that is lost asks as often."""
 
 

@@ -101,15 +101,11 @@ class Ingest:
         Raises:
             InvalidFile: the store cannot be read.
         """
-        self._bus = bus
-        self._keys = keys
-        self._store = store
-        self._name = check_name(server_name)
+        self._bus, self._keys, self._store, self._name = bus, keys, store, check_name(server_name)
         self._objection, self._taken = objection, tuple(taken)
         self._quotas, self._unmerged = quotas or Quotas(clock=time.monotonic), unmerged
-        self._on_change = on_change
+        self._on_change, self._counters = on_change, IngestCounters()
         self._settings = settings or IngestSettings()
-        self._counters = IngestCounters()
         self._logs: dict[MapId, AgentLog] = {}
         self._intakes = Intakes(store, self._quotas, retired)
         self._unknown: dict[MapId, None] = {}
@@ -118,8 +114,7 @@ class Ingest:
         self._declared: list[Closing] = []
         self._pullers = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="pull")
         self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
-        self._stopping = False
-        self._failure = ""
+        self._stopping, self._failure = False, ""
         maps = self._store.maps()
         stored = (change for map_id in maps for change in self._store.replay(map_id))
         if replay is not None:

@@ -24,6 +24,8 @@ def test_the_sbom_lists_every_pinned_package_and_is_the_same_each_time(tmp_path:
     assert made[0].read_bytes() == made[1].read_bytes()
     content = json.loads(made[0].read_text())
     assert content["bomFormat"] == "CycloneDX" and content["metadata"]["component"]["name"] == "mapweave"
-    pinned = [line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    pinned = [
+        line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line
+    ]
     listed = {(component["name"], component["version"]) for component in content["components"]}
     assert listed == {(name, version) for name, version in pinned} and len(pinned) > 50
