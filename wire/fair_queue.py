@@ -19,7 +19,7 @@ class FairQueue(Generic[_T]):
     """Round robin over senders; in order for each. It has no lock of its own.
 
     A full queue still takes from a sender that holds less than its share of it, so that one that floods it
-    loses its own things and nobody else's.
+    loses its own things alone.
     """
 
     def __init__(self, most: int, most_bytes: int) -> None:

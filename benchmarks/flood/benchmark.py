@@ -10,7 +10,7 @@ from four threads without a pause.
 
 Of the honest robots: `ack_p50_ms` and `ack_p99_ms` from handing over a change to its acknowledgement;
 `answer_p50_ms` and `answer_p95_ms` from asking to an answer, refusals and their pauses included; `lost`,
-changes and questions that waited for 60 s in vain. Of the server at the end of each part: `rss_mb`, its
+changes and questions that got none within 60 s. Of the server at the end of each part: `rss_mb`, its
 memory; `nodes` in the merged map, of which the honest robots have 80.
 """
 

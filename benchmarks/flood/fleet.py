@@ -66,7 +66,7 @@ class Room:
 
 @dataclass
 class Waits:
-    """How long robots waited, s, and how often in vain."""
+    """How long robots waited, s, and how often without an answer."""
 
     acks: list[float] = field(default_factory=list)
     answers: list[float] = field(default_factory=list)

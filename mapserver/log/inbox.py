@@ -32,14 +32,14 @@ class Inbox(Generic[_T]):
             self._changed.notify()
         return taken
 
-    def wake(self) -> None:
+    def interrupt(self) -> None:
         """End the wait."""
         with self._changed:
             self._woken = True
             self._changed.notify()
 
     def take(self, most: int, timeout: float) -> list[tuple[str, list[_T]]]:
-        """Wait for something; then so much at most, by robots, those first of whom there is least."""
+        """Wait for something; then so much at most, by robots: the one with the least comes first."""
         taken: dict[str, list[_T]] = {}
         with self._changed:
             self._changed.wait_for(lambda: len(self._items) or self._woken, min(timeout, LONGEST_WAIT))

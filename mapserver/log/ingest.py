@@ -152,7 +152,7 @@ class Ingest:
             declared.close()
         self._declared = []
         self._stopping = True
-        self._work.wake()
+        self._work.interrupt()
         if self._thread.is_alive():
             self._thread.join()
         self._pullers.shutdown(cancel_futures=True)

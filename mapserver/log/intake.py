@@ -133,7 +133,7 @@ class Intakes:
     def objection(self, map_id: MapId, known: Collection[MapId]) -> str:
         """Why a new map of a robot is not taken; empty if it is."""
         retired = self._retired()
-        living = sum(other.agent == map_id.agent and other not in retired for other in known)
-        if living < self._quotas.settings.maps:
+        kept = sum(other.agent == map_id.agent and other not in retired for other in known)
+        if kept < self._quotas.settings.maps:
             return ""
-        return f"{map_id.agent} has {living} maps here, which is its quota: {ADVICE} `maps`"
+        return f"{map_id.agent} has {kept} maps here, which is its quota: {ADVICE} `maps`"
