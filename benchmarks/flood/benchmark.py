@@ -133,7 +133,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args()
-    if options.seconds <= 0.0 or options.rate <= 0.0 or options.seed < 0:
+    if not (0.0 < options.seconds < math.inf and 0.0 < options.rate < math.inf) or options.seed < 0:
         parser.error("--seconds and --rate must be positive, --seed not negative")
     report = {"seed": options.seed, "cores": os.cpu_count(), "load_before": round(os.getloadavg()[0], 1)}
     with tempfile.TemporaryDirectory() as folder:
