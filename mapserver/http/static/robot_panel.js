@@ -33,7 +33,7 @@ export function listRobots(robots, select) {
     const choice = button(item, robot.robot, () => select(robot.robot));
     choice.dataset.robot = robot.robot;
     add(item, "span", ` ${word}`, kind);
-    if (robot.over_quota) add(item, "span", " over its quota", "bad");
+    if (robot.over_quota) add(item, "span", ", over its quota", "bad");
     const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
       robot.component < 0 ? "not on the map" : ""];
     item.append(" " + parts.filter(Boolean).join(", "));
