@@ -65,8 +65,8 @@ def test_a_robot_reserves_for_itself_alone(house: House) -> None:
     asker = house.bus()
     start = NodeId(*ROBOT, 1)
     for_r8 = encode(ReserveRequest("r8", start, Pose2(), ()))
-    (reply,) = asker.ask(KEYS.in_name_of("r7", KEYS.any_reserve()), for_r8, 20.0)
-    assert reply.error == "r7 reserves nothing for r8"
+    (reply,) = asker.ask(KEYS.in_name_of("r9", KEYS.any_reserve()), for_r8, 20.0)
+    assert reply.error == "r9 reserves nothing for r8"
     assert not asker.ask(KEYS.in_name_of("r8", KEYS.any_reserve()), for_r8, 20.0)[0].error
 
 
