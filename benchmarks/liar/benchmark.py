@@ -1,0 +1,175 @@
+"""Fleets of four robots of which one lies, in many ways: what becomes of the other three.
+
+    python -m benchmarks.liar [--seed N] [--ways NAME ...] [--json]
+
+Nothing is rendered (see `synthetic.wrong_geometry`); server, ingest, merge and relocalization are the real
+ones, and all that robots send and ask goes over a bus. Three robots map a house. A fourth one then sends its
+log, with one lie in it. When all is merged, and once more after the server was started again, the three are
+compared with what they have without the fourth robot: the links among their maps, the poses of their nodes,
+and the answers to lost robots. A lie is contained if links and answers are the same and no node has moved by
+more than it does for an honest fourth robot, or by 5 cm; it is named if the history that the page shows holds it against
+the robot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.liar.lies import WAYS, Lie, Map, Setting, bodies, honest, messages
+from benchmarks.liar.server import Answer, Seen, Served, difference
+from mapweave.hybridmap.node import MapId
+from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet, lost_views
+
+SCENE = "house"
+CLOCK, RADIUS, APART_S = "utc", 0.16, 10_000
+"""All robots have one clock; the honest ones drive one after the other."""
+MOVED_M = 0.05
+"""More than this moves no node of the others, m."""
+SAME_M = 0.1
+"""Two answers are the same if they are no farther apart, m."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of the others.
+
+    Attributes:
+        contained: whether they have what they would have without the robot that lies.
+        named: what the page says against that; empty if nothing.
+        max_pose_difference_m: of their nodes.
+        answers_changed: of those to lost robots.
+        links_changed: among their maps, gone or come.
+        alive: whether the server took all and answers.
+        seconds: until all was merged.
+    """
+
+    contained: bool
+    named: str
+    max_pose_difference_m: float
+    answers_changed: int
+    links_changed: int
+    alive: bool
+    seconds: float
+
+
+def draw(seed: int) -> tuple[Fleet, dict[MapId, Map]]:
+    """A fleet whose robots have clocks and footprints."""
+    fleet = draw_fleet(seed, SCENES[SCENE], Fault.NONE, stops=3)
+    maps: dict[MapId, Map] = {}
+    for number, (map_id, (nodes, edges)) in enumerate(fleet.maps.items()):
+        later = number * APART_S * 1_000_000_000
+        maps[map_id] = (
+            [replace(n, stamp_ns=n.stamp_ns + later, clock=CLOCK, radius=RADIUS) for n in nodes],
+            edges,
+        )
+    return fleet, maps
+
+
+def changed_answer(before: Answer, after: Answer) -> bool:
+    """Whether a lost robot is told less, something else, or something that is not true.
+
+    An answer where there was none is one more if it is right: true views of the fourth robot are no lie.
+    """
+    if before.found:
+        return not after.found or before.frame != after.frame or difference(before.pose, after.pose) > SAME_M
+    return after.found and not after.right
+
+
+def compared(before: Seen, after: Seen) -> tuple[float, int, int]:
+    """Greatest difference of a pose, m; answers and links that differ."""
+    if before.components != after.components:
+        moved = float("inf")
+    else:
+        moved = max(difference(pose, after.poses[node]) for node, pose in before.poses.items())
+    changed = sum(map(changed_answer, before.answers, after.answers))
+    return moved, changed, len(before.links ^ after.links)
+
+
+class Trial:
+    """Three honest robots whose maps are on a server's disk, and a fourth one."""
+
+    def __init__(self, seed: int, queries: int, folder: Path) -> None:
+        """Let the three map the house."""
+        fleet, self._maps = draw(seed)
+        self._others = {map_id: self._maps[map_id] for map_id in self._maps if map_id != ODD}
+        honest_truth = {node: pose for node, pose in fleet.truth.items() if node.map != ODD}
+        views = lost_views(replace(fleet, truth=honest_truth), SCENES[SCENE], queries, seed)
+        self._queries, self._truth = views, honest_truth
+        self._seed, self._folder = seed, folder
+        self._base = folder / "base"
+        with Served(self._base / "s0.sqlite") as served:
+            served.send({m: messages(m, bodies(content)) for m, content in self._others.items()})
+            served.settle()
+            self.before = served.seen(self._others, self._queries, self._truth)
+
+    def outcome(self, lie: Callable[[Setting], Lie], most_moved: float = MOVED_M) -> Outcome:
+        """Add the fourth robot, and compare; and again when the server was started again."""
+        rng = np.random.default_rng([self._seed, 0x11E])
+        told = lie(Setting(ODD, self._maps[ODD], self._others, rng))
+        folder = self._folder / "way"
+        shutil.copytree(self._base, folder)
+        began = time.monotonic()
+        with Served(folder / "s0.sqlite") as served:
+            taken = served.settle() and served.send(told.logs, told.extra) and served.settle()
+            seconds = time.monotonic() - began
+            alive = taken and served.alive()
+            first = compared(self.before, served.seen(self._others, self._queries, self._truth))
+        with Served(folder / "s0.sqlite") as served:
+            alive = served.settle() and alive
+            again = compared(self.before, served.seen(self._others, self._queries, self._truth))
+            named = served.named(ODD.agent)
+        shutil.rmtree(folder)
+        moved, answers, links = (max(pair) for pair in zip(first, again, strict=True))
+        contained = alive and moved <= most_moved and not answers and not links
+        return Outcome(contained, named, round(moved, 4), int(answers), int(links), alive, round(seconds, 2))
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.liar", description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, default=0, help="of the fleet (default 0)")
+    parser.add_argument("--queries", type=int, default=12, help="of lost robots (default 12)")
+    parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS), metavar="NAME")
+    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
+    arguments = parser.parse_args()
+    if arguments.seed < 0 or arguments.queries < 1:
+        parser.error("--seed must be at least 0, --queries at least 1")
+    console = Console(stderr=arguments.json)
+    outcomes: dict[str, Outcome] = {}
+    with tempfile.TemporaryDirectory() as folder, Progress(console=console) as progress:
+        task = progress.add_task("ways", total=len(arguments.ways) + 1)
+        trial = Trial(arguments.seed, arguments.queries, Path(folder))
+        beside = trial.outcome(honest)
+        for name in arguments.ways:
+            progress.advance(task)
+            outcomes[name] = trial.outcome(WAYS[name])
+            print(name, outcomes[name], flush=True) if not arguments.json else None
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    table = Table("way", "contained", "moved m", "answers", "links", "s", "the page says", title=f"one liar of four, seed {arguments.seed}")
+    for name, one in {"(honest)": beside, **outcomes}.items():
+        table.add_row(
+            name, "yes" if one.contained else "NO", f"{one.max_pose_difference_m:.3f}",
+            str(one.answers_changed), str(one.links_changed), f"{one.seconds:.1f}", one.named or "nothing",
+        )  # fmt: skip
+    console.print(table)
+    if arguments.json:
+        found = {name: {**asdict(one), "named": bool(one.named), "words": one.named} for name, one in outcomes.items()}
+        print(json.dumps({
+            "seed": arguments.seed, "ways": len(outcomes),
+            "contained": sum(one.contained for one in outcomes.values()),
+            "named": sum(bool(one.named) for one in outcomes.values()),
+            "peak_rss_mb": round(peak_mb), "honest": asdict(beside), "by_way": found,
+        }))  # fmt: skip
