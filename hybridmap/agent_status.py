@@ -15,6 +15,7 @@ from mapweave.hybridmap.pose import Pose2
 
 MAX_STATUS_WORDS = 500
 MAX_ROBOTS = 1024
+MAX_ACCUSATION = 1000
 Line = Annotated[str, Meta(max_length=MAX_STATUS_WORDS)]
 
 IDENTITY = Pose2()
@@ -129,6 +130,8 @@ class RobotEntry:
         component: number of that map's component; -1 if it is not known.
         place: the name of the place where it is; empty if it has none.
         floor: the floor of that map's component; empty if it is not known.
+        accusation: what the server holds against the newest of its maps with which something is wrong; empty
+            if there is none.
     """
 
     robot: Name
@@ -139,6 +142,7 @@ class RobotEntry:
     component: Annotated[int, Meta(ge=-1)] = NO_COMPONENT
     place: Annotated[str, Meta(max_length=64)] = ""
     floor: Annotated[str, Meta(max_length=256)] = ""
+    accusation: Annotated[str, Meta(max_length=MAX_ACCUSATION)] = ""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 
 from mapweave.hybridmap.agent_status import (
+    MAX_ACCUSATION,
     MAX_ROBOTS,
     NO_COMPONENT,
     AgentStatus,
@@ -66,6 +67,9 @@ class Roster:
         with self._turn:
             names = sorted({name for name, maps in self._alive.items() if maps} | self._heard.keys())
             heard, alive = dict(self._heard), {name for name, maps in self._alive.items() if maps}
+        against: dict[str, str] = {}
+        for map_id, words in sorted(merged.accusations().items()):
+            against[map_id.agent] = words[:MAX_ACCUSATION]
         entries = []
         for name in names[:MAX_ROBOTS]:
             status, at = heard.get(name, (None, now))
@@ -74,7 +78,10 @@ class Roster:
             if pose is not None:
                 place, floor = places.name_at(component, pose), places.floor_of(component)
             age = max(now - at, 0.0)
-            entries.append(RobotEntry(name, name in alive, age, status, pose, component, place, floor))
+            accusation = against.get(name, "")
+            entries.append(
+                RobotEntry(name, name in alive, age, status, pose, component, place, floor, accusation)
+            )
         return FleetStatus(tuple(entries))
 
     def _take(self, sample: Sample) -> None:

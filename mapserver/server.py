@@ -136,6 +136,7 @@ class MapServer:
         self._ingest = Ingest(
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
+            worker.note_refusal,
         )  # fmt: skip
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,

@@ -7,8 +7,8 @@ ones, and all that robots send and ask goes over a bus. Three robots map a house
 log, with one lie in it. When all is merged, and once more after the server was started again, the three are
 compared with what they have without the fourth robot: the links among their maps, the poses of their nodes,
 and the answers to lost robots. A lie is contained if links and answers are the same and no node has moved by
-more than it does for an honest fourth robot, or by 5 cm; it is named if the history that the page shows holds it against
-the robot.
+more than 5 cm: an honest fourth robot moves them by 2 to 3 cm. It is named if the history that the page shows
+holds it against the robot.
 """
 
 from __future__ import annotations
@@ -158,7 +158,16 @@ def main() -> None:
             outcomes[name] = trial.outcome(WAYS[name])
             print(name, outcomes[name], flush=True) if not arguments.json else None
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    table = Table("way", "contained", "moved m", "answers", "links", "s", "the page says", title=f"one liar of four, seed {arguments.seed}")
+    table = Table(
+        "way",
+        "contained",
+        "moved m",
+        "answers",
+        "links",
+        "s",
+        "the page says",
+        title=f"one liar of four, seed {arguments.seed}",
+    )
     for name, one in {"(honest)": beside, **outcomes}.items():
         table.add_row(
             name, "yes" if one.contained else "NO", f"{one.max_pose_difference_m:.3f}",
@@ -166,7 +175,10 @@ def main() -> None:
         )  # fmt: skip
     console.print(table)
     if arguments.json:
-        found = {name: {**asdict(one), "named": bool(one.named), "words": one.named} for name, one in outcomes.items()}
+        found = {
+            name: {**asdict(one), "named": bool(one.named), "words": one.named}
+            for name, one in outcomes.items()
+        }
         print(json.dumps({
             "seed": arguments.seed, "ways": len(outcomes),
             "contained": sum(one.contained for one in outcomes.values()),

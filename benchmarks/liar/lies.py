@@ -154,7 +154,7 @@ def covariance_of_1e12(s: Setting) -> Lie:
 
 def greatest_covariance(s: Setting) -> Lie:
     """Wrong steps, of each of which the robot knows nothing: the greatest covariance that a message holds."""
-    nodes, edges = s.own
+    nodes, _ = s.own
     poses = [Pose2.from_vector(s.rng.uniform(-50.0, 50.0, 3)) for _ in nodes]
     return Lie({s.map: messages(s.map, bodies(chain(s, nodes, poses, 0.99 * MAX_VARIANCE * np.eye(3))))})
 

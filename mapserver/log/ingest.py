@@ -62,6 +62,13 @@ class _Pulled:
 
 PULLS_AT_ONCE = 4
 """Logs that are pulled at once."""
+MOST_AHEAD = 10_000_000
+"""Changes that a server may lack of a log: a robot makes about one a second, and a year has 3e7."""
+
+
+def words_of(refusal: Refusal) -> str:
+    """Which change is refused, and why."""
+    return f"change {refusal.sequence} is refused ({refusal.reason})"
 
 
 class Ingest:
@@ -78,6 +85,7 @@ class Ingest:
         replay: Callable[[Iterable[Change]], None] | None = None,
         objection: Callable[[ChangeBody], str] = lambda body: "",
         taken: Collection[MapId] = (),
+        note_refusal: Callable[[MapId, str], None] = lambda map_id, reason: None,
     ) -> None:
         """Replay the store, then listen.
 
@@ -93,6 +101,7 @@ class Ingest:
             replay: called instead with all that is in the store at once, map by map.
             objection: why a change cannot be of the map whose name it has; its log is refused then.
             taken: maps that are here and not in the store: no new one may have their names.
+            note_refusal: called for a map of which a change was refused or is not believed, with the reason.
 
         Raises:
             InvalidFile: the store cannot be read.
@@ -102,7 +111,7 @@ class Ingest:
         self._store = store
         self._name = check_name(server_name)
         self._objection, self._taken = objection, tuple(taken)
-        self._on_change = on_change
+        self._on_change, self._note_refusal = on_change, note_refusal
         self._settings = settings or IngestSettings()
         self._counters = IngestCounters()
         self._logs: dict[MapId, AgentLog] = {}
@@ -121,6 +130,8 @@ class Ingest:
         for map_id in maps:
             watermark, log_id = self._store.watermark(map_id), self._store.log_id(map_id) or 0
             refusals = tuple(self._store.refusals(map_id))
+            for refusal in refusals[:1]:
+                self._note_refusal(map_id, words_of(refusal))
             self._logs[map_id] = AgentLog(
                 map_id, log_id, self._settings.pull, watermark, watermark, refusals=refusals,
                 damaged=self._store.damaged(map_id),
@@ -207,7 +218,7 @@ class Ingest:
         agent_log = self._log(map_id, mark.log_id)
         if agent_log is None:
             return None
-        agent_log.newest = max(agent_log.newest, mark.sequence)
+        self._believe(agent_log, mark.sequence)
         if mark.sequence <= agent_log.watermark or mark.sequence in agent_log.ahead:
             self._count(doubled=1)
             return agent_log
@@ -226,7 +237,7 @@ class Ingest:
         agent_log = self._log(map_id, head.log_id)
         if agent_log is None:
             return None
-        agent_log.newest = max(agent_log.newest, head.newest)
+        self._believe(agent_log, head.newest)
         agent_log.heard(time.monotonic())
         # More than there is: it was another store that had it.
         if head.acknowledged.get(self._name, 0) != agent_log.watermark:
@@ -299,6 +310,18 @@ class Ingest:
         self._refuse(map_id, log_id, f"another log goes by the name {map_id} here: begin a fresh map")
         return None
 
+    def _believe(self, agent_log: AgentLog, newest: int) -> None:
+        """Take note of a sequence number.
+
+        Raises:
+            InvalidMessage: no log is as long.
+        """
+        if newest > agent_log.watermark + MOST_AHEAD:
+            reason = f"change {newest} is announced, where {agent_log.watermark} have come"
+            self._note_refusal(agent_log.map, reason)
+            raise InvalidMessage(f"{agent_log.map}: {reason}")
+        agent_log.newest = max(agent_log.newest, newest)
+
     def _refuse(self, map_id: MapId, log_id: int, reason: str) -> None:
         """Notify an agent that its log is not taken."""
         ack = Ack(map_id, log_id, 0, (Refusal(0, reason),), self._store.id)
@@ -323,6 +346,7 @@ class Ingest:
         agent_log.settled(applied)
         for refusal in applied.refusals:
             log.warning("refused %s %d: %s", agent_log.map, refusal.sequence, refusal.reason)
+            self._note_refusal(agent_log.map, words_of(refusal))
         self._count(applied=len(applied.changes), refused=len(applied.refusals))
         self._pass_on(applied.changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.
