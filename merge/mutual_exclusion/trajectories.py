@@ -67,13 +67,13 @@ BACKWARDS = 1.0
 
 
 def runs_backwards(nodes: Collection[Node]) -> bool:
-    """Whether the clock of one robot's nodes does, which have numbers in the order in which they were made."""
+    """Whether the clock of a robot's nodes does: they are numbered in the order in which they were made."""
     times = _seconds(sorted(nodes, key=lambda node: node.id))
     return bool(len(times) and (np.maximum.accumulate(times) - times).max() > BACKWARDS)
 
 
 def trajectories_of(nodes: Collection[Node]) -> tuple[RobotTrajectory, ...]:
-    """The trajectories of one robot's nodes, one a clock; clocks that are unknown or run backwards are left out."""
+    """The trajectories of one robot's nodes, one a clock, without clocks unknown or running backwards."""
     by_clock: dict[str, list[Node]] = {}
     for node in nodes:
         if node.clock:

@@ -127,7 +127,8 @@ class MergedMap:
             nodes.
         faded: (N,) of nodes, which of their landmarks have faded, see
             mapweave.merge.map_maintenance.landmark_removal. Nodes without faded landmarks are left out.
-        set_apart: maps that are not among these, because the merge fails with them or they are copies, and why.
+        set_apart: maps that are not among these, because the merge fails with them or they are copies, and
+            why.
         implausible: maps in which is what no robot can have measured, and what; see
             mapweave.mapserver.merging.plausibility.
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
