@@ -9,8 +9,9 @@ from typing import Protocol
 import numpy as np
 
 from mapweave.hybridmap.constraint_subject import RetiredWindow
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
+from mapweave.mapserver.plausibility import fragments
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.wire_limits import FARTHEST
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -76,31 +77,18 @@ class ActiveNodes:
         return bounded(without_faded(found_node, self._merged))
 
 
-LEAST_NODES = 4
-"""A map of fewer nodes that its robot has left for a new one is a fragment: its geometry cannot be tested."""
-
-
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
     """Nodes of maps with wrong geometry, implausible maps and fragments that show places of other maps.
 
     Each is at the same place as the node that it is linked to, seen by a robot whose map has it elsewhere: it
     is no second place where a robot could be. Unlinked nodes of such a map are still used.
     """
-    wrong = {*merged.wrong, *merged.implausible, *_fragments(merged)}
+    wrong = {*merged.wrong, *merged.implausible, *fragments(merged.maps)}
     for refusal in merged.refused if wrong else ():
         if refusal.link is not None and not refusal.link.within:
             ends = [node for node in refusal.pair if node.map in wrong]
             if len(ends) == 1:
                 yield ends[0]
-
-
-def _fragments(merged: MergedMap) -> Iterator[MapId]:
-    newest: dict[str, int] = {}
-    for map_id in merged.maps:
-        newest[map_id.agent] = max(map_id.epoch, newest.get(map_id.agent, 0))
-    for map_id, hybrid_map in merged.maps.items():
-        if map_id.epoch < newest[map_id.agent] and len(hybrid_map.nodes) < LEAST_NODES:
-            yield map_id
 
 
 def _out_of_range(merged: MergedMap) -> Iterator[NodeId]:

@@ -38,8 +38,6 @@ CLOCK, RADIUS, APART_S = "utc", 0.16, 10_000
 """All robots have one clock; the honest ones drive one after the other."""
 MOVED_M = 0.05
 """More than this moves no node of the others, m."""
-SAME_M = 0.1
-"""Two answers are the same if they are no farther apart, m."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +82,7 @@ def changed_answer(before: Answer, after: Answer) -> bool:
     An answer where there was none is one more if it is right: true views of the fourth robot are no lie.
     """
     if before.found:
-        return not after.found or before.frame != after.frame or difference(before.pose, after.pose) > SAME_M
+        return not after.found or not before.agrees(after) or before.right > after.right
     return after.found and not after.right
 
 

@@ -27,7 +27,7 @@ SURE = np.diag([0.015, 0.015, 0.008]) ** 2
 """Covariance of an edge that looks well measured, m^2 and rad^2."""
 OFF_M = 2.0
 """By which copied places are torn apart."""
-EPOCHS = 120
+EPOCHS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ def many_epochs(s: Setting) -> Lie:
     logs = {}
     for k in range(EPOCHS):
         which = replace(s, map=MapId(s.map.agent, s.map.epoch + k))
-        some = [s.own[0][n] for n in s.rng.choice(len(s.own[0]), 3, replace=False)]
+        some = [s.own[0][n] for n in sorted(s.rng.choice(len(s.own[0]), 3, replace=False))]
         poses = [Pose2.from_vector(s.rng.uniform(-4.0, 4.0, 3)) for _ in some]
         logs[which.map] = messages(which.map, bodies(chain(which, some, poses)))
     return Lie(logs)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
+
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
+from mapweave.mapserver.relocalization.verdict import FLOOR_HEADING, FLOOR_XY, GATE
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Request, Sample
@@ -28,6 +31,9 @@ AT_ONCE = 64
 """Changes in one answer for a part of a log."""
 
 
+NOWHERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
+
+
 @dataclass(frozen=True, eq=False)
 class Answer:
     """To a lost robot.
@@ -41,8 +47,15 @@ class Answer:
 
     found: bool
     frame: NodeId | None = None
-    pose: Pose2 = field(default_factory=Pose2)
+    pose: PoseGaussian = NOWHERE
     right: bool = False
+
+    def agrees(self, other: Answer) -> bool:
+        """Whether two answers say the same, within what they are certain of."""
+        off = self.pose.inverse() @ other.pose
+        spread = off.covariance + np.diag([FLOOR_XY**2, FLOOR_XY**2, FLOOR_HEADING**2])
+        vector = off.mean.vector
+        return self.frame == other.frame and float(vector @ np.linalg.solve(spread, vector)) < GATE
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +173,9 @@ class Served:
         if first is None:
             # On a map of the fourth robot alone: what is told is of no use to the others, true or not.
             return Answer(True)
-        pose = merged.pose(first).inverse() @ merged.pose(best.node) @ best.node_from_robot.mean
-        return Answer(True, first, pose, (truth[first] @ pose).distance(at) < RIGHT_M)
+        way = merged.pose(first).inverse() @ merged.pose(best.node)
+        pose = PoseGaussian(way, np.zeros((3, 3))) @ best.node_from_robot
+        return Answer(True, first, pose, (truth[first] @ pose.mean).distance(at) < RIGHT_M)
 
     def _hear(self, sample: Sample) -> None:
         ack = Ack.decode(sample.payload)

@@ -13,12 +13,13 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.mapserver.merging.copies import Copies
 from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import NodeComparisons
-from mapweave.mapserver.merging.plausibility import Copies, implausible
 from mapweave.mapserver.merging.verification_cache import VerificationCache
+from mapweave.mapserver.plausibility import implausible, scattered
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
@@ -242,7 +243,8 @@ class Merger:
     ) -> MergedMap:
         kept = {map_id: self._kept[map_id] for map_id in maps}
         merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins)
-        odd = {which: reason for which, reason in self._implausible.items() if reason} | self._refused
+        odd = {which: reason for which, reason in self._implausible.items() if reason}
+        odd |= scattered(kept) | self._refused
         merged = replace(
             merged,
             set_apart=self._set_apart(),

@@ -15,8 +15,7 @@ Clutter and wrong depths are seen through at true places too. Their share is mea
 placed by its own links. Unobserved placements are not refuted, and the map may be right: it may have a room
 that only looks like theirs.
 
-A map that is only a little wrong is seen through nowhere. But then each of its links puts it nearly where all
-others do, and no second room is so near to the first: it is at that one place, and is bent.
+A map that is only a little wrong is seen through nowhere: see `mapweave.merge.outlier_rejection.bent_maps`.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ from scipy.special import bdtrc
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
+from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
@@ -40,15 +40,12 @@ from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import WrongGeometry
 from mapweave.merge.settings import ConsistencySettings
-from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
+from mapweave.registration.pose_arrays import PoseGaussians
 
 MOST_LINKS = 60
 """Links between two pieces of map that are tested, evenly chosen: pairs of links grow by the square."""
 MOST_PARTNERS = 5
 """Maps against which one is held: those with which it has most links."""
-AGREEING = 0.9
-"""Two maps agree if this share of their links do: a few are false. Sound maps of the benchmark have 0.97 and
-more, those of a robot with wrong geometry up to 0.75."""
 LEAST_SHARE = 0.25
 """A set of links is a placement if it has this share of the links of the largest set."""
 RARE = 0.05
@@ -69,10 +66,6 @@ SIGMAS, MARGIN = 3.0, 0.2
 """What lies behind a landmark by more than so many sigmas, and so many m, is behind it."""
 AROUND = 0.03
 """Two landmarks are in the same direction if they are so near to each other, rad."""
-
-BENT_XY, BENT_HEADING = 1.5, math.radians(30.0)
-"""Placements that differ by less are of one place, m and rad: rooms that look alike are at least as far apart
-as one is wide, and doors are 0.9 m wide alone."""
 
 UNSOLVABLE = (ArithmeticError, RuntimeError, ValueError)
 """What solvers raise for a map whose numbers they cannot take. Nothing is found out about it then."""
@@ -262,7 +255,7 @@ def all_refuted(
     """
     if not _nodes_agree(links, fixed):
         return False
-    if _is_bent(links, placed, fixed):
+    if is_bent(links, placed, fixed):
         return True
     sets = link_sets(links, placed, fixed, s)
     sets = [some_links for some_links in sets if len(some_links) >= LEAST_SHARE * len(sets[0])]
@@ -300,29 +293,6 @@ def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
         for placement in rest
     ]
     return len(agree) >= LEAST_NODES and sum(agree) >= AGREEING * len(agree)
-
-
-def _is_bent(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> bool:
-    """Whether a map can be placed so that nearly all links have their nodes nearly there.
-
-    Args:
-        links: from `placed` to `fixed`, which contradict each other.
-        placed: piece of map.
-        fixed: piece of map.
-    """
-    own = compose_poses(
-        fixed.graph.means[fixed.graph.index([link.b for link in links])],
-        inverse_poses(np.stack([link.a_from_b.mean.vector for link in links])),
-    )
-    inside = placed.graph.means[placed.graph.index([link.a for link in links])]
-    placements = compose_poses(own, inverse_poses(inside))
-    for placement in placements:
-        off = compose_poses(inverse_poses(own), compose_poses(placement[None], inside))
-        near = np.hypot(off[:, 0], off[:, 1]) < BENT_XY
-        near &= np.abs(off[:, 2]) < BENT_HEADING
-        if near.mean() >= AGREEING:
-            return True
-    return False
 
 
 def _more(shares: Array, usual: Array) -> bool:

@@ -130,7 +130,7 @@ class MergedMap:
         set_apart: maps that are not among these, because the merge fails with them or they are copies, and
             why.
         implausible: maps in which is what no robot can have measured, and what; see
-            mapweave.mapserver.merging.plausibility.
+            mapweave.mapserver.plausibility.
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
         contradicted: links by hand that the rest of the map contradicts, by their nodes, and how.
         pins: people's pins of components' frames, oldest first.

@@ -1,31 +1,12 @@
-"""Plausibility: what is in a map that no robot can have measured, in words.
-
-Such a map is merged as far as its links carry it, but it is no second place: where it shows what other maps
-show, and is not joined with them, it makes no answer ambiguous (mapweave.mapserver.active_nodes).
-"""
+"""Copies: nodes whose landmarks are other robots', bit by bit."""
 
 from __future__ import annotations
 
-from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import CODE_BYTES, MapId, Node, NodeId
-from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
-from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
 
 LEAST_COPIED = 10
 """Landmarks with the same descriptor, bit by bit: as many as a recognition needs. Two images of a thing never
 give the same 32 numbers as often."""
-
-
-def implausible(hybrid_map: HybridMap) -> str:
-    """What no robot can have measured; empty if all of a map may be true."""
-    nodes = sorted(hybrid_map.nodes.values(), key=lambda node: node.id)
-    most = max(nodes, key=lambda node: len(node.landmarks), default=None)
-    if most is not None and len(most.landmarks) > MOST_LANDMARKS:
-        return f"node {most.id} has {len(most.landmarks)} landmarks, of which {MOST_LANDMARKS} are compared"
-    for clock in sorted({node.clock for node in nodes} - {""}):
-        if runs_backwards([node for node in nodes if node.clock == clock]):
-            return f"its clock {clock} runs backwards: nothing is concluded from its times"
-    return ""
 
 
 def copied_landmarks(a: Node, b: Node) -> int:
