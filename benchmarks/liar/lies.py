@@ -85,13 +85,14 @@ def messages(map_id: MapId, changes: Sequence[ChangeBody]) -> list[bytes]:
 
 
 def chain(setting: Setting, nodes: Sequence[Node], poses: Sequence[Pose2], covariance: Array = SURE) -> Map:
-    """Nodes at poses of one's choice, with the edges that a drive would have measured."""
+    """Nodes at poses of one's choice, with the edges and the times that a drive would have."""
     out: list[Node] = []
     edges: list[Edge] = []
     for k, (node, pose) in enumerate(zip(nodes, poses, strict=True)):
         # The frame of a map is its first node's.
         at = PoseGaussian(poses[0].inverse() @ pose, SURE if k else np.zeros((3, 3)))
-        out.append(replace(node, id=setting.id(2 * k + 1), map_from_robot=at))
+        stamp = setting.own[0][0].stamp_ns + 2_000_000_000 * k
+        out.append(replace(node, id=setting.id(2 * k + 1), stamp_ns=stamp, map_from_robot=at))
         if k:
             step = PoseGaussian(poses[k - 1].inverse() @ pose, covariance)
             edges.append(Edge(setting.id(2 * k), out[-2].id, out[-1].id, step, EdgeKind.MAPPED))

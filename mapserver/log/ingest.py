@@ -123,6 +123,9 @@ class Ingest:
         self._failure = ""
         maps = self._store.maps()
         stored = (change for map_id in maps for change in self._store.replay(map_id))
+        for map_id in maps:
+            for refusal in self._store.refusals(map_id)[:1]:
+                self._note_refusal(map_id, words_of(refusal))
         if replay is not None:
             replay(stored)
         for change in stored:
@@ -130,8 +133,6 @@ class Ingest:
         for map_id in maps:
             watermark, log_id = self._store.watermark(map_id), self._store.log_id(map_id) or 0
             refusals = tuple(self._store.refusals(map_id))
-            for refusal in refusals[:1]:
-                self._note_refusal(map_id, words_of(refusal))
             self._logs[map_id] = AgentLog(
                 map_id, log_id, self._settings.pull, watermark, watermark, refusals=refusals,
                 damaged=self._store.damaged(map_id),

@@ -125,7 +125,11 @@ class Fleet:
         self.server_bus, self.bus = MemoryBus(hub), MemoryBus(hub)
         self.acks: list[Ack] = []
         self.server = MapServer(self.server_bus, KEYS, path, "s0").__enter__()
-        self.bus.subscribe(KEYS.acks(BAD.agent), lambda sample: self.acks.append(Ack.decode(sample.payload)))
+        self.acks_of(BAD.agent)
+
+    def acks_of(self, agent: str) -> None:
+        """Hear the acknowledgements for a robot."""
+        self.bus.subscribe(KEYS.acks(agent), lambda sample: self.acks.append(Ack.decode(sample.payload)))
 
     def ask(self, key: str, payload: bytes) -> Reply:
         (reply,) = self.bus.ask(key, payload, 20.0)
