@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.agent_status import AgentStatus, Status
-from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.limits import MAX_NUMBER
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEventKind
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty
+from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.log.entry import unmeasurable
 from mapweave.mapserver.merging.copies import Copies, copied_landmarks
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.plausibility import MOST_FRAGMENTS
+from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.wire.codec import decode_change
 from mapweave.wire.log_messages import Head
 from mapweave.wire.messages import encode
@@ -32,6 +38,7 @@ from tests.mapserver.test_set_apart import (
     stored,
     whereabouts,
 )
+from tests.mapserver.test_set_apart import views as lost
 from tests.waiting import eventually
 
 FIRST, LAST = MapId("a", 1), MapId("z", 1)
@@ -154,3 +161,35 @@ def test_edges_that_no_robot_measures() -> None:
         pose = PoseGaussian(Pose2(x), variance * np.eye(3))
         edge = Edge(NodeId(*LAST, 2), *ends, pose, EdgeKind.DRIVEN)
         assert words in unmeasurable(EdgePut(edge)) and bool(words) == bool(unmeasurable(EdgePut(edge)))
+
+
+def test_fragments_make_no_answer_ambiguous() -> None:
+    """A robot begins map after map, each with two views of the room and a wrong way between them."""
+    merger = Merger()
+    for log in sound_logs().values():
+        for message in log:
+            merger.on_change(decode_change(message))
+    first = Answers.of(merger, merger.merged(), merger.node).relocalizer
+    assert [first.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+    for epoch in range(1, MOST_FRAGMENTS + 2):
+        map_id = MapId(LAST.agent, epoch)
+        for number, body in enumerate(views(map_id, Pose2(1.0, 2.0, 0.5), STEP)[:3], start=1):
+            merger.on_change(Change(map_id, number, 0, body))
+    merged = merger.merged()
+    assert list(merged.implausible) == [LAST]
+    # The newest map is no fragment yet.
+    merger.constrain(ManualConstraints([ManualConstraint(RetiredMap(map_id), True, "anna", 1)]))
+    relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
+    assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+
+
+def test_nothing_is_concluded_from_a_clock_that_runs_backwards() -> None:
+    nodes = [
+        replace(node, stamp_ns=k * 10**10, clock="utc")
+        for k, node in enumerate(take_map(WORLD, LAST, TOUR, np.random.default_rng(8))[0])
+    ]
+    assert len(trajectories_of(nodes)) == 1
+    for back, known in ((0.9, True), (1.1, False)):
+        late = replace(nodes[1], stamp_ns=nodes[0].stamp_ns - round(back * 1e9) + 10**10)
+        ahead = replace(nodes[0], stamp_ns=10**10)
+        assert len(trajectories_of([ahead, late])) == known
