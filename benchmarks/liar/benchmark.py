@@ -1,6 +1,6 @@
 """Fleets of four robots of which one lies, in many ways: what becomes of the other three.
 
-    python -m benchmarks.liar [--seed N] [--ways NAME ...] [--json]
+    python -m benchmarks.liar [--seed N] [--ways NAME ...] [--without RULE] [--json]
 
 Nothing is rendered (see `synthetic.wrong_geometry`); server, ingest, merge and relocalization are the real
 ones, and all that robots send and ask goes over a bus. Three robots map a house. A fourth one then sends its
@@ -30,7 +30,15 @@ from rich.table import Table
 
 from benchmarks.liar.lies import WAYS, Lie, Map, Setting, bodies, honest, messages
 from benchmarks.liar.server import Answer, Seen, Served, difference
+from benchmarks.rules.switches import Switch, switched_off
 from mapweave.hybridmap.node import MapId
+from mapweave.mapserver import active_nodes
+from mapweave.mapserver.log import entry
+from mapweave.mapserver.merging import merger
+from mapweave.mapserver.merging.copies import Copies
+from mapweave.merge.mutual_exclusion import trajectories
+from mapweave.merge.outlier_rejection import distinctness, wrong_geometry
+from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet, lost_views
 
 SCENE = "house"
@@ -38,6 +46,23 @@ CLOCK, RADIUS, APART_S = "utc", 0.16, 10_000
 """All robots have one clock; the honest ones drive one after the other."""
 MOVED_M = 0.05
 """More than this moves no node of the others, m."""
+
+
+RULES: dict[str, tuple[Switch, ...]] = {
+    "two sources of aliasing": ((distinctness, "ENOUGH", 1),),
+    "wrong geometry": ((WrongGeometrySearch, "wrong", lambda *_: {}),),
+    "bent maps": ((wrong_geometry, "is_bent", lambda *_: False),),
+    "copies": ((Copies, "maps", lambda *_: {}),),
+    "implausible maps": (
+        (merger, "implausible", lambda _: ""),
+        (merger, "scattered", lambda _: {}),
+        (merger.Merger, "note_refusal", lambda *_: None),
+    ),
+    "fragments": ((active_nodes, "fragments", lambda _: []),),
+    "unmeasurable edges": ((entry, "unmeasurable", lambda _: ""),),
+    "clocks that run backwards": ((trajectories, "runs_backwards", lambda _: False),),
+}
+"""What contains lies, each with what takes its place when it is switched off."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +102,7 @@ def draw(seed: int) -> tuple[Fleet, dict[MapId, Map]]:
 
 
 def changed_answer(before: Answer, after: Answer) -> bool:
-    """Whether a lost robot is told less, something else, or something that is not true.
+    """Whether a lost robot is sent less, something else, or something that is not true.
 
     An answer where there was none is one more if it is right: true views of the fourth robot are no lie.
     """
@@ -116,12 +141,12 @@ class Trial:
     def outcome(self, lie: Callable[[Setting], Lie], most_moved: float = MOVED_M) -> Outcome:
         """Add the fourth robot, and compare; and again when the server was started again."""
         rng = np.random.default_rng([self._seed, 0x11E])
-        told = lie(Setting(ODD, self._maps[ODD], self._others, rng))
+        sent = lie(Setting(ODD, self._maps[ODD], self._others, rng))
         folder = self._folder / "way"
         shutil.copytree(self._base, folder)
         began = time.monotonic()
         with Served(folder / "s0.sqlite") as served:
-            taken = served.settle() and served.send(told.logs, told.extra) and served.settle()
+            taken = served.settle() and served.send(sent.logs, sent.extra) and served.settle()
             seconds = time.monotonic() - began
             alive = taken and served.alive()
             first = compared(self.before, served.seen(self._others, self._queries, self._truth))
@@ -141,13 +166,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the fleet (default 0)")
     parser.add_argument("--queries", type=int, default=12, help="of lost robots (default 12)")
     parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS), metavar="NAME")
+    parser.add_argument("--without", choices=list(RULES), metavar="RULE", help="switch a rule off: see RULES")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
     if arguments.seed < 0 or arguments.queries < 1:
         parser.error("--seed must be at least 0, --queries at least 1")
     console = Console(stderr=arguments.json)
     outcomes: dict[str, Outcome] = {}
-    with tempfile.TemporaryDirectory() as folder, Progress(console=console) as progress:
+    off = switched_off(RULES.get(arguments.without, ()))
+    with off, tempfile.TemporaryDirectory() as folder, Progress(console=console) as progress:
         task = progress.add_task("ways", total=len(arguments.ways) + 1)
         trial = Trial(arguments.seed, arguments.queries, Path(folder))
         beside = trial.outcome(honest)

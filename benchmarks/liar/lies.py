@@ -193,7 +193,7 @@ def edges_to_nowhere(s: Setting) -> Lie:
     """Edges to nodes that do not exist, and between nodes of others, all of them certain and false."""
     own, log = [node.id for node in s.own[0]], bodies(s.own)
     theirs = [node.id for node in s.theirs()]
-    ends = [*own, *theirs, s.id(10**6 + 1), NodeId("nobody", 0, 1)]
+    ends = [*own, *theirs, s.id(10**6 + 1), NodeId("unknown", 0, 1)]
     for k in range(300):
         a, b = (ends[n] for n in s.rng.choice(len(ends), 2, replace=False))
         kind = list(EdgeKind)[k % len(EdgeKind)]

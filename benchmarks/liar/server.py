@@ -1,4 +1,4 @@
-"""A map server in this process, and what robots and people are told by it."""
+"""A map server in this process, and what robots and people get from it."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ class Served:
         number = merged.component_of(best.node)
         first = next((f for f in sorted({*frames.values()}) if merged.component_of(f) == number), None)
         if first is None:
-            # On a map of the fourth robot alone: what is told is of no use to the others, true or not.
+            # On a map of the fourth robot alone: it is of no use to the others, true or not.
             return Answer(True)
         way = merged.pose(first).inverse() @ merged.pose(best.node)
         pose = PoseGaussian(way, np.zeros((3, 3))) @ best.node_from_robot

@@ -10,7 +10,7 @@ Sparck Jones 1972; here geometry shows at how many places a landmark is.)
 
 What remains of a true link is unique: a sign, a wall, a bay with other goods.
 
-Whoever says that a landmark occurs twice is a witness of it: the robot by whose drive the two places differ.
+Who says that a landmark occurs twice is the source of that: the robot by whose drive the two places differ.
 A robot is believed about the links of its own maps; about links between others only if a second one says the
 same. Else one robot with a wrong drive, or with copies of others' nodes, would part all maps.
 
@@ -45,7 +45,7 @@ Landmark = tuple[NodeId, int]
 """Which node, and which of its landmarks."""
 ENOUGH = 2
 """Robots that say the same are believed about all links."""
-Witnesses = dict[Landmark, set[str]]
+Sources = dict[Landmark, set[str]]
 """Aliased landmarks with the names of robots that say so, `ENOUGH` of them at most."""
 
 
@@ -73,7 +73,7 @@ def weigh(
     claims = [link_of(e) for e in own if e.kind is EdgeKind.LOOP]
     with_landmarks = (link for link in (*links, *claims) if len(link.shared))
     connected = [link for link in with_landmarks if link.a in by_node and link.b in by_node]
-    aliased: Witnesses = {}
+    aliased: Sources = {}
     if connected:
         sides = _Sides.of(connected, by_node)
         loops, pairs = sides.loops(), sides.pairs()
@@ -81,8 +81,8 @@ def weigh(
         claimed = [(end, connected[k].a.agent) for k in loops[astray] for end in _ends(connected[k])]
         for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c)]:
             node, a, b = sides.meeting(i, j)
-            witness = sides.agent(i)
-            claimed += [((node, int(landmark)), witness) for landmark in np.intersect1d(a, b)]
+            source = sides.agent(i)
+            claimed += [((node, int(landmark)), source) for landmark in np.intersect1d(a, b)]
         if claimed:
             aliased = _followed(claimed, [connected[k] for k in loops[~astray]], maps)
     return [_weighed(link, aliased) for link in links]
@@ -220,25 +220,25 @@ def _ends(link: Link) -> set[Landmark]:
 
 def _followed(
     claimed: Iterable[tuple[Landmark, str]], loops: Sequence[Link], maps: Mapping[MapId, HybridMap]
-) -> Witnesses:
+) -> Sources:
     """All landmarks that show the same things as some that are claimed to be aliased, with who says so."""
     by_loop: dict[NodeId, list[Link]] = defaultdict(list)
     for link in loops:
         by_loop[link.a].append(link)
         by_loop[link.b].append(link.turned())
     onward: dict[NodeId, dict[int, list[Landmark]]] = {}
-    witnesses: Witnesses = defaultdict(set)
+    sources: Sources = defaultdict(set)
     waiting = list(claimed)
     while waiting:
-        (node, landmark), witness = waiting.pop()
-        known = witnesses[node, landmark]
-        if witness in known or len(known) == ENOUGH:
+        (node, landmark), source = waiting.pop()
+        known = sources[node, landmark]
+        if source in known or len(known) == ENOUGH:
             continue
-        known.add(witness)
+        known.add(source)
         if node not in onward:
             onward[node] = _next_to(node, by_loop.get(node, ()), maps[node.map])
-        waiting += [(same, witness) for same in onward[node].get(landmark, ())]
-    return witnesses
+        waiting += [(same, source) for same in onward[node].get(landmark, ())]
+    return sources
 
 
 def _next_to(node: NodeId, loops: Iterable[Link], hybrid_map: HybridMap) -> dict[int, list[Landmark]]:
@@ -252,14 +252,14 @@ def _next_to(node: NodeId, loops: Iterable[Link], hybrid_map: HybridMap) -> dict
     return table
 
 
-def _weighed(link: Link, aliased: Witnesses) -> Link:
+def _weighed(link: Link, aliased: Sources) -> Link:
     count = 0
     if aliased:
         agents = {link.a.agent, link.b.agent}
 
         def counts(landmark: Landmark) -> bool:
-            witnesses = aliased.get(landmark, ())
-            return len(witnesses) == ENOUGH or not agents.isdisjoint(witnesses)
+            sources = aliased.get(landmark, ())
+            return len(sources) == ENOUGH or not agents.isdisjoint(sources)
 
         count = sum(counts((link.a, i)) or counts((link.b, j)) for i, j in link.shared.tolist())
     if count == link.aliased:
