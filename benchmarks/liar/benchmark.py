@@ -8,7 +8,7 @@ log, with one lie in it. When all is merged, and once more after the server was 
 compared with what they have without the fourth robot: the links among their maps, the poses of their nodes,
 and the answers to lost robots. A lie is contained if links and answers are the same and no node has moved by
 more than 5 cm: an honest fourth robot moves them by 2 to 3 cm. It is named if the history that the page shows
-holds it against the robot.
+holds it against the robot. Two ways cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
 """
 
 from __future__ import annotations
@@ -19,16 +19,15 @@ import resource
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
-from benchmarks.liar.lies import WAYS, Lie, Map, Setting, bodies, honest, messages
+from benchmarks.liar.lies import UNDECIDABLE, WAYS, Lie, Map, Setting, bodies, honest, messages
 from benchmarks.liar.server import Answer, Seen, Served, difference
 from benchmarks.rules.switches import Switch, switched_off
 from mapweave.hybridmap.node import MapId
@@ -48,6 +47,7 @@ MOVED_M = 0.05
 """More than this moves no node of the others, m."""
 
 
+EVERY = {**WAYS, **UNDECIDABLE}
 RULES: dict[str, tuple[Switch, ...]] = {
     "two sources of aliasing": ((distinctness, "ENOUGH", 1),),
     "wrong geometry": ((WrongGeometrySearch, "wrong", lambda *_: {}),),
@@ -160,12 +160,35 @@ class Trial:
         return Outcome(contained, named, round(moved, 4), int(answers), int(links), alive, round(seconds, 2))
 
 
+def row(name: str, one: Outcome) -> str:
+    """An outcome as a line."""
+    figures = (
+        f"{one.max_pose_difference_m:.3f} m, {one.answers_changed} answers, {one.links_changed} links changed"
+    )
+    verdict = "contained" if one.contained else "NOT CONTAINED"
+    return f"{name}: {verdict}, {figures}, {one.seconds:.0f} s; {one.named or 'not named'}"
+
+
+def totals(outcomes: Mapping[str, Outcome]) -> dict[str, object]:
+    """Of the ways that can be found out, and which of them were not."""
+    listed = {name: one for name, one in outcomes.items() if name in WAYS}
+    return {
+        "ways": len(listed),
+        "contained": sum(one.contained for one in listed.values()),
+        "named": sum(bool(one.named) for one in listed.values()),
+        "max_pose_difference_m": max((one.max_pose_difference_m for one in listed.values()), default=0.0),
+        "answers_changed": sum(one.answers_changed for one in listed.values()),
+        "not_contained": [name for name, one in listed.items() if not one.contained],
+        "not_named": [name for name, one in listed.items() if not one.named],
+    }
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.liar", description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0, help="of the fleet (default 0)")
     parser.add_argument("--queries", type=int, default=12, help="of lost robots (default 12)")
-    parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS), metavar="NAME")
+    parser.add_argument("--ways", nargs="+", default=list(EVERY), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--without", choices=list(RULES), metavar="RULE", help="switch a rule off: see RULES")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
@@ -178,35 +201,14 @@ def main() -> None:
         task = progress.add_task("ways", total=len(arguments.ways) + 1)
         trial = Trial(arguments.seed, arguments.queries, Path(folder))
         beside = trial.outcome(honest)
+        console.print(row("(an honest fourth robot)", beside))
         for name in arguments.ways:
             progress.advance(task)
-            outcomes[name] = trial.outcome(WAYS[name])
-            print(name, outcomes[name], flush=True) if not arguments.json else None
+            outcomes[name] = trial.outcome(EVERY[name])
+            console.print(row(name, outcomes[name]))
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    table = Table(
-        "way",
-        "contained",
-        "moved m",
-        "answers",
-        "links",
-        "s",
-        "the page says",
-        title=f"one liar of four, seed {arguments.seed}",
-    )
-    for name, one in {"(honest)": beside, **outcomes}.items():
-        table.add_row(
-            name, "yes" if one.contained else "NO", f"{one.max_pose_difference_m:.3f}",
-            str(one.answers_changed), str(one.links_changed), f"{one.seconds:.1f}", one.named or "nothing",
-        )  # fmt: skip
-    console.print(table)
     if arguments.json:
-        found = {
-            name: {**asdict(one), "named": bool(one.named), "words": one.named}
-            for name, one in outcomes.items()
-        }
-        print(json.dumps({
-            "seed": arguments.seed, "ways": len(outcomes),
-            "contained": sum(one.contained for one in outcomes.values()),
-            "named": sum(bool(one.named) for one in outcomes.values()),
-            "peak_rss_mb": round(peak_mb), "honest": asdict(beside), "by_way": found,
+        print(json.dumps({"seed": arguments.seed, "without": arguments.without, **totals(outcomes),
+            "peak_rss_mb": round(peak_mb), "honest": asdict(beside),
+            "by_way": {name: asdict(one) for name, one in outcomes.items()},
         }))  # fmt: skip

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import EdgeKind, MapId
 from mapweave.wire.codec import decode_body, element_of, unwrap_body
 from mapweave.wire.log_messages import Refusal
 
@@ -57,6 +57,8 @@ def unmeasurable(body: ChangeBody) -> str:
     if not isinstance(body, EdgePut):
         return ""
     pose, which = body.edge.a_from_b, body.edge.id
+    if body.edge.kind is not EdgeKind.DRIVEN and not body.edge.within:
+        return f"edge {which} is {body.edge.kind} and joins nodes of others: robots only drive between those"
     length = math.hypot(pose.mean.x, pose.mean.y)
     if length > MOST_EDGE_M:
         return f"edge {which} is {length:.0f} m long, more than {MOST_EDGE_M:.0f} m"

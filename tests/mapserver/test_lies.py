@@ -151,15 +151,16 @@ def test_who_shares_landmarks_with_most_has_copied_them_if_nothing_else_tells() 
 
 
 def test_edges_that_no_robot_measures() -> None:
-    ends = NodeId(*LAST, 1), NodeId(*LAST, 3)
-    for x, variance, words in (
-        (3.0, 0.1, ""),
-        (999.0, 99.0, ""),
-        (1001.0, 0.1, "is 1001 m long"),
-        (3.0, 144.0, "deviation of 12 m"),
+    own, other = NodeId(*LAST, 1), NodeId(*FIRST, 3)
+    for end, kind, x, variance, words in (
+        (NodeId(*LAST, 3), EdgeKind.LOOP, 3.0, 0.1, ""),
+        (other, EdgeKind.DRIVEN, 999.0, 99.0, ""),
+        (other, EdgeKind.DRIVEN, 1001.0, 0.1, "is 1001 m long"),
+        (other, EdgeKind.DRIVEN, 3.0, 144.0, "deviation of 12 m"),
+        (other, EdgeKind.LOOP, 3.0, 0.1, "is loop and joins nodes of others"),
     ):
         pose = PoseGaussian(Pose2(x), variance * np.eye(3))
-        edge = Edge(NodeId(*LAST, 2), *ends, pose, EdgeKind.DRIVEN)
+        edge = Edge(NodeId(*LAST, 2), own, end, pose, kind)
         assert words in unmeasurable(EdgePut(edge)) and bool(words) == bool(unmeasurable(EdgePut(edge)))
 
 
