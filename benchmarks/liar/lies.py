@@ -245,7 +245,7 @@ def mixed_landmarks(s: Setting) -> Lie:
     theirs, nodes = s.theirs(), []
     for k, node in enumerate(s.own[0]):
         other = theirs[(k * 3) % len(theirs)]
-        some = [node.landmarks.take(slice(None, None, 2)), other.landmarks.take(slice(None, None, 2))]
+        some = [half.landmarks.take(np.arange(0, len(half.landmarks), 2)) for half in (node, other)]
         nodes.append(replace(node, landmarks=joined(some)))
     return Lie({s.map: messages(s.map, bodies((nodes, s.own[1])))})
 

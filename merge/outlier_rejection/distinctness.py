@@ -174,7 +174,8 @@ class _Sides:
 
     def agent(self, side: int) -> str:
         """The robot into whose map a side goes."""
-        return self.graphs[self.fragments[self.far[side]]].anchor.agent
+        agent: str = self.graphs[self.fragments[self.far[side]]].anchor.agent
+        return agent
 
     def contradict(
         self,

@@ -73,7 +73,7 @@ def chain(map_id: MapId, nodes: list[Node], step: Pose2, covariance: np.ndarray)
 def lies(map_id: MapId) -> dict[str, tuple[list[ChangeBody], str]]:
     """What is sent, and what is said against it."""
     vague, true = (views(map_id, Pose2(), spread) for spread in (9e3 * np.eye(3), STEP))
-    backwards = [
+    backwards: list[ChangeBody] = [
         NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock="utc"))
         for body in true
         if isinstance(body, NodePut)
