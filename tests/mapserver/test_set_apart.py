@@ -350,6 +350,10 @@ def test_nodes_that_show_the_same_break_nothing(beside: Beside) -> None:
             if isinstance(body, NodePut) and rng.random() < 0.8:
                 like = seen[rng.integers(len(seen))]
                 some = like.landmarks.take(np.arange(rng.integers(30, len(like.landmarks))))
+                # Bit by bit they would be copies.
+                some = replace(
+                    some, codes=(some.codes ^ rng.integers(0, 2, some.codes.shape)).astype(np.uint8)
+                )
                 body = NodePut(replace(body.node, landmarks=some, camera=like.camera))
             log.append((map_id, body))
         merged, _ = beside.merged(log)
