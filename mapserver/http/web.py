@@ -15,6 +15,7 @@
     POST /annotations JSON: adds an annotation, or withdraws one
     GET /plans        floor plans, and where they lie under the merged map, JSON; /plans/NAME.png is the image
     POST /plans       an image: keeps it for a plan that an annotation adds; JSON: its name and size
+                      (/plan-images/NAME.png is the image again)
     GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
@@ -81,7 +82,7 @@ METHODS = {
     **dict.fromkeys(
         (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
     ),
-    **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png"), "GET"),
+    **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
     **dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST"),
 }
