@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import resource
 import shutil
 import tempfile
@@ -194,6 +195,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.seed < 0 or arguments.queries < 1:
         parser.error("--seed must be at least 0, --queries at least 1")
+    logging.disable(logging.WARNING)
     console = Console(stderr=arguments.json)
     outcomes: dict[str, Outcome] = {}
     off = switched_off(RULES.get(arguments.without, ()))
