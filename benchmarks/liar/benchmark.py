@@ -6,9 +6,10 @@ Nothing is rendered (see `synthetic.wrong_geometry`); server, ingest, merge and 
 ones, and all that robots send and ask goes over a bus. Three robots map a house. A fourth one then sends its
 log, with one lie in it. When all is merged, and once more after the server was started again, the three are
 compared with what they have without the fourth robot: the links among their maps, the poses of their nodes,
-and the answers to lost robots. A lie is contained if links and answers are the same and no node has moved by
-more than 5 cm: an honest fourth robot moves them by 2 to 3 cm. It is named if the history that the page shows
-holds it against the robot. Two ways cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
+and the answers to lost robots; views to which an honest fourth robot changes the answer are left out. A lie is
+contained if links and answers are the same and no node has moved by more than 5 cm: an honest fourth robot
+moves them by 2 to 3 cm. It is named if the history that the page shows holds it against the robot. Two ways
+cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
@@ -64,6 +66,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "clocks that run backwards": ((trajectories, "runs_backwards", lambda _: False),),
 }
 """What contains lies, each with what takes its place when it is switched off."""
+
+
+Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -112,14 +117,14 @@ def changed_answer(before: Answer, after: Answer) -> bool:
     return after.found and not after.right
 
 
-def compared(before: Seen, after: Seen) -> tuple[float, int, int]:
-    """Greatest difference of a pose, m; answers and links that differ."""
+def compared(before: Seen, after: Seen) -> tuple[float, Bools, int]:
+    """Greatest difference of a pose, m; which answers differ; links that do."""
     if before.components != after.components:
         moved = float("inf")
     else:
         moved = max(difference(pose, after.poses[node]) for node, pose in before.poses.items())
-    changed = sum(map(changed_answer, before.answers, after.answers))
-    return moved, changed, len(before.links ^ after.links)
+    changed = [changed_answer(*pair) for pair in zip(before.answers, after.answers, strict=True)]
+    return moved, np.array(changed), len(before.links ^ after.links)
 
 
 class Trial:
@@ -138,8 +143,14 @@ class Trial:
             served.send({m: messages(m, bodies(content)) for m, content in self._others.items()})
             served.settle()
             self.before = served.seen(self._others, self._queries, self._truth)
+        self._left_out = np.zeros(queries, np.bool_)
+        self.beside, self._left_out = self._outcome(honest)
 
-    def outcome(self, lie: Callable[[Setting], Lie], most_moved: float = MOVED_M) -> Outcome:
+    def outcome(self, lie: Callable[[Setting], Lie]) -> Outcome:
+        """Add the fourth robot with a lie. Views that an honest one changes the answers to are left out."""
+        return self._outcome(lie)[0]
+
+    def _outcome(self, lie: Callable[[Setting], Lie]) -> tuple[Outcome, Bools]:
         """Add the fourth robot, and compare; and again when the server was started again."""
         rng = np.random.default_rng([self._seed, 0x11E])
         sent = lie(Setting(ODD, self._maps[ODD], self._others, rng))
@@ -156,9 +167,11 @@ class Trial:
             again = compared(self.before, served.seen(self._others, self._queries, self._truth))
             named = served.named(ODD.agent)
         shutil.rmtree(folder)
-        moved, answers, links = (max(pair) for pair in zip(first, again, strict=True))
-        contained = alive and moved <= most_moved and not answers and not links
-        return Outcome(contained, named, round(moved, 4), int(answers), int(links), alive, round(seconds, 2))
+        moved, links = max(first[0], again[0]), max(first[2], again[2])
+        changed = (first[1] | again[1]) & ~self._left_out
+        contained = alive and moved <= MOVED_M and not changed.any() and not links
+        seconds = round(seconds, 2)
+        return Outcome(contained, named, round(moved, 4), int(changed.sum()), links, alive, seconds), changed
 
 
 def row(name: str, one: Outcome) -> str:
@@ -202,7 +215,7 @@ def main() -> None:
     with off, tempfile.TemporaryDirectory() as folder, Progress(console=console) as progress:
         task = progress.add_task("ways", total=len(arguments.ways) + 1)
         trial = Trial(arguments.seed, arguments.queries, Path(folder))
-        beside = trial.outcome(honest)
+        beside = trial.beside
         console.print(row("(an honest fourth robot)", beside))
         for name in arguments.ways:
             progress.advance(task)
