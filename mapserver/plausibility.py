@@ -33,14 +33,22 @@ MOST_FRAGMENTS = 8
 
 
 def fragments(maps: Mapping[MapId, HybridMap]) -> list[MapId]:
-    """Maps with fewer nodes that their robots have left for others: nothing tells whether they are right."""
+    """Maps with fewer nodes that their robots have left for others: nothing tells whether they are right.
+
+    Of a robot that leaves very many, the newest as well.
+    """
+    small: dict[str, list[MapId]] = {}
     newest: dict[str, int] = {}
-    for map_id in maps:
-        newest[map_id.agent] = max(map_id.epoch, newest.get(map_id.agent, 0))
+    for map_id, hybrid_map in sorted(maps.items()):
+        newest[map_id.agent] = map_id.epoch
+        if len(hybrid_map.nodes) < LEAST_NODES:
+            small.setdefault(map_id.agent, []).append(map_id)
     return [
-        map_id for map_id, hybrid_map in sorted(maps.items())
-        if map_id.epoch < newest[map_id.agent] and len(hybrid_map.nodes) < LEAST_NODES
-    ]  # fmt: skip
+        map_id
+        for robot, some in small.items()
+        for map_id in some
+        if map_id.epoch < newest[robot] or len(some) > MOST_FRAGMENTS
+    ]
 
 
 def scattered(maps: Mapping[MapId, HybridMap]) -> dict[MapId, str]:

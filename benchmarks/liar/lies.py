@@ -17,6 +17,7 @@ from mapweave.hybridmap.descriptor import decode, quantise
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.registration.matching import match
 from mapweave.wire.codec import encode_body, encode_change, wrap_body
 from mapweave.wire.pose_codec import MAX_MEASURED, MAX_VARIANCE, POSTURE, UPPER
 from synthetic.world import Sensing, random_vectors
@@ -162,9 +163,9 @@ def greatest_covariance(s: Setting) -> Lie:
 
 def contradicting_clocks(s: Setting) -> Lie:
     """True views and a true way, at the very times at which another robot was at the same places."""
-    theirs = s.theirs()
+    first, *_ = (nodes for nodes, _ in s.others.values())
     nodes, edges = s.own
-    stamps = [theirs[(k * 7) % len(theirs)].stamp_ns for k in range(len(nodes))]
+    stamps = [max(first, key=lambda other: alike(node, other)).stamp_ns for node in nodes]
     return Lie({s.map: messages(s.map, bodies(([
         replace(node, stamp_ns=stamp) for node, stamp in zip(nodes, stamps, strict=True)
     ], edges)))})  # fmt: skip
@@ -263,6 +264,11 @@ def altered(node: Node, rng: np.random.Generator) -> Node:
             pixels.astype(np.float32), codes, depths.astype(np.float32), marks.depth_sigmas
         )
     )  # fmt: skip
+
+
+def alike(a: Node, b: Node) -> int:
+    """How many landmarks of two nodes match."""
+    return len(match(a.landmarks.codes, b.landmarks.codes))
 
 
 def joined(some: Sequence[Landmarks]) -> Landmarks:

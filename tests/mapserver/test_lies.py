@@ -10,9 +10,7 @@ import pytest
 
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.limits import MAX_NUMBER
-from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEventKind
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -178,9 +176,7 @@ def test_fragments_make_no_answer_ambiguous() -> None:
             merger.on_change(Change(map_id, number, 0, body))
     merged = merger.merged()
     assert list(merged.implausible) == [LAST]
-    # The newest map is no fragment yet.
-    merger.constrain(ManualConstraints([ManualConstraint(RetiredMap(map_id), True, "anna", 1)]))
-    relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
+    relocalizer = Answers.of(merger, merged, merger.node).relocalizer
     assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
 
 
