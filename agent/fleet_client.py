@@ -21,6 +21,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import serve_senders
 from mapweave.wire.traffic_meter import TrafficMeter
 
 NO_ANSWER = "no map server answered"
@@ -74,7 +75,7 @@ class FleetClient:
         self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._open_questions = 0
         self._closing = [
-            bus.serve(keys.mission(map_id.agent), self._take_mission),
+            *serve_senders(bus, keys.mission(map_id.agent), self._take_mission),
             bus.serve(keys.drive(map_id.agent), self._take_drive),
             bus.serve(keys.agent_status(map_id.agent), self._tell_status),
             bus.watch(keys.server_alive(server), self._see_server),
@@ -163,8 +164,9 @@ class FleetClient:
         del key
         self._server_alive = alive
 
-    def _take_mission(self, request: Request) -> None:
-        report = self._missions.take(decode(request.payload, MissionOrder))
+    def _take_mission(self, request: Request, who: str) -> None:
+        order = decode(request.payload, MissionOrder)
+        report = self._missions.take(replace(order, by=who or order.by))
         # A mission ends the wait for a person who has fallen silent.
         self._teleoperation.release()
         request.reply(encode(report))

@@ -33,6 +33,7 @@ from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
 from mapweave.wire.messages import decode, decode_view, encode
+from mapweave.wire.senders import serve_senders
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +100,7 @@ class Services:
             bus.serve(keys.known(name), guarded(self._known)),
             bus.serve(keys.server_map(name), self._map.ask),
             bus.serve(keys.reserve(name), guarded(self._reserve)),
-            bus.serve(keys.server_mission(name), self._command_later),
+            *serve_senders(bus, keys.server_mission(name), self._command_later),
             bus.serve(keys.missions(name), guarded(lambda _: encode(missions.missions()))),
             bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(places())))),
             bus.serve(keys.server_status(name), guarded(self._tell_status)),
@@ -117,10 +118,13 @@ class Services:
         """The merged map as a map file, from any thread."""
         return self._map.packed()
 
-    def _command_later(self, request: Request) -> None:
+    def _command_later(self, request: Request, who: str) -> None:
+        def command(payload: bytes) -> bytes:
+            mission = decode(payload, MissionRequest)
+            return encode(self._missions.command(replace(mission, by=who or mission.by)))
+
         # It waits for a robot, which nothing else of the server may do.
-        command = guarded(lambda payload: encode(self._missions.command(decode(payload, MissionRequest))))
-        self._relays.submit(command, request)
+        self._relays.submit(guarded(command), request)
 
     def _relocalize_later(self, request: Request) -> None:
         done = self._admission.submit(lambda: self._relocalize(request.payload), hash(request.payload))

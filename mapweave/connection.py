@@ -9,6 +9,7 @@ from mapweave.hybridmap.errors import NotConnected
 
 if TYPE_CHECKING:
     from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.credentials import Credentials
     from mapweave.wire.zenoh_bus import ZenohBus
 
 SOON = 1.0
@@ -33,12 +34,30 @@ def reach(settings: BusSettings, advice: str = "give --connect") -> ZenohBus:
     if not bus.wait_connected(SOON):
         bus.close()
         where = ", ".join(settings.endpoints)
-        raise NotConnected(f"no router at {where}: start `mapweave server`, or {advice}")
+        raise NotConnected(
+            f"no router at {where}: start `mapweave server`, or {advice}{_key_hint(settings.credentials)}"
+        )
     return bus
 
 
-def no_server(fleet: str) -> NotConnected:
-    """The error that no map server answers."""
+def no_server(fleet: str, holder: Credentials | None = None) -> NotConnected:
+    """The error that no map server answers.
+
+    Args:
+        fleet: its name.
+        holder: of the key with which one is connected, if there is one.
+    """
     return NotConnected(
         f"a router is up, but no map server of fleet {fleet} answers: start `mapweave server` or give --fleet"
+        f"{_key_hint(holder)}"
+    )
+
+
+def _key_hint(holder: Credentials | None) -> str:
+    """A router drops what a key may not do, without a word."""
+    if holder is None:
+        return ""
+    return (
+        f"; or the key of {holder.name} was revoked, has expired or may not do this: `mapweave keys list` at "
+        "the server and the server's log say so"
     )

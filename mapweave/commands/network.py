@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mapweave.identities.key_renewal import KeyRenewal
     from mapweave.settings import NetworkSettings, Settings
     from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.credentials import Credentials
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -85,11 +86,16 @@ def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
 
 def client_settings(network: NetworkSettings) -> BusSettings:
     """How a client connects."""
-    from mapweave.identities.key_file import read_key_file
     from mapweave.wire.bus_settings import BusSettings
 
-    credentials = read_key_file(Path(network.keys)).credentials if network.keys else None
-    return BusSettings(mode="client", endpoints=network.endpoints, credentials=credentials)
+    return BusSettings(mode="client", endpoints=network.endpoints, credentials=key_holder(network))
+
+
+def key_holder(network: NetworkSettings) -> Credentials | None:
+    """Whose key a client has; None without one."""
+    from mapweave.identities.key_file import read_key_file
+
+    return read_key_file(Path(network.keys)).credentials if network.keys else None
 
 
 def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings, KeyFolder | None]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -19,11 +19,12 @@ from mapweave.hybridmap.node import MapId
 from mapweave.identities.authority import Authority
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
-from mapweave.wire.access_rules import ASKS, COMMANDS, OF_ROBOTS
+from mapweave.wire.access_rules import ASKS, COMMANDS, OF_ROBOTS, SIGNED
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.keys import Keys
+from mapweave.wire.senders import sent_by, serve_senders
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.waiting import eventually, free_port
 
@@ -132,14 +133,15 @@ def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet) -> None:
     r0 = fleet.join("r0")
     r0.announce(KEYS.agent_alive(MapId("r1", 1)))
     r0.announce(KEYS.agent_alive(MapId("r0", 1)))
-    for key in (KEYS.mission("r1"), KEYS.log(MapId("r1", 1)), KEYS.relocalize("s0"), KEYS.route("s0")):
+    for key in (KEYS.log(MapId("r1", 1)), KEYS.relocalize("s0"), KEYS.route("s0")):
         r0.serve(key, answer)
-    r0.serve(KEYS.mission("r0"), answer)
+    serve_senders(r0, KEYS.mission("r0"), lambda request, who: answer(request))
+    serve_senders(r0, KEYS.mission("r1"), lambda request, who: answer(request))
     anna, r1 = fleet.join("anna"), fleet.join("r1")
-    eventually(lambda: asked(anna, KEYS.mission("r0")))
+    eventually(lambda: asked(anna, sent_by(KEYS.mission("r0"), "anna")))
     eventually(lambda: alive)
     assert alive == [KEYS.agent_alive(MapId("r0", 1))]
-    assert not asked(anna, KEYS.mission("r1"))
+    assert not asked(anna, sent_by(KEYS.mission("r1"), "anna"))
     assert not asked(fleet.router, KEYS.log(MapId("r1", 1)))
     assert not asked(r1, KEYS.relocalize("s0"))
     assert not asked(r1, KEYS.route("s0"))
@@ -150,7 +152,7 @@ def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet) -> None:
     [("r0", OF_ROBOTS), ("bob", frozenset(ASKS) - COMMANDS), ("anna", frozenset(ASKS))],
 )
 def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[str]) -> None:
-    every = {what: f"{KEYS.root}/server/s0/{what}" for what in ASKS}
+    every = {what: sent_by(f"{KEYS.root}/server/s0/{what}", name if what in SIGNED else "") for what in ASKS}
     for key in every.values():
         certified.router.serve(key, answer)
     bus = certified.join(name)
@@ -171,13 +173,52 @@ def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[
 
 def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
     r0 = fleet.join("r0")
-    for key in (KEYS.mission("r0"), KEYS.drive("r0"), KEYS.agent_status("r0")):
+    for key in (KEYS.drive("r0"), KEYS.agent_status("r0")):
         r0.serve(key, answer)
+    serve_senders(r0, KEYS.mission("r0"), lambda request, who: answer(request))
     anna, bob = fleet.join("anna"), fleet.join("bob")
-    eventually(lambda: asked(anna, KEYS.mission("r0")) and asked(anna, KEYS.drive("r0")))
+    eventually(lambda: asked(anna, sent_by(KEYS.mission("r0"), "anna")) and asked(anna, KEYS.drive("r0")))
     eventually(lambda: asked(bob, KEYS.agent_status("r0")))
-    assert not asked(bob, KEYS.mission("r0"))
+    assert not any(asked(bob, sent_by(KEYS.mission("r0"), who)) for who in ("", "anna", "bob"))
     assert not asked(bob, KEYS.drive("r0"))
+
+
+def test_an_operator_commands_under_the_own_name_alone(fleet: Fleet) -> None:
+    """Whatever a message says, its key has the name that is recorded; patterns are no way around it."""
+    senders: list[tuple[str, str]] = []
+
+    def hear(what: str) -> Callable[[Request, str], None]:
+        def handler(request: Request, who: str) -> None:
+            senders.append((what, who))
+            answer(request)
+
+        return handler
+
+    r0, carl = fleet.join("r0"), read_key_file(fleet.folder.add("carl", Role.OPERATOR)).credentials
+    fleet.renew()
+    serve_senders(r0, KEYS.mission("r0"), hear("order"))
+    for key in (KEYS.constrain("s0"), KEYS.annotate("s0"), KEYS.server_mission("s0")):
+        serve_senders(fleet.router, key, hear(key.rpartition("/")[2]))
+    anna, second = fleet.join("anna"), fleet.join_as(carl)
+    keys = {
+        "order": KEYS.mission("r0"), "constrain": KEYS.any_constrain(), "annotate": KEYS.any_annotate(),
+        "mission": KEYS.any_mission(),
+    }  # fmt: skip
+    for what, key in keys.items():
+        eventually(lambda key=key: asked(anna, sent_by(key, "anna")))
+        assert set(senders) == {(what, "anna")}
+        threads = [
+            threading.Thread(target=anna.ask, args=(forged, b"", SOON))
+            for forged in (key, *(f"{key}/{end}" for end in ("carl", "s0", "*", "**")))
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert asked(second, sent_by(key, "carl"))
+        assert set(senders) == {(what, "anna"), (what, "carl")}
+        assert senders.count((what, "carl")) == 1
+        senders.clear()
 
 
 def test_who_has_no_good_key_is_not_let_in(certified: Fleet) -> None:
