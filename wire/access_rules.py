@@ -95,8 +95,8 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
     addressed = [f"{keys.root}/server/*/{what}/{name}" for what in ("ack", "poses")]
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
-                  f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/mission/*", f"{agent}/drive",
-                  f"{base}/describe", f"{base}/step"]),
+                  f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/mission/*",
+                  f"{agent}/drive", f"{base}/describe", f"{base}/step"]),
         *_reads([*addressed, f"{keys.root}/server/*/alive", f"{base}/driver/*", f"{agent}/alive/*"]),
         *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
                 f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),

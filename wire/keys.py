@@ -15,8 +15,8 @@
     mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
-    mapweave/1/<fleet>/server/<server>/constrain/<who>  the same of a person with a key; also annotate, mission,
-                                                      and mission of an agent, see mapweave.wire.senders
+    mapweave/1/<fleet>/server/<server>/constrain/<who>  the same of a person with a key; also annotate and
+                                                      missions, see mapweave.wire.senders
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot base; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of the driver of that base
 

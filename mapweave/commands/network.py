@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from mapweave.connection import SOON
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.identities.key_renewal import KeyRenewal
     from mapweave.settings import NetworkSettings, Settings
@@ -124,7 +126,11 @@ def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings,
 
 
 def key_renewal(
-    bus: ZenohBus, folder: KeyFolder | None, server: str, settings: BusSettings
+    bus: ZenohBus,
+    folder: KeyFolder | None,
+    server: str,
+    settings: BusSettings,
+    renewed: Callable[[Credentials], None] = lambda credentials: None,
 ) -> KeyRenewal | None:
     """What keeps a router's rules up to date, if it has keys; it says on stderr what it does."""
     from mapweave.identities.key_renewal import KeyRenewal
@@ -132,9 +138,11 @@ def key_renewal(
 
     if folder is None:
         return None
-    return KeyRenewal(
-        bus, folder, server, settings.listen, lambda line: print(stamped(line), file=sys.stderr, flush=True)
-    )
+
+    def say(line: str) -> None:
+        print(stamped(line), file=sys.stderr, flush=True)
+
+    return KeyRenewal(bus, folder, server, settings.listen, say, renewed)
 
 
 def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[ZenohBus, Keys]:

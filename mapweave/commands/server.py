@@ -51,12 +51,8 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument(
         "--http", metavar="[HOST:]PORT",
-        help="answer people over HTTP as well, on this machine alone unless HOST is given, "
-        "for example 8080 or 0.0.0.0:8080 (default: off)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--http-commands", action="store_true",
-        help="with --http: other machines may move robots, too; there is no password",
+        help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
+        "0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
@@ -85,11 +81,14 @@ def run(arguments: argparse.Namespace) -> int:
     keys = Keys(router.fleet)
     if arguments.demo and arguments.data is not None:
         raise SettingsError("--demo keeps nothing: leave out --data")
-    address, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
+    address, tls, http = None, None, arguments.http or (DEMO_HTTP if arguments.demo else None)
     if http is not None:
-        from mapweave.mapserver.http.web import Web, parse_address
+        from mapweave.identities.logins import Logins
+        from mapweave.mapserver.http.tls import load, server_context
+        from mapweave.mapserver.http.web import Web, check_reach, parse_address
 
-        address = parse_address(http)
+        address, tls = parse_address(http), server_context(router.credentials)
+        check_reach(address, folder is not None, tls is not None)
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
@@ -115,11 +114,13 @@ def run(arguments: argparse.Namespace) -> int:
             where = ", ".join(router.listen)
             print(stamped(f"map server {name} of fleet {keys.fleet} listens at {where}"), flush=True)
             if address is not None:
-                stack.enter_context(Web(address, server, commands=arguments.http_commands))
-                print(stamped(f"for people: http://{':'.join(map(str, address))}/"), flush=True)
+                logins = None if folder is None else Logins(folder.path)
+                stack.enter_context(Web(address, server, logins=logins, tls=tls))
+                scheme = "http" if tls is None else "https"
+                print(stamped(f"for people: {scheme}://{':'.join(map(str, address))}/"), flush=True)
             if arguments.demo:
                 stack.enter_context(RecordedFleet(bus, keys, name, data))
-            renewal = key_renewal(bus, folder, name, router)
+            renewal = key_renewal(bus, folder, name, router, lambda own: tls and load(tls, own))
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):

@@ -86,8 +86,8 @@ def _answer(bus: ZenohBus, network: NetworkSettings) -> Finding:
         )  # fmt: skip
     return wrong(
         SUBJECT, f"the router answers, and no map server of fleet {network.fleet}",
-        "start `mapweave server`, or, if a key is used, look at `mapweave keys list` there; a robot alone needs no "
-        "server: --offline leaves this out",
+        "start `mapweave server`; with a key, `mapweave keys list` there says whether it is good; a robot "
+        "alone needs none: --offline leaves this out",
     )  # fmt: skip
 
 
