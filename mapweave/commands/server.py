@@ -81,14 +81,11 @@ def run(arguments: argparse.Namespace) -> int:
     keys = Keys(router.fleet)
     if arguments.demo and arguments.data is not None:
         raise SettingsError("--demo keeps nothing: leave out --data")
-    address, tls, http = None, None, arguments.http or (DEMO_HTTP if arguments.demo else None)
+    people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
     if http is not None:
-        from mapweave.identities.logins import Logins
-        from mapweave.mapserver.http.tls import load, server_context
-        from mapweave.mapserver.http.web import Web, check_reach, parse_address
+        from mapweave.commands.http_access import http_access
 
-        address, tls = parse_address(http), server_context(router.credentials)
-        check_reach(address, folder is not None, tls is not None)
+        people = http_access(http, folder, name)
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
@@ -113,14 +110,12 @@ def run(arguments: argparse.Namespace) -> int:
             stack.enter_context(server)
             where = ", ".join(router.listen)
             print(stamped(f"map server {name} of fleet {keys.fleet} listens at {where}"), flush=True)
-            if address is not None:
-                logins = None if folder is None else Logins(folder.path)
-                stack.enter_context(Web(address, server, logins=logins, tls=tls))
-                scheme = "http" if tls is None else "https"
-                print(stamped(f"for people: {scheme}://{':'.join(map(str, address))}/"), flush=True)
+            if people is not None:
+                stack.enter_context(people.serve(server))
+                print(stamped(f"for people: {people.url}"), flush=True)
             if arguments.demo:
                 stack.enter_context(RecordedFleet(bus, keys, name, data))
-            renewal = key_renewal(bus, folder, name, router, lambda own: tls and load(tls, own))
+            renewal = key_renewal(bus, folder, name, router, lambda own: people and people.renew(own))
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):

@@ -83,6 +83,7 @@ function showOthers(box, links) {
   }
 }
 function offerUndo(box, a, b) {
+  if (explanation.whyNot) { add(box, "p", explanation.whyNot, "soft"); return; }
   if (!explanation.commands) return;
   const line = add(box, "form", "", "actions"), why = add(line, "input");
   why.placeholder = "why is it wrong?"; why.setAttribute("aria-label", "Why the link is wrong"); why.maxLength = 300;
@@ -129,7 +130,7 @@ function showRoute(route) {
   if (route.apart) showTwo(route.apart);
 }
 
-export const explanation = { commands: false, shown: () => {} };
+export const explanation = { commands: false, whyNot: "", shown: () => {} };
 
 let asked = 0;
 

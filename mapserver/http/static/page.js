@@ -4,6 +4,7 @@ import { colours, edgeColour, followTheme, hue } from "./colours.js";
 import { drawAnnotations, loadAnnotations, nodeOf, placeNamed } from "./annotations.js";
 import { listCorrections } from "./corrections.js";
 import { explain, explainAddress, explanation } from "./explanation.js";
+import { admitted } from "./login.js";
 import { forget, showNode } from "./node_panel.js";
 import { leaveRobot, listRobots, poseOf, showRobot, updateRobot } from "./robot_panel.js";
 import { listen } from "./input.js";
@@ -21,7 +22,7 @@ const MOST_NAMES = 500;       // in the list that helps searching
 const SAID_EVERY = 10000;       // ms, between two looks at annotations and plans
 
 const model = new MapModel(), viewport = new Viewport(), painter = new Painter(byId("canvas"), model, viewport);
-const page = { robots: [], commands: false, node: "", robot: "", photo: [], places: [], readOnly: false };
+const page = { robots: [], commands: false, whyNot: "", node: "", robot: "", photo: [], places: [], readOnly: false };
 // For tests and measurements.
 window.mapweave = { model, viewport, painter, page };
 
@@ -47,7 +48,7 @@ function selectRobot(name, goal = page.node) {
   page.robot = painter.robot = name;
   forget();
   openTab("selected");
-  showRobot(name, page.commands, goal);
+  showRobot(name, page.whyNot, goal);
   updateRobot(page.robots);
   const robot = painter.robots.find(one => one.name === name);
   if (robot) viewport.show(robot.x, robot.y);
@@ -154,8 +155,9 @@ painter.overlays.push(drawAnnotations, (c, v) => {
 });
 
 watch({
-  hello({ commands, read_only }) {
+  hello({ commands, read_only, why_not }) {
     page.commands = explanation.commands = commands;
+    page.whyNot = explanation.whyNot = why_not;
     page.readOnly = read_only;
     byId("connection").textContent = read_only ? "map file" : "live";
     clearEvents();
@@ -188,12 +190,12 @@ watch({
     addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name));
     if (page.heard) byId("announcement").textContent = history.at(-1)?.words || "";
     page.heard = true;
-    listCorrections(page.commands);
+    listCorrections(page.whyNot);
   },
 }, up => {
   byId("connection").className = up ? "" : "lost";
   byId("connection").textContent = up ? "live" : "no server, trying again";
-});
+}, admitted);
 async function loadSaid() {
   loadPlans(() => painter.ask());
   const places = await loadAnnotations(selectNode);
@@ -223,4 +225,4 @@ for (const [id, factor] of [["closer", 1.4], ["farther", 1 / 1.4]])
   byId(id).addEventListener("click", () => { viewport.zoom(factor); painter.ask(); });
 addEventListener("popstate", () => { if (location.pathname.endsWith("/why")) { openTab("why"); explainAddress(); } });
 new ResizeObserver(() => { painter.resize(); if (!viewport.touched) fit(); }).observe(byId("map"));
-if (location.pathname.endsWith("/why")) { openTab("why"); explainAddress(); }
+if (location.pathname.endsWith("/why")) { openTab("why"); admitted().then(explainAddress); }

@@ -156,6 +156,48 @@ def test_ambiguous_requests_are_answered_once(served: Web, head: bytes, status: 
     assert b'{"error":' in got
 
 
+UPGRADE = (
+    b"GET /live HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n%s"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+ANSWERS = {
+    b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n": b"200",
+    b"GET /static/page.js HTTP/1.1\r\nHost: localhost\r\n\r\n": b"200",
+    b"GET /nothing HTTP/1.1\r\nHost: localhost\r\n\r\n": b"404",
+    b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n": b"403",
+    HEAD + b"\r\n": b"411",
+    b"noise\r\n\r\n": b"400",
+    UPGRADE % b"Origin: http://evil.example\r\n": b"403",
+}
+
+
+@pytest.mark.parametrize("request_", ANSWERS)
+def test_every_answer_has_the_headers_and_names_no_version(served: Web, request_: bytes) -> None:
+    got = raw(served, request_, close=request_.startswith(b"noise"))
+    head = got.partition(b"\r\n\r\n")[0].lower()
+    assert got.startswith(b"HTTP/1.1 " + ANSWERS[request_])
+    for header in (
+        b"x-content-type-options: nosniff", b"x-frame-options: deny", b"referrer-policy: no-referrer",
+        b"cross-origin-opener-policy: same-origin", b"cross-origin-resource-policy: same-origin",
+        b"cache-control: no-store", b"server: mapweave",
+    ):  # fmt: skip
+        assert head.count(b"\r\n" + header + b"\r\n") == 1 or head.endswith(b"\r\n" + header), header
+    assert b"frame-ancestors 'none'" in head and b"default-src 'none'" in head and b"unsafe" not in head
+    assert not any(word in got.lower() for word in (b"uvicorn", b"starlette", b"wsproto", b"python/"))
+
+
+@pytest.mark.parametrize("path", ["/constraints", "/annotations", "/plans", "/relocalize"])
+@pytest.mark.parametrize(
+    "kind", ["", "text/plain", "application/x-www-form-urlencoded", "image/svg+xml", "x"]
+)
+def test_a_body_of_another_type_is_refused(served: Web, path: str, kind: str) -> None:
+    """Among them are those that a form of another site's page sends without asking first."""
+    stated = b"Content-Type: %s\r\n" % kind.encode() if kind else b""
+    head = b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n" % path.encode()
+    got = raw(served, head + stated + b"\r\n{}")
+    assert got.startswith(b"HTTP/1.1 415") and b"send Content-Type: " in got
+
+
 def test_one_request_a_connection(served: Web) -> None:
     got = raw(served, b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
     assert got.count(b"HTTP/1.1 200") == 1 and b"\r\nconnection: close\r\n" in got.lower()
