@@ -19,6 +19,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 from tests.agent.ranged_body import BODY, MAP, on, rangers
+from tests.quick import first_quick
 
 Broken = Callable[[np.ndarray], np.ndarray]
 ALLOWED = AgentSettings(exploration=ExplorerSettings(without_rangers=True))
@@ -72,6 +73,7 @@ def test_it_stops_and_reports_while_they_are_silent_and_then_goes_on(walls, miss
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_long_silence_does_not_count_against_what_the_robot_was_doing(walls):
     """The same commands as without the silence: behaviours have waited, not given up.
 
@@ -112,7 +114,7 @@ def test_a_single_sensor_is_named() -> None:
     assert monitor.fault == ""
 
 
-@pytest.mark.parametrize("broken", [NONE, FEWER], ids=["none", "five"])
+@pytest.mark.parametrize("broken", first_quick([NONE, FEWER], 1))
 def test_a_simulated_robot_touches_nothing(broken):
     """24 s in an office: with free room assumed it touched a wall several times."""
     world = make_world("office", 3)
