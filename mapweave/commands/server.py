@@ -115,7 +115,8 @@ def run(arguments: argparse.Namespace) -> int:
                 print(stamped(f"for people: {people.url}"), flush=True)
             if arguments.demo:
                 stack.enter_context(RecordedFleet(bus, keys, name, data))
-            renewal = key_renewal(bus, folder, name, router, lambda own: people and people.renew(own))
+            renewed = people.renew if people is not None else lambda own: None
+            renewal = key_renewal(bus, folder, name, router, renewed)
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):
