@@ -1,8 +1,8 @@
 """Who asks over HTTP, and what that one may do: the identities and roles of the router.
 
-Without keys nobody logs in: this machine may do everything, others whom a proxy lets in only read. With keys
-everyone shows a token: scripts with each request (`Authorization: Bearer`), people once, for a session in a
-cookie that pages cannot read and that pages of other sites cannot send.
+Without keys there is no login: this machine may do everything, other machines that a proxy lets in only read.
+With keys a token is needed: scripts send it with each request (`Authorization: Bearer`), people once, for a
+session in a cookie that pages cannot read and that pages of other sites cannot send.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 LONGEST_LOGIN = 1024
 """Of the body of a login, bytes."""
-ANYBODY = ""
+PUBLIC = ""
 """In place of a question: it needs no login."""
 PERSON = "mapweave.person"
 """In the scope of a request: who asks."""
@@ -138,7 +138,7 @@ class Access:
         """Routes of logging in and out.
 
         Args:
-            read_only: whether the server takes no commands from anybody.
+            read_only: whether the server takes no commands at all.
             guarded: makes an endpoint of an answer, with its refusals.
         """
 
@@ -152,14 +152,14 @@ class Access:
             return self._log_out(request)
 
         return [
-            Route("/session", guarded(session, ANYBODY), methods=["GET"]),
-            Route("/login", guarded(login, ANYBODY), methods=["POST"]),
-            Route("/logout", guarded(logout, ANYBODY), methods=["POST"]),
+            Route("/session", guarded(session, PUBLIC), methods=["GET"]),
+            Route("/login", guarded(login, PUBLIC), methods=["POST"]),
+            Route("/logout", guarded(logout, PUBLIC), methods=["POST"]),
         ]
 
     def _log_in(self, request: Request, body: bytes) -> Response:
         if self._logins is None:
-            raise InvalidValue("this server has no keys: nobody logs in")
+            raise InvalidValue("this server has no keys, and needs no login")
         try:
             token = msgspec.json.decode(body, type=_Posted).token.strip()
         except (msgspec.MsgspecError, UnicodeDecodeError):

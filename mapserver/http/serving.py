@@ -234,7 +234,7 @@ class HttpThread:
             headers=list(HEADERS.items()),
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             timeout_graceful_shutdown=1,
-            # A proxy on this machine says for whom it asks.
+            # A proxy on this machine names the client for which it asks.
             forwarded_allow_ips="127.0.0.1,::1",
         )
         config.load()

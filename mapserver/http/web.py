@@ -63,7 +63,7 @@ from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.live import Live
-from mapweave.mapserver.http.login import ANYBODY, PERSON, Access
+from mapweave.mapserver.http.login import PERSON, PUBLIC, Access
 from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.http.plans import plan_answers
 from mapweave.mapserver.http.reply import PATIENCE, Reply, busy, refusal
@@ -143,7 +143,7 @@ class Web(HttpThread):
 
 
 def check_reach(address: tuple[str, int], logins: bool, tls: bool) -> None:
-    """Refuse to serve other machines without a login, or with tokens that everyone in between can read.
+    """Refuse to serve other machines without a login, or with tokens that can be read on their way.
 
     Raises:
         SettingsError: what to do instead.
@@ -223,7 +223,7 @@ class Questions:
                 return busy(Busy(1.0))
             self._open += 1
             try:
-                if question != ANYBODY:
+                if question != PUBLIC:
                     request.scope[PERSON] = self._access.check(request, question)
                 content = await answer(request)
                 return content if isinstance(content, Response) else Reply(content)
@@ -345,7 +345,7 @@ class Questions:
 
 
 def _author(request: Request) -> str:
-    """Who gives a mission: whoever has logged in, and without keys whom the request names."""
+    """Who gives a mission: the person who has logged in, without keys the one that the request names."""
     return request.scope[PERSON].name or request.query_params.get("by", BY)
 
 

@@ -1,4 +1,4 @@
-"""Where HTTP is served, and to whom: `--http`, with the keys of the fleet if there are any."""
+"""Where HTTP is served, and to which clients: `--http`, with the keys of the fleet if there are any."""
 
 from __future__ import annotations
 

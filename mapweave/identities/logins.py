@@ -67,7 +67,7 @@ class Logins:
             try:
                 self._read()
             except SettingsError as error:
-                # Nobody is let in by what cannot be read.
+                # What cannot be read lets no client in.
                 log.error("no login is possible: %s", error)
                 self._seen, self._tokens = seen, {}
         token, identity = self._tokens.get(sha256, (None, None))

@@ -218,7 +218,7 @@ def test_robots_are_moved_from_this_machine_and_its_own_pages_alone(house: House
     link, control = house.robot()
     with Web(("127.0.0.1", 0), house.server) as web:
         assert ask(web, "POST", "/robots/r0/stop", Origin="http://evil.example")[0] == 403
-        # A proxy on this machine says for whom it asks.
+        # A proxy on this machine names the client for which it asks.
         forwarded = {"X-Forwarded-For": "10.0.0.1"}
         for path in ("/robots/r0/stop", "/stop"):
             status, answer = ask(web, "POST", path, **forwarded)

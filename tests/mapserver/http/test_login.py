@@ -1,6 +1,6 @@
 """Who may do what over HTTP on a fleet with keys: tokens, sessions, roles, and pages of other sites.
 
-`TABLE` has every route: a new one is without a line until somebody decides who may ask it.
+`TABLE` has every route: a new one is without a line until it is decided who may ask it.
 """
 
 from __future__ import annotations
@@ -273,7 +273,7 @@ def test_without_keys_this_machine_alone_is_served(services: StubServices, tmp_p
         Web(("0.0.0.0", 0), services, logins=lab)
     with Web(("127.0.0.1", 0), services) as open_one:
         assert ask(open_one, "POST", "/stop")[0] == 200
-        # Whom a proxy lets in reads.
+        # Other machines that a proxy lets in read.
         forwarded = {"X-Forwarded-For": "10.0.0.7"}
         assert ask(open_one, "GET", "/robots", None, forwarded)[0] == 200
         status, _, content = ask(open_one, "POST", "/stop", None, forwarded)

@@ -27,7 +27,7 @@ ROBOT = "const robot = document.querySelector('#robots button'); robot?.click();
 SUMMARY = "return document.getElementById('summary').textContent"
 EXPLORE = "[...document.querySelectorAll('#selected button')].find(b => b.textContent === 'Explore').click()"
 RETIRE = """
-const body = JSON.stringify({ retire: ["r0.1.5"], because: "a mirror", by: "somebody" });
+const body = JSON.stringify({ retire: ["r0.1.5"], because: "a mirror", by: "mallory" });
 fetch("constraints", { method: "POST", headers: { "Content-Type": "application/json" }, body });
 """
 
@@ -85,7 +85,7 @@ def test_a_viewer_looks_and_an_operator_commands(
         eventually(lambda: any("by otto on" in event.words for event in house.server.history()))
         assert "r0.1.5 is retired by otto on" in house.server.history()[-1].words
         assert house.server.history()[-1].words.endswith('"a mirror"')
-        assert "somebody" not in house.server.history()[-1].words
+        assert "mallory" not in house.server.history()[-1].words
 
         folder.revoke("otto", "left")
         eventually(lambda: page.run(FORM))
