@@ -11,6 +11,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places
@@ -106,15 +107,23 @@ class Annotator:
         """Nodes for words, from any thread; see Places.answer."""
         return self._places().answer(request)
 
-    def annotate(self, annotation: Annotation) -> str:
+    def annotate(self, annotation: Annotation, check: bool = False) -> str:
         """Add an annotation to the record, from any thread; returns what it says, in words.
+
+        Args:
+            annotation: the new one.
+            check: only say what it would do; nothing changes.
 
         Raises:
             InvalidValue: it says nothing new, or is about something that is not there.
         """
         with self._turn:
-            check_annotation(self._places().merged, self._record.annotations, annotation)
+            places = self._places()
+            check_annotation(places.merged, self._record.annotations, annotation)
             self._check(annotation)
+            if check:
+                words = "; ".join((annotation.words, *effects_of(annotation, places)))
+                return f"only checked, nothing is changed: {words}"
             self._record.add(annotation)
             self._changed(self._record.annotations)
         log.warning("%s", annotation.words)

@@ -242,13 +242,13 @@ class MapServer:
         """What people say about the map."""
         return self._annotations.annotations
 
-    def annotate(self, annotation: Annotation) -> str:
-        """Add an annotation to the record, from any thread; returns what it says, in words.
+    def annotate(self, annotation: Annotation, check: bool = False) -> str:
+        """Add an annotation to the record, or only check it, from any thread; says what it does in words.
 
         Raises:
             InvalidValue: it says nothing new, or is about something that is not there.
         """
-        return self._annotator.annotate(annotation)
+        return self._annotator.annotate(annotation, check)
 
     def plans(self) -> PlacedPlans:
         """Floor plans under the newest merged map, from any thread."""
@@ -263,13 +263,25 @@ class MapServer:
         """
         return self._plans.image(name)
 
-    def put_plan_image(self, data: bytes) -> PlanImage:
+    def kept_image(self, sha256: str) -> bytes:
+        """The PNG file of an image that was put here, whether a plan names it or not yet; from any thread.
+
+        Raises:
+            InvalidFile: it is not there, or damaged.
+        """
+        return self._plans.images.get(sha256)
+
+    def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
         """Keep the image of a floor plan, from any thread; an annotation names it afterwards.
+
+        Args:
+            data: an image file.
+            negate: exchange light and dark, as a map.yaml says.
 
         Raises:
             InvalidValue: it is no image, or too large.
         """
-        return self._plans.put(data)
+        return self._plans.put(data, negate)
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words, from any thread.

@@ -16,9 +16,11 @@ from mapweave.agent.global_localization.candidates import Candidate, FleetMap, O
 from mapweave.agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
 from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
 from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.mission import Answer, Question, WhichWay
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
+from mapweave.agent.navigation.answer_trial import AnswerTrial
 from mapweave.agent.navigation.blocked_edges import BlockedEdges
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.onboard_router import onboard_route
@@ -31,6 +33,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeKind, Node, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
+from mapweave.registration.recognition import RecognitionSettings
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
@@ -117,10 +120,13 @@ class Navigator:
         self._rng = np.random.default_rng(seed)
         self._local_planner = LocalPlanner(description, s.navigation)
         self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
+        fleet = FleetMap(self._motion)
         self._localization = GlobalLocalization(
-            description, sift, self._motion, OwnMap(own_map, self._rng), TO_NAVIGATE,
-            FleetMap(self._motion),
-        )  # fmt: skip
+            description, sift, self._motion, OwnMap(own_map, self._rng), TO_NAVIGATE, fleet
+        )
+        self._refuted = fleet.refuted
+        self._trial = AnswerTrial(self._motion, self._refuted)
+        self._detector = NodeDetector(description, lens, sift, self._rng, s)
         self._blocks = BlockedEdges(s.navigation)
         self._traverse_recorder = TraverseRecorder(description)
         self._refinement = LandmarkRefinement(own_map)
@@ -165,6 +171,8 @@ class Navigator:
             self._progressed_at += self._description.tick
         elif not self.arrived and self._motion.now - self._progressed_at > self._settings.navigation.patience:
             self._give_up(f"no nearer in {self._settings.navigation.patience:g} s: {self._trouble}")
+        elif not self.arrived and self._trial.ended:
+            self._give_up(self._trial.ended)
         command = Command() if standing else next(self._behaviour)
         fix = None if self._searching else self.fix
         self.traverse = self._traverse_recorder.see(fix, observation)
@@ -221,6 +229,7 @@ class Navigator:
     def _start_from(self, place: Candidate | None) -> None:
         """Go on from the place that was found, if one was."""
         self._searching, self.detail, self.fix = False, self._localization.detail, None
+        self._trial.found(place)
         if place is None:
             return
         self.tally = self.tally.found()
@@ -277,7 +286,8 @@ class Navigator:
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
         """Follow a route until it is driven, or blocked, or the robot is lost."""
-        follower = self._follower(route, fix)
+        follower = self._follower(route, self._compared(route, fix))
+        self._trial.took(route)
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
         self._following, self._touched = True, ""
         while True:
@@ -293,9 +303,11 @@ class Navigator:
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._failed_views = 0
+                self._trial.saw(follower.fix.node)
             if self._via and follower.to_goal <= THERE:
                 del self._via[0]
                 self._following = False
+                self._trial = AnswerTrial(self._motion, self._refuted)
                 return
             if self._touched:
                 follower.progress = RouteProgress.BLOCKED
@@ -310,12 +322,14 @@ class Navigator:
                 # Nothing keeps it from its goal but its own precision: that blocks no other robot.
                 self.detail, self._parking_retried = "parking did not end: trying once more", True
             case RouteProgress.BLOCKED:
+                self._trial.blocked()
                 yield from self._report_block(*follower.blocked)
                 if self._parking_retried:
                     # Twice: localize again, so that parking begins from another heading.
                     self.fix, self._expected, self._parking_retried = None, self._on_own_map(self.fix), False
             case RouteProgress.UNSURE if (
                 self._goal_hidden
+                and self._trial.node is None
                 and not self._via
                 and follower.fix.blind < self._settings.navigation.blind_distance
             ):
@@ -323,8 +337,25 @@ class Navigator:
                 self.tally = self.tally.passed([0.0])
             case RouteProgress.UNSURE:
                 # By landmarks seen a moment ago it is at the goal, yet it sees none of the goal's landmarks.
-                self._goal_hidden = follower.fix.blind < self._settings.navigation.blind_distance
+                blind, allowed = follower.fix.blind, self._settings.navigation.blind_distance
+                self._goal_hidden = blind < allowed
+                if self._trial.node is not None or not (self._trial.borne_out or self._goal_hidden):
+                    self._trial.refute(blind)
                 yield from self._relocalize()
+
+    def _compared(self, route: tuple[RouteLeg, ...], fix: Fix) -> Fix:
+        """The fix, or the robot's own if it sees the node by which the fleet has localized it.
+
+        The robot still stands where it asked. What it recognises itself comes before any answer.
+        """
+        node = next((leg.node for leg in route if leg.node.id == fix.node), None)
+        image = self._motion.observation.image
+        if self._trial.node is None or node is None or image is None:
+            return fix
+        # More is asked than of an expected node: any pose will do.
+        anywhere = Expected(0, node, fix.node_from_robot.mean, math.inf)
+        seen = self._detector.find(image, [anywhere], RecognitionSettings())
+        return fix if seen is None else Fix.of(seen[1])
 
     def _let_pass(self, right_of_way: RightOfWay, follower: RouteFollower) -> Generator[Command, None, bool]:
         """Stand while another robot holds the way ahead; returns whether to go on then.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
 from mapweave.hybridmap.errors import InvalidMessage
@@ -69,6 +70,13 @@ def decode_answer(
         _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
     if route.legs and route.legs[-1].node.id != question.goal:
         raise InvalidMessage(f"route: it ends at node {route.legs[-1].node.id}, not at {question.goal}")
+    nodes = [leg.node.id for leg in route.legs]
+    if twice := next((node for k, node in enumerate(nodes) if node in nodes[:k]), None):
+        raise InvalidMessage(f"route: it leads in a circle, to node {twice} twice")
+    blocked = {frozenset(pair) for pair in question.blocked}
+    for a, b in pairwise(nodes):
+        if frozenset((a, b)) in blocked:
+            raise InvalidMessage(f"route: it leads from {a} to {b}, where the robot did not get through")
     return route
 
 

@@ -35,6 +35,10 @@ LONGEST_LOGIN = 1024
 """Of the body of a login, bytes."""
 PUBLIC = ""
 """In place of a question: it needs no login."""
+READ_ONLY = (
+    "This is a map file, which is only shown. Commands such as mapweave map link --map FILE -o OUT write a "
+    "corrected copy."
+)
 PERSON = "mapweave.person"
 """In the scope of a request: who asks."""
 
@@ -128,7 +132,7 @@ class Access:
 
     def described(self, person: Person, read_only: bool) -> Mapping[str, Any]:
         """What a page shows of who asks."""
-        why = "A map file takes no commands." if read_only else why_not(person, "mission")
+        why = READ_ONLY if read_only else why_not(person, "mission")
         return {
             "name": person.name, "role": str(person.role) if person.name else "", "read_only": read_only,
             "commands": not why, "why_not": why,

@@ -16,6 +16,7 @@
     POST /annotations JSON: adds an annotation, or withdraws one
     GET /plans        floor plans, and where they lie under the merged map, JSON; /plans/NAME.png is the image
     POST /plans       an image: keeps it for a plan that an annotation adds; JSON: its name and size
+                      (/plan-images/NAME.png is the image again)
     GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
     POST /stop        stops every robot, JSON
@@ -82,7 +83,7 @@ METHODS = {
         (*PAGES, "/session", "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"),
         "GET",
     ),
-    **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png", "/session"), "GET"),
+    **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
     **dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST"),
     **dict.fromkeys(("/login", "/logout"), "POST"),
@@ -194,7 +195,7 @@ class Questions:
             ("GET", "/nodes/{node}", "map", self._node),
             ("GET", "/annotations", "annotations", self._annotations),
             ("POST", "/annotations", "annotate", self._annotate),
-            *plan_answers(server, lambda request: read_body(request, IMAGE, patience)),
+            *plan_answers(server, lambda request: read_body(request, (*IMAGE, FORM), patience)),
             ("POST", "/relocalize", "relocalize", self._relocalize),
             ("POST", "/robots/{robot}/{kind}", "mission", self._give),
             ("POST", "/stop", "mission", self._stop),

@@ -47,6 +47,7 @@ TABLE: dict[tuple[str, str], set[str]] = {
     ("GET", "/robots"): READ, ("GET", "/missions"): READ, ("GET", "/map"): READ,
     ("GET", "/nodes/{node}"): READ,
     ("GET", "/annotations"): READ, ("POST", "/annotations"): COMMAND,
+    ("GET", "/plan-images/{sha256}.png"): READ,
     ("GET", "/plans"): READ, ("GET", "/plans/{name:path}.png"): READ, ("POST", "/plans"): COMMAND,
     ("GET", "/constraints"): READ, ("POST", "/constraints"): COMMAND,
     ("POST", "/robots/{robot}/{kind}"): COMMAND, ("POST", "/stop"): COMMAND,
@@ -116,10 +117,16 @@ def test_every_route_is_in_the_table(services: StubServices) -> None:
 
 def test_each_role_may_ask_what_the_table_says(keyed: Keyed) -> None:
     """What it may not is refused before anything of the request is looked at."""
-    filled = {"{node}": "r0.1.1", "{name:path}": "flat", "{robot}": "r0", "{kind}": "stop"}
+    filled = {
+        "{node}": "r0.1.1",
+        "{name:path}": "flat",
+        "{sha256}": "0" * 64,
+        "{robot}": "r0",
+        "{kind}": "stop",
+    }
     for (method, path), may in TABLE.items():
-        for name, words in filled.items():
-            path = path.replace(name, words)
+        for chunk, words in filled.items():
+            path = path.replace(chunk, words)
         for name in ALL:
             status = watched(keyed, name) if method == "WS" else keyed.ask(method, path, name)
             refused = status == (403 if name else 401)
