@@ -157,7 +157,7 @@ class MapServer:
         )  # fmt: skip
         self._annotator = Annotator(
             self._bus, self._keys, self._name, self._named_places, self._annotations, self._plans.check,
-            self._apply_annotations,
+            lambda: self._constraints.constraints, self._apply_annotations,
         )  # fmt: skip
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._publish)
@@ -322,6 +322,14 @@ class MapServer:
     ) -> MissionReport:
         """Give a robot a mission that is newer than the one that holds it; see `command`."""
         return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id, via))
+
+    def portal_done(self, robot: str, by: str) -> str:
+        """Tell a robot that it was taken through a portal, from any thread; returns what it does, in words.
+
+        Raises:
+            InvalidValue: it does not wait at a portal, or does not answer.
+        """
+        return self._missions.portal_done(robot, by)
 
     def missions(self) -> Missions:
         """The missions that are known, oldest first."""

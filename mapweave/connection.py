@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 SOON = 1.0
 """s; a router that is there is found sooner. Commands say within 2 s of their start that there is none."""
+LOOK = 0.2
+"""s; without a router a person learns why in this time more."""
 ANSWERED = 2.0
 """s; a server or robot that is there answers sooner."""
 
@@ -34,10 +37,22 @@ def reach(settings: BusSettings, advice: str = "give --connect") -> ZenohBus:
     if not bus.wait_connected(SOON):
         bus.close()
         where = ", ".join(settings.endpoints)
-        raise NotConnected(
-            f"no router at {where}: start `mapweave server`, or {advice}{_key_hint(settings.credentials)}"
-        )
+        if any(map(_listens, settings.endpoints)):
+            reason = "what listens there does not let this in"
+            advice = _key_hint(settings.credentials) or "; if the fleet has keys, give --keys FILE"
+            raise NotConnected(f"no router at {where}: {reason}{advice}")
+        raise NotConnected(f"no router at {where}: start `mapweave server`, or {advice}")
     return bus
+
+
+def _listens(endpoint: str) -> bool:
+    """Whether a program takes connections there."""
+    host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), LOOK):
+            return True
+    except (OSError, ValueError):
+        return False
 
 
 def no_server(fleet: str, holder: Credentials | None = None) -> NotConnected:

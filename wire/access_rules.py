@@ -82,9 +82,10 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
     ]
     questions += [keys.agent_statuses(), f"{keys.root}/server/*/ack/*"]
     if role is Role.OPERATOR:
-        questions += [sent_by(f"{keys.root}/agent/*/mission", name), f"{keys.root}/agent/*/drive"]
+        questions += [sent_by(f"{keys.root}/agent/*/{what}", name) for what in ("mission", "portal")]
+        questions.append(f"{keys.root}/agent/*/drive")
     reads = [
-        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), f"{keys.root}/server/*/alive",
+        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), keys.servers_alive(),
         f"{keys.root}/server/*/poses/*",
     ]  # fmt: skip
     return [*_reads(reads), *_asks(questions)]
@@ -96,8 +97,9 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/mission/*",
-                  f"{agent}/drive", f"{base}/describe", f"{base}/step"]),
-        *_reads([*addressed, f"{keys.root}/server/*/alive", f"{base}/driver/*", f"{agent}/alive/*"]),
+                  f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive",
+                  f"{base}/describe", f"{base}/step"]),
+        *_reads([*addressed, keys.servers_alive(), f"{base}/driver/*", f"{agent}/alive/*"]),
         *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
                 f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
     ]  # fmt: skip

@@ -175,11 +175,14 @@ def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
     r0 = fleet.join("r0")
     for key in (KEYS.drive("r0"), KEYS.agent_status("r0")):
         r0.serve(key, answer)
-    serve_senders(r0, KEYS.mission("r0"), lambda request, who: answer(request))
+    for key in (KEYS.mission("r0"), KEYS.portal("r0")):
+        serve_senders(r0, key, lambda request, who: answer(request))
     anna, bob = fleet.join("anna"), fleet.join("bob")
     eventually(lambda: asked(anna, sent_by(KEYS.mission("r0"), "anna")) and asked(anna, KEYS.drive("r0")))
+    eventually(lambda: asked(anna, sent_by(KEYS.portal("r0"), "anna")))
     eventually(lambda: asked(bob, KEYS.agent_status("r0")))
-    assert not any(asked(bob, sent_by(KEYS.mission("r0"), who)) for who in ("", "anna", "bob"))
+    for key in (KEYS.mission("r0"), KEYS.portal("r0")):
+        assert not any(asked(bob, sent_by(key, who)) for who in ("", "anna", "bob"))
     assert not asked(bob, KEYS.drive("r0"))
 
 
@@ -197,12 +200,13 @@ def test_an_operator_commands_under_the_own_name_alone(fleet: Fleet) -> None:
     r0, carl = fleet.join("r0"), read_key_file(fleet.folder.add("carl", Role.OPERATOR)).credentials
     fleet.renew()
     serve_senders(r0, KEYS.mission("r0"), hear("order"))
+    serve_senders(r0, KEYS.portal("r0"), hear("portal"))
     for key in (KEYS.constrain("s0"), KEYS.annotate("s0"), KEYS.server_mission("s0")):
         serve_senders(fleet.router, key, hear(key.rpartition("/")[2]))
     anna, second = fleet.join("anna"), fleet.join_as(carl)
     keys = {
         "order": KEYS.mission("r0"), "constrain": KEYS.any_constrain(), "annotate": KEYS.any_annotate(),
-        "mission": KEYS.any_mission(),
+        "mission": KEYS.any_mission(), "portal": KEYS.portal("r0"),
     }  # fmt: skip
     for what, key in keys.items():
         eventually(lambda key=key: asked(anna, sent_by(key, "anna")))
