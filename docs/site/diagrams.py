@@ -54,7 +54,7 @@ def draw_robot(path: Path) -> None:
 
 
 def draw_fleet(path: Path) -> None:
-    """Who sends what to whom."""
+    """Senders and receivers of messages."""
     _, axes = plt.subplots(figsize=(8.4, 3.0), dpi=90)
     boxes = {
         "r0": (0.0, 2.0, "agent r0\nits own disk"), "r1": (0.0, 0.0, "agent r1\nits own disk"),
