@@ -24,15 +24,15 @@ COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})
 SIGNED = frozenset({"constrain", "annotate", "mission"})
 """Those whose sender is recorded: people ask them under keys that end with their name alone."""
 WATCHES = ("liveliness_query", "declare_liveliness_subscriber")
-OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve", "status"})
-"""Those of robots."""
+OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve"})
+"""Those of robots, each in its own name."""
 
 
 def may_ask(role: Role) -> frozenset[str]:
     """The questions to a server that a role may ask, over any transport."""
     match role:
         case Role.ROBOT:
-            return OF_ROBOTS
+            return OF_ROBOTS | {"status"}
         case Role.VIEWER:
             return frozenset(ASKS) - COMMANDS
     return frozenset(ASKS)
@@ -93,6 +93,7 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
 
 def _robot(keys: Keys, name: str) -> list[_Rule]:
     agent, base = f"{keys.root}/agent/{name}", f"{keys.root}/robot/{name}"
+    questions = [keys.in_name_of(name, f"{keys.root}/server/*/{what}") for what in sorted(OF_ROBOTS)]
     addressed = [f"{keys.root}/server/*/{what}/{name}" for what in ("ack", "poses")]
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
@@ -100,7 +101,7 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
                   f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive",
                   f"{base}/describe", f"{base}/step"]),
         *_reads([*addressed, keys.servers_alive(), f"{base}/driver/*", f"{agent}/alive/*"]),
-        *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
+        *_asks([*addressed, *questions, f"{keys.root}/server/*/status",
                 f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
     ]  # fmt: skip
 
