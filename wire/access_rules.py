@@ -32,7 +32,7 @@ def may_ask(role: Role) -> frozenset[str]:
     """The questions to a server that a role may ask, over any transport."""
     match role:
         case Role.ROBOT:
-            return OF_ROBOTS
+            return OF_ROBOTS | {"status"}
         case Role.VIEWER:
             return frozenset(ASKS) - COMMANDS
     return frozenset(ASKS)

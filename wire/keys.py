@@ -382,7 +382,7 @@ class Keys:
 
 
 def robot_of(key: str) -> str:
-    """In whose name a message or a question comes: a robot's; empty for people and servers."""
+    """In whose name a message or a question comes: a robot's, or a person's with a key; else empty."""
     match key.split("/")[3:]:
         case ["agent" | "robot", name, *_] | ["server", _, _, name] if NAME.fullmatch(name):
             return name
