@@ -11,7 +11,7 @@ from itertools import islice
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
@@ -136,6 +136,10 @@ class MergeWorker:
             self._schedule.post(lambda: self._end_reading(taken))
         self._schedule.catch_up()
         taken.wait()
+
+    def note_refusal(self, map_id: MapId, reason: str) -> None:
+        """Note that a change of a map was refused. Returns at once."""
+        self._post(lambda: self._merger.note_refusal(map_id, reason))
 
     def constrain(self, constraints: ManualConstraints) -> None:
         """Apply exactly these manual constraints from now on. Returns at once."""

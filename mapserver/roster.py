@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 
 from mapweave.hybridmap.agent_status import (
+    MAX_ACCUSATION,
     MAX_ROBOTS,
     NO_COMPONENT,
     AgentStatus,
@@ -76,6 +77,9 @@ class Roster:
             known = {name for name, maps in self._alive.items() if maps} | self._heard.keys()
             heard, alive = dict(self._heard), {name for name, maps in self._alive.items() if maps}
         over = self._quotas.over()
+        against: dict[str, str] = {}
+        for map_id, words in sorted(merged.accusations().items()):
+            against[map_id.agent] = words[:MAX_ACCUSATION]
         entries = []
         for name in sorted(known | over.keys())[:MAX_ROBOTS]:
             status, at = heard.get(name, (None, now))
@@ -84,8 +88,10 @@ class Roster:
             if pose is not None:
                 place, floor = places.name_at(component, pose), places.floor_of(component)
             age = max(now - at, 0.0)
-            words = one_line(over.get(name, ""))
-            entries.append(RobotEntry(name, name in alive, age, status, pose, component, place, floor, words))
+            words, accusation = one_line(over.get(name, "")), against.get(name, "")
+            entries.append(
+                RobotEntry(name, name in alive, age, status, pose, component, place, floor, words, accusation)
+            )
         return FleetStatus(tuple(entries))
 
     def _take(self, sample: Sample) -> None:

@@ -140,7 +140,7 @@ class MapServer:
         self._ingest = Ingest(
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
-            self._quotas, lambda: self._constraints.constraints.retired, worker.unmerged,
+            self._quotas, lambda: self._constraints.constraints.retired, worker.unmerged, worker.note_refusal,
         )  # fmt: skip
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,

@@ -62,6 +62,15 @@ class IngestSettings:
     retry_interval: float = 1.0
 
 
+MOST_AHEAD = 10_000_000
+"""Changes that a server may lack of a log: a robot makes about one a second, and a year has 3e7."""
+
+
+def words_of(refusal: Refusal) -> str:
+    """Which change is refused, and why."""
+    return f"change {refusal.sequence} is refused ({refusal.reason})"
+
+
 class Ingest:
     """Keeps a store complete. One thread applies changes; a few more wait for agents' answers."""
 
@@ -79,6 +88,7 @@ class Ingest:
         quotas: Quotas | None = None,
         retired: Callable[[], Collection[MapId]] = tuple,
         unmerged: Callable[[str], int] = lambda robot: 0,
+        note_refusal: Callable[[MapId, str], None] = lambda map_id, reason: None,
     ) -> None:
         """Replay the store, then listen.
 
@@ -97,6 +107,7 @@ class Ingest:
             quotas: of robots.
             retired: maps that do not count for them.
             unmerged: how many changes of a robot were passed on and wait.
+            note_refusal: called for a map of which a change was refused or is not believed, with the reason.
 
         Raises:
             InvalidFile: the store cannot be read.
@@ -104,7 +115,8 @@ class Ingest:
         self._bus, self._keys, self._store, self._name = bus, keys, store, check_name(server_name)
         self._objection, self._taken = objection, tuple(taken)
         self._quotas, self._unmerged = quotas or Quotas(clock=time.monotonic), unmerged
-        self._on_change, self._counters = on_change, IngestCounters()
+        self._on_change, self._note_refusal = on_change, note_refusal
+        self._counters = IngestCounters()
         self._settings = settings or IngestSettings()
         self._logs: dict[MapId, AgentLog] = {}
         self._intakes = Intakes(store, self._quotas, retired)
@@ -117,6 +129,9 @@ class Ingest:
         self._stopping, self._failure = False, ""
         maps = self._store.maps()
         stored = (change for map_id in maps for change in self._store.replay(map_id))
+        for map_id in maps:
+            for refusal in self._store.refusals(map_id)[:1]:
+                self._note_refusal(map_id, words_of(refusal))
         if replay is not None:
             replay(stored)
         for change in stored:
@@ -216,7 +231,7 @@ class Ingest:
         agent_log = self._log(map_id, mark.log_id)
         if agent_log is None:
             return None
-        agent_log.newest = max(agent_log.newest, mark.sequence)
+        self._believe(agent_log, mark.sequence)
         intake = self._intakes.of(map_id.agent)
         if mark.sequence <= agent_log.watermark or mark.sequence in agent_log.ahead:
             self._count(doubled=1)
@@ -241,7 +256,7 @@ class Ingest:
         agent_log = self._log(map_id, head.log_id)
         if agent_log is None:
             return None
-        agent_log.newest = max(agent_log.newest, head.newest)
+        self._believe(agent_log, head.newest)
         agent_log.heard(time.monotonic())
         # More than there is: it was another store that had it.
         if head.acknowledged.get(self._name, 0) != agent_log.watermark:
@@ -318,6 +333,18 @@ class Ingest:
             del self._unknown[oldest], self._logs[oldest]
             self._pulls.forget(oldest)
 
+    def _believe(self, agent_log: AgentLog, newest: int) -> None:
+        """Take note of a sequence number.
+
+        Raises:
+            InvalidMessage: no log is as long.
+        """
+        if newest > agent_log.watermark + MOST_AHEAD:
+            reason = f"change {newest} is announced, where {agent_log.watermark} have come"
+            self._note_refusal(agent_log.map, reason)
+            raise InvalidMessage(f"{agent_log.map}: {reason}")
+        agent_log.newest = max(agent_log.newest, newest)
+
     def _refuse(self, map_id: MapId, log_id: int, reason: str, watermark: int = 0) -> None:
         """Notify an agent that its log is not taken, or not beyond the watermark."""
         ack = Ack(map_id, log_id, watermark, (Refusal(0, reason),), self._store.id)
@@ -350,6 +377,7 @@ class Ingest:
         self._pulls.answers(agent_log.map.agent)
         for refusal in applied.refusals:
             log.warning("refused %s %d: %s", agent_log.map, refusal.sequence, refusal.reason)
+            self._note_refusal(agent_log.map, words_of(refusal))
         self._count(applied=len(applied.changes), refused=len(applied.refusals))
         self._pass_on(applied.changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.

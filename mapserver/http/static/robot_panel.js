@@ -34,6 +34,7 @@ export function listRobots(robots, select) {
     choice.dataset.robot = robot.robot;
     add(item, "span", ` ${word}`, kind);
     if (robot.over_quota) add(item, "span", ", over its quota", "bad");
+    if (robot.accusation) add(item, "span", " not trusted", "bad").title = robot.accusation;
     const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
       robot.component < 0 ? "not on the map" : ""];
     item.append(" " + parts.filter(Boolean).join(", "));
@@ -81,6 +82,7 @@ export function updateRobot(robots) {
   const spread = xx + yy > 0 ? ` (sigma ${xx.toFixed(3)}, ${yy.toFixed(3)} m, ${degrees(hh)})` : "";
   facts(panel.facts, [
     ["state", word, kind],
+    ["held against it", robot.accusation, "bad"],
     ["last heard", `${seconds(robot.age)} ago`],
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
