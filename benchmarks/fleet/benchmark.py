@@ -234,7 +234,9 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args()
     if min(options.agents) < 1 or options.seconds < INTERVAL or options.burst < 0 or options.seed < 0:
-        parser.error(f"--agents must be positive, --seconds at least {INTERVAL:g}, the others not negative")
+        parser.error(
+            f"--agents must be positive, --seconds at least {INTERVAL:g}, --burst and --seed not negative"
+        )
     rows: dict[str, Figures] = {}
     report: dict[str, object] = {
         "seed": options.seed, "cores": os.cpu_count(), "load_before": round(os.getloadavg()[0], 1),
