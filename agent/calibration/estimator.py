@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, predict
+from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, motions_over, predict
 from mapweave.agent.calibration.floor_scale import LEAST_FLOOR, floor_scale
 from mapweave.agent.calibration.pair_information import ImagePair, PairInformation, reduce_pair
 from mapweave.agent.calibration.parameter_sigmas import DELAY_SHARE, MODEL_SIGMAS, PRIOR_SIGMAS, useful
@@ -189,21 +189,22 @@ class Estimator:
             predicted = predict(self.vector, wheels, first, last)
             off = predicted.since(at)
             jacobian = self._jacobian(wheels, first, last, at, off)
-            rest = b - np.einsum("nij,nj->ni", a, off)
+            rest = b - _product(a, off)
             basis, growth = self._noise_basis(self.vector, wheels, first, last, predicted)
+            whitened = np.linalg.inv(basis)
+            transposed = np.swapaxes(whitened, 1, 2)
             for _ in range(NOISE_STEPS):
-                noise = np.einsum("nik,nk,njk->nij", basis, growth * self._noise, basis)
-                inverse = np.linalg.inv(noise)
+                variances = growth * self._noise
+                inverse = (transposed / variances[:, None]) @ whitened
                 posterior = np.asarray(np.linalg.inv(a + inverse), np.float64)
-                slip: Array = np.einsum("nij,nj->ni", posterior, rest)
-                weight = _weights(np.einsum("ni,nij,nj->n", slip, inverse, slip))
-                self._learn_noise(basis, growth, slip, posterior, weight)
+                slip = _product(posterior, rest)
+                weight = _weights((_product(whitened, slip) ** 2 / variances).sum(1))
+                self._learn_noise(whitened, growth, slip, posterior, weight)
             keep = np.eye(6) - a @ posterior
-            marginal = keep @ a
-            pull = np.einsum("nij,nj->ni", keep, rest)
-            scores = weight[:, None] * np.einsum("nji,nj->ni", jacobian, pull)
-            data = np.einsum("n,nji,njk,nkl->il", weight, jacobian, marginal, jacobian)
-            hessian = data + self._prior + fixed
+            scores = weight[:, None] * _product(np.swapaxes(jacobian, 1, 2), _product(keep, rest))
+            # One product of (10, 6 N) and (6 N, 10): of four tensors at once it takes half of a solution.
+            pulled = (weight[:, None, None] * (keep @ a @ jacobian)).reshape(-1, COUNT)
+            hessian = jacobian.reshape(-1, COUNT).T @ pulled + self._prior + fixed
             gradient: Array = scores.sum(0) - self._prior @ (self.vector - self.declared)
             gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
             self.vector = self.vector + np.linalg.solve(hessian, gradient)
@@ -266,6 +267,8 @@ class Estimator:
     ) -> Array:
         """(N, 6, 10) of the predicted motions with respect to the parameters, numeric."""
         columns = []
+        delay = self.vector[P.DELAY]
+        counted = wheels.between(first + delay, last + delay)
         for k in range(COUNT):
             moved = self.vector.copy()
             moved[k] += STEP[k]
@@ -276,7 +279,7 @@ class Estimator:
             if k == P.DELAY:
                 columns.append(self._delay_column(moved, wheels, first, last, at))
                 continue
-            columns.append((predict(moved, wheels, first, last).since(at) - off) / STEP[k])
+            columns.append((motions_over(moved, *counted).since(at) - off) / STEP[k])
         return np.stack(columns, axis=-1)
 
     def _delay_column(
@@ -314,10 +317,11 @@ class Estimator:
         """
         n = len(first)
         basis = np.zeros((n, 6, 6))
+        counted = wheels.between(first + vector[P.DELAY], last + vector[P.DELAY])
         for k in range(3):
             slip = np.zeros(3)
             slip[k] = SLIP_STEP
-            moved = predict(vector, wheels, first, last, slip)
+            moved = motions_over(vector, *counted, slip)
             basis[:, :, k] = moved.since(predicted) / SLIP_STEP
         basis[:, 3, 3] = basis[:, 5, 4] = basis[:, 1, 5] = 1.0
         ways, turns = wheels.between(first, last)
@@ -331,13 +335,14 @@ class Estimator:
         self, vector: Array, wheels: WheelTrack, first: Array, last: Array, predicted: CameraMotions
     ) -> Array:
         basis, growth = self._noise_basis(vector, wheels, first, last, predicted)
-        return np.asarray(np.einsum("nik,nk,njk->nij", basis, growth * self._noise, basis))
+        return (basis * (growth * self._noise)[:, None]) @ np.swapaxes(basis, 1, 2)
 
-    def _learn_noise(self, basis: Array, growth: Array, slip: Array, posterior: Array, weight: Array) -> None:
+    def _learn_noise(
+        self, whitened: Array, growth: Array, slip: Array, posterior: Array, weight: Array
+    ) -> None:
         """One step of expectation maximisation for the variances of slip and springs."""
-        solved = np.linalg.inv(basis)
-        own = np.einsum("nij,nj->ni", solved, slip)
-        spread = np.einsum("nij,njk,nik->ni", solved, posterior, solved)
+        own = _product(whitened, slip)
+        spread = ((whitened @ posterior) * whitened).sum(2)
         share = (weight[:, None] * own**2 + spread) / growth
         learned = (share.sum(0) + 5.0 * FIRST_NOISE * 0.01) / (len(share) + 5.0)
         self._noise = np.clip(learned, 1e-4 * FIRST_NOISE, 4.0 * FIRST_NOISE)
@@ -361,6 +366,11 @@ class Estimator:
         pulls = _few_blocks(len(blocks)) ** 2 * (blocks.T @ blocks + cross + cross.T)
         prior = inverse_hessian @ self._prior @ inverse_hessian
         return np.asarray(inverse_hessian @ pulls @ inverse_hessian + prior)
+
+
+def _product(matrices: Array, vectors: Array) -> Array:
+    """(N, I) products of (N, I, J) matrices with (N, J) vectors."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def _few_blocks(blocks: int) -> float:

@@ -1,7 +1,7 @@
 """Calibration while mapping: image pairs of the tracks that are followed anyway, a solution now and then.
 
 It costs about one reduction of a pair a tick while estimates change, and one Gauss-Newton step every few
-seconds. What the drive shows and contradicts the geometry in use is said once, in one line, and used from the
+seconds. No tick does two of these: a solution comes two ticks after the pair that it was due with. What the drive shows and contradicts the geometry in use is said once, in one line, and used from the
 next node on.
 """
 
@@ -39,6 +39,8 @@ LEAST = 0.004
 FEWEST_PAIRS = 20
 SOLVE_EVERY = 4
 """Pairs between two solutions."""
+PARTS = 2
+"""Ticks over which a solution is spread: the floor, the step."""
 MOST_PAIRS = 150
 KEPT_NEW = 40
 """Of these the newest stay; of the others those go that turn least."""
@@ -88,6 +90,7 @@ class OnlineCalibration:
         self._begin: Array = np.zeros((0, 2))
         self._floor = FloorPoints(description.camera)
         self._since_solution = 0
+        self._parts_left = 0
         self._taken = 0
         self._named_since = np.full(COUNT, np.inf)
         self._changed_since = np.full(COUNT, np.inf)
@@ -128,12 +131,13 @@ class OnlineCalibration:
             raw: (N, 2) px in the real image.
         """
         now = self._stamps[-1]
+        found = self._solve()
         if source is not self._source or now - self._first_s > 3.0 * LONGEST_S:
             self._start(image, source, now, ids, raw)
-            return ()
+            return found
         self._floor.follow(image)
         if now - self._first_s < SHORTEST_S:
-            return ()
+            return found
         common, mine, theirs = np.intersect1d(self._ids, ids, assume_unique=True, return_indices=True)
         moved = (
             float(np.median(np.linalg.norm(raw[theirs] - self._begin[mine], axis=1))) if len(common) else 0.0
@@ -143,7 +147,7 @@ class OnlineCalibration:
         leaving = len(common) < LEAST_LEFT * len(self._ids) or self._floor.left < LEAST_LEFT
         if not (due or leaving):
             self._refresh()
-            return ()
+            return found
         pair = None
         if len(common) >= LEAST_TRACKS and moved > LEAST * camera.width:
             begun, ended = self._floor.moved
@@ -154,7 +158,9 @@ class OnlineCalibration:
             )
             pair = ImagePair(self._first_s, now, before, after)
         self._start(image, source, now, ids, raw)
-        return self._take(pair) if pair is not None else ()
+        if pair is not None:
+            self._take(pair)
+        return found
 
     def pause(self) -> None:
         """The tracks are not to be trusted now."""
@@ -176,7 +182,7 @@ class OnlineCalibration:
         counts = np.array(self._counts)
         return WheelTrack(np.array(self._stamps), counts[:, 0], counts[:, 1])
 
-    def _take(self, pair: ImagePair) -> Sequence[Cause]:
+    def _take(self, pair: ImagePair) -> None:
         estimator = self._estimator
         wheels = self._wheels()
         estimator.add(pair, wheels)
@@ -189,11 +195,18 @@ class OnlineCalibration:
             del self._turns[old]
             self._trim()
         self._since_solution += 1
-        if len(estimator.pairs) < FEWEST_PAIRS or self._since_solution < SOLVE_EVERY:
+        if len(estimator.pairs) >= FEWEST_PAIRS and self._since_solution >= SOLVE_EVERY:
+            self._since_solution, self._parts_left = 0, PARTS
+
+    def _solve(self) -> Sequence[Cause]:
+        """Do the next part of a solution that is due; causes that it finds."""
+        if not self._parts_left:
             return ()
-        self._since_solution = 0
-        estimator.find_floor()
-        estimate = estimator.solve(wheels, STEPS)
+        self._parts_left -= 1
+        if self._parts_left:
+            self._estimator.find_floor()
+            return ()
+        estimate = self._estimator.solve(self._wheels(), STEPS)
         before, self._last = self._last, estimate
         if before is None:
             return ()
@@ -254,5 +267,6 @@ class OnlineCalibration:
         vector = self._estimator.vector
         self._estimator = Estimator(geometry_of(self._declared), sigma_of(self._declared.camera))
         self._estimator.vector = vector
-        self._source, self._since_solution, self._last, self._taken = None, 0, None, 0
+        self._source, self._last = None, None
+        self._since_solution = self._parts_left = self._taken = 0
         self._named_since[:] = self._changed_since[:] = np.inf
