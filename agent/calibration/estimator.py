@@ -11,14 +11,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, motions_over, predict
 from mapweave.agent.calibration.floor_scale import LEAST_FLOOR, floor_scale
-from mapweave.agent.calibration.pair_information import ImagePair, PairInformation, reduce_pair
+from mapweave.agent.calibration.pair_information import (
+    FloorMatches,
+    ImagePair,
+    PairInformation,
+    reduce_pair,
+    with_floor,
+)
 from mapweave.agent.calibration.parameter_sigmas import DELAY_SHARE, MODEL_SIGMAS, PRIOR_SIGMAS, useful
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.hybridmap.pose import Array
@@ -149,6 +155,11 @@ class Estimator:
         self._reduced_sigmas.append(self._sigma)
         return self.informations[-1]
 
+    def add_floor(self, floor: FloorMatches) -> None:
+        """Keep points of the floor with the newest pair."""
+        pair = self.pairs[-1] = replace(self.pairs[-1], floor=floor)
+        self.informations[-1] = with_floor(self.informations[-1], pair, self._most_sigma)
+
     def drop(self, index: int) -> None:
         """Forget a pair."""
         del self.pairs[index], self.informations[index], self.reduced_at[index], self._reduced_sigmas[index]
@@ -246,17 +257,17 @@ class Estimator:
         fresh = [
             k for k, at in enumerate(self.reduced_at) if abs(at[P.PITCH] - self.vector[P.PITCH]) < STALE_PITCH
         ]
-        ratios = [
-            self.informations[k].floor_ratios
-            + self.reduced_at[k][P.WHEEL_SCALE]
-            - self.reduced_at[k][P.HEIGHT]
-            for k in fresh
-        ]
-        blocks = np.repeat(np.array(fresh, np.int64) // BLOCK, [len(r) for r in ratios])
+        seen = [self.informations[k].floor for k in fresh]
+        counts = [len(floor.logs) for floor in seen]
+        reduced = [self.reduced_at[k][P.WHEEL_SCALE] - self.reduced_at[k][P.HEIGHT] for k in fresh]
         found = floor_scale(
-            np.concatenate([*ratios, np.zeros(0)]) - used,
-            np.concatenate([*(self.informations[k].floor_sigmas for k in fresh), np.zeros(0)]),
-            blocks,
+            np.concatenate([*(floor.logs for floor in seen), np.zeros(0)])
+            + np.repeat(reduced, counts)
+            - used,
+            np.concatenate([*(floor.sigmas for floor in seen), np.zeros(0)]),
+            np.concatenate([*(floor.flatness for floor in seen), np.zeros(0)]),
+            np.repeat(np.array(fresh, np.int64), counts),
+            BLOCK,
         )
         pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) / FLOOR_BELOW
         self._floor = None if found is None else (float(used + found.log), math.hypot(found.sigma, pitch))
