@@ -37,8 +37,9 @@ STEP = np.array([1e-5, 1e-5, 1e-6, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
 SLIP_STEP = 1e-5
 NOISE_STEPS = 4
 """Of expectation maximisation in each Gauss-Newton step."""
-STALE_PITCH = 0.004
-"""Pairs that were reduced with another pitch than the present, rad, tell nothing of the floor."""
+STALE_PITCH = 0.02
+"""Pairs that were reduced with another pitch than the present, rad, tell nothing of the floor: its tiles were
+looked for elsewhere."""
 FLOOR_BELOW = 0.2
 """How far below the horizon floor is seen, rad: a wrong pitch moves it away by its share of this."""
 DELAY_SMOOTH_S = 0.5
@@ -254,21 +255,19 @@ class Estimator:
         Nothing else is learnt from the floor: a pavement or a carpet must not bend the rest.
         """
         used = self.vector[P.WHEEL_SCALE] - self.vector[P.HEIGHT]
-        fresh = [
-            k for k, at in enumerate(self.reduced_at) if abs(at[P.PITCH] - self.vector[P.PITCH]) < STALE_PITCH
-        ]
-        seen = [self.informations[k].floor for k in fresh]
-        counts = [len(floor.logs) for floor in seen]
-        reduced = [self.reduced_at[k][P.WHEEL_SCALE] - self.reduced_at[k][P.HEIGHT] for k in fresh]
-        found = floor_scale(
-            np.concatenate([*(floor.logs for floor in seen), np.zeros(0)])
-            + np.repeat(reduced, counts)
-            - used,
-            np.concatenate([*(floor.sigmas for floor in seen), np.zeros(0)]),
-            np.concatenate([*(floor.flatness for floor in seen), np.zeros(0)]),
-            np.repeat(np.array(fresh, np.int64), counts),
-            BLOCK,
-        )
+        logs, sigmas, flatness, numbers = list[Array](), list[Array](), list[Array](), list[Array]()
+        for k, (at, information) in enumerate(zip(self.reduced_at, self.informations, strict=True)):
+            tilt, floor = self.vector[P.PITCH] - at[P.PITCH], information.floor
+            if abs(tilt) < STALE_PITCH:
+                reduced = at[P.WHEEL_SCALE] - at[P.HEIGHT]
+                logs.append(floor.logs + (reduced - used) - tilt * floor.flatness)
+                sigmas.append(floor.sigmas)
+                flatness.append(floor.flatness)
+                numbers.append(np.full(len(floor.logs), k))
+        found = None
+        if logs:
+            parts = (np.concatenate(part) for part in (logs, sigmas, flatness, numbers))
+            found = floor_scale(*parts, BLOCK)
         pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) / FLOOR_BELOW
         self._floor = None if found is None else (float(used + found.log), math.hypot(found.sigma, pitch))
         self.floor_tracks = 0 if found is None else found.tracks

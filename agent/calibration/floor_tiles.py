@@ -30,8 +30,10 @@ MARGIN_PX = 4
 BLUR_PX = 0.8
 SEARCHED = np.arange(-0.3, 0.31, 0.05)
 """Logarithms of inverse depth over the floor's with which a tile is tried first,"""
-STEPS = 4
+STEPS = 3
 """and Gauss-Newton steps from the best."""
+CONVERGED = 0.02
+"""Last step at most."""
 LEAST_CORRELATION = 0.85
 """Of a tile with where it is found;"""
 AMBIGUOUS = 0.1
@@ -45,26 +47,34 @@ LEAST_SIGMA_PX = 0.1
 
 
 class FloorTiles:
-    """Where tiles of the floor can lie in the images of one camera."""
+    """Where tiles of the floor can lie in the images of one camera.
+
+    Attributes:
+        camera: intrinsics of the images.
+        lens: of them.
+        distorted: whether the lens moves any tile.
+        top: first row of an image that matters.
+    """
 
     def __init__(self, camera: Camera, lens: Lens) -> None:
         """Take the camera of the images, and their lens."""
-        self._camera, self._lens = camera, lens
-        self._focal = np.array([camera.fx, camera.fy])
-        self._centre = np.array([camera.cx, camera.cy])
-        self._top = max(math.floor(camera.cy), 0)
-        rows = np.arange(self._top + MARGIN_PX, camera.height - MARGIN_PX - HEIGHT_PX, HEIGHT_PX)
+        self.camera, self.lens = camera, lens
+        self.top = max(math.floor(camera.cy), 0)
+        rows = np.arange(self.top + MARGIN_PX, camera.height - MARGIN_PX - HEIGHT_PX, HEIGHT_PX)
         columns = np.arange(MARGIN_PX, camera.width - MARGIN_PX - WIDTH_PX, WIDTH_PX)
         corner = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
         y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
         self._pixels = corner + np.stack([x, y], axis=-1).reshape(1, -1, 2)
-        ideal = lens.undistort(self._pixels.reshape(-1, 2).astype(np.float64))
-        rays = np.column_stack([(ideal - self._centre) / self._focal, np.ones(len(ideal))])
+        raw = self._pixels.reshape(-1, 2).astype(np.float64)
+        ideal = lens.undistort(raw)
+        self.distorted = not np.array_equal(raw, ideal)
+        rays = np.ones((len(ideal), 3))
+        rays[:, :2] = (ideal - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
         self._rays = rays.reshape(*self._pixels.shape[:2], 3)
 
     def part(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """What matters of an image, (H, W) grey: below the middle row, a little blurred."""
-        below = image[self._top :].astype(np.float32)
+        below = image[self.top :].astype(np.float32)
         return np.asarray(cv2.GaussianBlur(below, (0, 0), BLUR_PX), np.float32)
 
     def match(
@@ -84,47 +94,33 @@ class FloorTiles:
         if before.shape != after.shape or not len(chosen):
             return FloorMatches.none()
         column, row = np.moveaxis(self._pixels[chosen], -1, 0)
-        template = before[row - self._top, column]
+        template = before[row - self.top, column]
         # Texture along the way counts: gradients down the image.
         energy = np.square(np.diff(template.reshape(-1, HEIGHT_PX, WIDTH_PX), axis=1)).sum((1, 2))
         best = np.sort(np.argsort(-energy, kind="stable")[:MOST])
         chosen, template = chosen[best], template[best]
         warp = _Warp(self, self._rays[chosen], at)
         template = template - template.mean(axis=1, keepdims=True)
-        logs, unique = self._searched(template, after, warp)
-        step = sigma = np.zeros(0)
+        logs, unique = _searched(template, after, warp)
+        step = sigma = np.zeros(len(logs))
         for _ in range(STEPS):
-            shown, slope = warp.sampled(after, logs)
-            gain = (template * shown).sum(1) / np.maximum((shown**2).sum(1), 1e-6)
-            error, slope = gain[:, None] * shown - template, gain[:, None] * slope
+            nearer, farther = (warp.values(after, logs + off) for off in (STEP, -STEP))
+            shown, slope = 0.5 * (nearer + farther), (nearer - farther) / (2.0 * STEP)
+            gain = ((template * shown).sum(1) / np.maximum((shown**2).sum(1), 1e-6))[:, None]
+            error, slope = gain * shown - template, gain * slope
             stiffness = (slope**2).sum(1) + 1e-6
             step = np.clip(-(slope * error).sum(1) / stiffness, -0.05, 0.05)
             logs = np.clip(logs + step, -1.0, 1.0)
             sigma = np.sqrt((error**2).sum(1) / (INDEPENDENT * error.shape[1] * stiffness))
-        shown, _ = warp.sampled(after, logs)
-        pixels = warp.pixels(logs)
-        inside = ((pixels > 2) & (pixels < [self._camera.width - 3, self._camera.height - 3])).all((1, 2))
-        kept = inside & unique & (_correlation(template, shown) > LEAST_CORRELATION) & (np.abs(step) < 0.02)
         sigma = np.minimum(sigma, 1.0)
+        column, row = warp.pixels(logs)
+        inside = ((column > 2) & (column < self.camera.width - 3)).all(axis=1)
+        inside &= ((row > self.top + 2) & (row < self.camera.height - 3)).all(axis=1)
+        kept = inside & unique & (np.abs(step) < CONVERGED)
+        kept &= _correlation(template, warp.values(after, logs)) > LEAST_CORRELATION
         moved = warp.middle(logs + 0.5 * sigma) - warp.middle(logs - 0.5 * sigma)
-        across = np.hypot(np.linalg.norm(moved, axis=1), LEAST_SIGMA_PX / self._camera.fy)
+        across = np.hypot(np.linalg.norm(moved, axis=1), LEAST_SIGMA_PX / self.camera.fy)
         return FloorMatches(middle[chosen][kept, :2], warp.middle(logs)[kept], across[kept])
-
-    def _searched(
-        self, template: Array, after: NDArray[np.float32], warp: _Warp
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        """(N,) best of the logarithms that are tried, and whether no other is as good."""
-        part = slice(None, None, 2)
-        tried = np.stack(
-            [
-                _correlation(template[:, part], warp.sampled(after, np.full(len(template), log), part)[0])
-                for log in SEARCHED
-            ]
-        )
-        best = tried.argmax(axis=0)
-        near = np.abs(np.arange(len(SEARCHED))[:, None] - best) <= 2
-        other = np.where(near, -1.0, tried).max(axis=0)
-        return SEARCHED[best], other < tried.max(axis=0) - AMBIGUOUS
 
 
 class _Warp:
@@ -132,42 +128,52 @@ class _Warp:
 
     def __init__(self, tiles: FloorTiles, rays: Array, at: CameraMotions) -> None:
         self._tiles = tiles
-        self._turned = rays @ at.rotation.T
+        self._turned = np.moveaxis(rays @ at.rotation.T, -1, 0)
         self._floor = rays @ at.floor
         self._translation = at.translation
 
-    def normalised(self, logs: Array, part: slice) -> Array:
-        """(N, P, 2) normalised coordinates."""
+    def pixels(self, logs: Array, part: slice = slice(None)) -> tuple[Array, Array]:
+        """Columns and rows (N, P) px in the real image."""
+        tiles, camera = self._tiles, self._tiles.camera
         rho = self._floor[:, part] * np.exp(logs)[:, None]
-        y = self._turned[:, part] + rho[..., None] * self._translation
-        return np.asarray(y[..., :2] / np.maximum(y[..., 2:], 0.05))
+        x, y, z = (a[:, part] + rho * t for a, t in zip(self._turned, self._translation, strict=True))
+        focal = 1.0 / np.maximum(z, 0.05)
+        column, row = camera.cx + camera.fx * x * focal, camera.cy + camera.fy * y * focal
+        if tiles.distorted:
+            there = tiles.lens.distort(np.column_stack([column.ravel(), row.ravel()]))
+            column, row = there.T.reshape(2, *column.shape)
+        return column, row
 
     def middle(self, logs: Array) -> Array:
         """(N, 2) normalised coordinates of the tiles' middles."""
-        turned, floor = self._turned.mean(axis=1), self._floor.mean(axis=1)
-        y = turned + (floor * np.exp(logs))[:, None] * self._translation
+        turned, floor = self._turned.mean(axis=2), self._floor.mean(axis=1)
+        y = turned.T + (floor * np.exp(logs))[:, None] * self._translation
         return np.asarray(y[:, :2] / np.maximum(y[:, 2:], 0.05))
 
-    def pixels(self, logs: Array, part: slice = slice(None)) -> Array:
-        """(N, P, 2) px in the real image."""
-        tiles = self._tiles
-        ideal = self.normalised(logs, part) * tiles._focal + tiles._centre
-        return tiles._lens.distort(ideal.reshape(-1, 2)).reshape(ideal.shape)
-
-    def sampled(
-        self, after: NDArray[np.float32], logs: Array, part: slice = slice(None)
-    ) -> tuple[Array, Array]:
-        """(N, P) values there less each tile's mean, and (N, P) how they change with the logarithms."""
-        top = np.array([0.0, self._tiles._top])
-        values = []
-        for off in (-STEP, STEP):
-            column, row = np.moveaxis((self.pixels(logs + off, part) - top).astype(np.float32), -1, 0)
-            values.append(cv2.remap(after, column, row, cv2.INTER_LINEAR).astype(np.float64))
-        shown, slope = 0.5 * (values[0] + values[1]), (values[1] - values[0]) / (2.0 * STEP)
-        return shown - shown.mean(axis=1, keepdims=True), slope - slope.mean(axis=1, keepdims=True)
+    def values(self, after: NDArray[np.float32], logs: Array, part: slice = slice(None)) -> Array:
+        """(N, P) of the second image there, less each tile's mean."""
+        column, row = self.pixels(logs, part)
+        there = (column.astype(np.float32), (row - self._tiles.top).astype(np.float32))
+        values = cv2.remap(after, *there, cv2.INTER_LINEAR)
+        return np.asarray(values - values.mean(axis=1, keepdims=True), np.float64)
 
 
 def _correlation(one: Array, other: Array) -> Array:
     """(N,) of rows that have no mean."""
     size = np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
     return np.asarray((one * other).sum(axis=1) / np.maximum(size, 1e-6))
+
+
+def _searched(template: Array, after: NDArray[np.float32], warp: _Warp) -> tuple[Array, NDArray[np.bool_]]:
+    """(N,) best of the logarithms that are tried, and whether no other is as good."""
+    part = slice(None, None, 2)
+    tried = np.stack(
+        [
+            _correlation(template[:, part], warp.values(after, np.full(len(template), log), part))
+            for log in SEARCHED
+        ]
+    )
+    best = tried.argmax(axis=0)
+    near = np.abs(np.arange(len(SEARCHED))[:, None] - best) <= 2
+    other = np.where(near, -1.0, tried).max(axis=0)
+    return SEARCHED[best], other < tried.max(axis=0) - AMBIGUOUS
