@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, motions_over, predict
-from mapweave.agent.calibration.floor_scale import LEAST_FLOOR, floor_scale
+from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.floor_scale import floor_scale
 from mapweave.agent.calibration.pair_information import (
     FloorMatches,
     ImagePair,
@@ -46,8 +46,6 @@ DELAY_SMOOTH_S = 0.5
 """Over which the wheels' speed is averaged where it serves as an instrument for the delay."""
 STUDENT = 5.0
 """Degrees of freedom of the pairs' weights."""
-SIGNIFICANT = 3.5
-"""Sigmas from the declared value at which a parameter is declared wrongly."""
 BLOCK = 4
 """Pairs in a row whose errors may go together."""
 FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
@@ -60,55 +58,6 @@ ROUNDS = 3
 """Of a batch: reductions of all pairs."""
 INNER = 6
 """Gauss-Newton steps between two reductions of the pairs."""
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Parameters with their covariance.
-
-    Attributes:
-        vector: (10,) in the order of `Parameter`.
-        covariance: (10, 10).
-        declared: (10,) before anything was seen.
-        pairs: how many image pairs it is made of.
-        floor_tracks: tracks on the floor in all of them.
-        keep_wheels: whether the wheels' scale was held instead of the height.
-    """
-
-    vector: Array
-    covariance: Array
-    declared: Array
-    pairs: int
-    floor_tracks: int
-    keep_wheels: bool = False
-
-    @property
-    def geometry(self) -> DriveGeometry:
-        """All estimated values, shown or not."""
-        return DriveGeometry.of(self.vector)
-
-    @property
-    def sigmas(self) -> Array:
-        """(10,) standard deviations."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def shown(self) -> NDArray[np.bool_]:
-        """(10,) which parameters the drive shows: better than useful, and much better than assumed.
-
-        Without the floor nothing tells a scale.
-        """
-        assumed = np.array([PRIOR_SIGMAS[p] for p in P])
-        if self.keep_wheels:
-            assumed[[P.WHEEL_SCALE, P.HEIGHT]] = assumed[[P.HEIGHT, P.WHEEL_SCALE]]
-        shown = np.asarray((self.sigmas < useful(self.declared)) & (self.sigmas < 0.5 * assumed))
-        shown[[P.WHEEL_SCALE, P.HEIGHT, P.LEFT]] &= self.floor_tracks >= LEAST_FLOOR
-        return shown
-
-    @property
-    def usable(self) -> DriveGeometry:
-        """What the drive shows; all else as declared."""
-        return DriveGeometry.of(np.where(self.shown, self.vector, self.declared))
 
 
 class Estimator:

@@ -35,9 +35,7 @@ STEPS = 3
 CONVERGED = 0.02
 """Last step at most."""
 LEAST_CORRELATION = 0.85
-"""Of a tile with where it is found;"""
-AMBIGUOUS = 0.1
-"""no place further off than two steps of the search may correlate as well but for this: a pattern repeats."""
+"""Of a tile with where it is found."""
 STEP = 0.02
 """Of the numeric derivative by a logarithm."""
 INDEPENDENT = 0.25
@@ -75,6 +73,8 @@ class FloorTiles:
     def part(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """What matters of an image, (H, W) grey: below the middle row, a little blurred."""
         below = image[self.top :].astype(np.float32)
+        if not below.size:
+            return below
         return np.asarray(cv2.GaussianBlur(below, (0, 0), BLUR_PX), np.float32)
 
     def match(
@@ -91,7 +91,8 @@ class FloorTiles:
         steepness = middle @ (at.floor / np.linalg.norm(at.floor))
         ahead = (steepness > FLOOR_STEEPNESS) & (np.abs(middle[:, 0]) < ABREAST * steepness)
         chosen = np.flatnonzero(ahead)
-        if before.shape != after.shape or not len(chosen):
+        size = (self.camera.height - self.top, self.camera.width)
+        if not before.shape == after.shape == size or not len(chosen):
             return FloorMatches.none()
         column, row = np.moveaxis(self._pixels[chosen], -1, 0)
         template = before[row - self.top, column]
@@ -101,7 +102,7 @@ class FloorTiles:
         chosen, template = chosen[best], template[best]
         warp = _Warp(self, self._rays[chosen], at)
         template = template - template.mean(axis=1, keepdims=True)
-        logs, unique = _searched(template, after, warp)
+        logs = _searched(template, after, warp)
         step = sigma = np.zeros(len(logs))
         for _ in range(STEPS):
             nearer, farther = (warp.values(after, logs + off) for off in (STEP, -STEP))
@@ -116,7 +117,7 @@ class FloorTiles:
         column, row = warp.pixels(logs)
         inside = ((column > 2) & (column < self.camera.width - 3)).all(axis=1)
         inside &= ((row > self.top + 2) & (row < self.camera.height - 3)).all(axis=1)
-        kept = inside & unique & (np.abs(step) < CONVERGED)
+        kept = inside & (np.abs(step) < CONVERGED)
         kept &= _correlation(template, warp.values(after, logs)) > LEAST_CORRELATION
         moved = warp.middle(logs + 0.5 * sigma) - warp.middle(logs - 0.5 * sigma)
         across = np.hypot(np.linalg.norm(moved, axis=1), LEAST_SIGMA_PX / self.camera.fy)
@@ -164,16 +165,11 @@ def _correlation(one: Array, other: Array) -> Array:
     return np.asarray((one * other).sum(axis=1) / np.maximum(size, 1e-6))
 
 
-def _searched(template: Array, after: NDArray[np.float32], warp: _Warp) -> tuple[Array, NDArray[np.bool_]]:
-    """(N,) best of the logarithms that are tried, and whether no other is as good."""
+def _searched(template: Array, after: NDArray[np.float32], warp: _Warp) -> Array:
+    """(N,) best of the logarithms that are tried, by every other pixel."""
     part = slice(None, None, 2)
-    tried = np.stack(
-        [
-            _correlation(template[:, part], warp.values(after, np.full(len(template), log), part))
-            for log in SEARCHED
-        ]
-    )
-    best = tried.argmax(axis=0)
-    near = np.abs(np.arange(len(SEARCHED))[:, None] - best) <= 2
-    other = np.where(near, -1.0, tried).max(axis=0)
-    return SEARCHED[best], other < tried.max(axis=0) - AMBIGUOUS
+    tried = [
+        _correlation(template[:, part], warp.values(after, np.full(len(template), log), part))
+        for log in SEARCHED
+    ]
+    return np.asarray(SEARCHED[np.stack(tried).argmax(axis=0)])

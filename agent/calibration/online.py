@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import WheelTrack
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
-from mapweave.agent.calibration.estimator import SIGNIFICANT, Estimate, Estimator
+from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.floor_tiles import FloorTiles
 from mapweave.agent.calibration.image_pairs import (
     LEAST_LEFT,
@@ -34,7 +35,7 @@ from mapweave.vision.lens import Lens
 P = Parameter
 ENOUGH = 0.04
 """A pair ends when half of its tracks have moved this far, as a share of the image's width,"""
-ENOUGH_HEIGHTS = 1.5
+ENOUGH_HEIGHTS = 0.5
 """or the camera by so many of its heights: near floor leaves the view;"""
 LEAST = 0.004
 """and says nothing if they have moved less than this."""
