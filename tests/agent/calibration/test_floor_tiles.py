@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from mapweave.agent.calibration.camera_motions import CameraMotions, rotations
 from mapweave.agent.calibration.floor_scale import floor_scale
 from mapweave.agent.calibration.floor_tiles import FloorTiles
+from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.calibration.pair_information import ImagePair, floor_ratios
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
 from synthetic.room_drive import CAMERA
@@ -99,3 +101,23 @@ def test_slopes_of_single_pairs_do_not_bend_the_scale():
     assert flat is not None
     assert abs(found.log - 0.03) < 3.0 * found.sigma < 0.03
     assert abs(flat.log - 0.03) > 0.015
+
+
+def test_a_robot_that_maps_sees_how_far_it_goes():
+    """Wheels that report 4 % too much, over a carpet: each pair tells it."""
+    way, pattern, lens = 0.1, carpet(10.0), Lens(CAMERA)
+    points = np.random.default_rng(2).uniform([-2.0, -1.0, 0.5], [2.0, 0.2, 4.0], (80, 3))
+    online = OnlineCalibration(RobotDescription(CAMERA))
+    for k in range(7):
+        centre = np.array([0.0, 0.0, k * way])
+        image = seen(pattern, np.eye(3), centre, lens, 1.0)
+        online.correct(Observation(1 + 300_000_000 * k, Odometry(1.04 * way if k else 0.0, 0.0)))
+        local = points - centre
+        pixels = local[:, :2] / local[:, 2:] * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
+        seeable = np.flatnonzero((local[:, 2] > 0.3) & CAMERA.contains(pixels, 4.0))
+        online.watch(image, pattern, seeable, pixels[seeable])
+    floors = [information.floor for information in online._estimator.informations]
+    assert len(floors) >= 3
+    for floor in floors:
+        assert len(floor.logs) >= 10
+        assert float(np.median(floor.logs)) == pytest.approx(-math.log(1.04), abs=0.01)
