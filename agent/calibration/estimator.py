@@ -152,7 +152,7 @@ class Estimator:
             jacobian = self._jacobian(wheels, first, last, at, off)
             rest = b - _product(a, off)
             basis, growth = self._noise_basis(self.vector, wheels, first, last, predicted)
-            whitened = np.linalg.inv(basis)
+            whitened = np.asarray(np.linalg.inv(basis), np.float64)
             transposed = np.swapaxes(whitened, 1, 2)
             for _ in range(NOISE_STEPS):
                 variances = growth * self._noise
@@ -170,7 +170,7 @@ class Estimator:
             gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
             self.vector = self.vector + np.linalg.solve(hessian, gradient)
         self._learn_scene()
-        inverse_hessian = np.linalg.inv(hessian)
+        inverse_hessian = np.asarray(np.linalg.inv(hessian), np.float64)
         self._covariance = _wider(inverse_hessian, self._scatter(inverse_hessian, scores))
         model = MODEL_SIGMAS.copy()
         model[P.DELAY] = max(model[P.DELAY], DELAY_SHARE * float(np.median(np.diff(wheels.stamps))))
@@ -204,7 +204,7 @@ class Estimator:
         Nothing else is learnt from the floor: a pavement or a carpet must not bend the rest.
         """
         used = self.vector[P.WHEEL_SCALE] - self.vector[P.HEIGHT]
-        logs, sigmas, flatness, numbers = list[Array](), list[Array](), list[Array](), list[Array]()
+        logs, sigmas, flatness, numbers = list[Array](), list[Array](), list[Array](), list[int]()
         for k, (at, information) in enumerate(zip(self.reduced_at, self.informations, strict=True)):
             tilt, floor = self.vector[P.PITCH] - at[P.PITCH], information.floor
             if abs(tilt) < STALE_PITCH:
@@ -212,11 +212,11 @@ class Estimator:
                 logs.append(floor.logs + (reduced - used) - tilt * floor.flatness)
                 sigmas.append(floor.sigmas)
                 flatness.append(floor.flatness)
-                numbers.append(np.full(len(floor.logs), k))
+                numbers += [k] * len(floor.logs)
         found = None
         if logs:
-            parts = (np.concatenate(part) for part in (logs, sigmas, flatness, numbers))
-            found = floor_scale(*parts, BLOCK)
+            joined = [np.concatenate(part) for part in (logs, sigmas, flatness)]
+            found = floor_scale(joined[0], joined[1], joined[2], np.array(numbers, np.int64), BLOCK)
         pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) / FLOOR_BELOW
         self._floor = None if found is None else (float(used + found.log), math.hypot(found.sigma, pitch))
         self.floor_tracks = 0 if found is None else found.tracks

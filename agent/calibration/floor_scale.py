@@ -92,8 +92,8 @@ def floor_scale(
         floor, pull = float(share.mean()), share / spread**2
         square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
         # The mode is common, each pair has a slope: its row of the normal equations is eliminated.
-        level, cross, steep = (np.bincount(own, pull * flatness**k) for k in range(3))
-        steep = steep + 1.0 / slope**2
+        level, cross, square_sum = (np.bincount(own, pull * flatness**k) for k in range(3))
+        steep = square_sum + 1.0 / slope**2
         off = logs - mode
         rest, tilt = np.bincount(own, pull * off), np.bincount(own, pull * flatness * off)
         pulls, stiff = rest - cross * tilt / steep, level - cross**2 / steep

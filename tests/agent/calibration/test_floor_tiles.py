@@ -39,7 +39,8 @@ def seen(pattern: Array, rotation: Array, centre: Array, lens: Lens, gain: float
     reach = (HEIGHT - centre @ DOWN) / np.where(d[:, 1] > 0.02, d[:, 1], np.inf)
     p = centre + reach[:, None] * d
     place = ((p[:, [0, 2]] / TEXEL) % (len(pattern) - 1)).astype(np.float32)
-    grey = cv2.remap(pattern.astype(np.float32), *place.T.reshape(2, *u.shape), cv2.INTER_LINEAR)
+    column, row = place.T.reshape(2, *u.shape)
+    grey = cv2.remap(pattern.astype(np.float32), column, row, cv2.INTER_LINEAR)
     shade = 1.0 - 0.4 * (((u - CAMERA.cx) / 160.0) ** 2 + ((v - CAMERA.cy) / 120.0) ** 2) / 2.0
     image = gain * shade * np.where(reach.reshape(u.shape) > 0.0, grey, 90.0)
     image = image.reshape(height, 2, width, 2).mean((1, 3))
