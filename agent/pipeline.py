@@ -11,7 +11,6 @@ It knows no network, no disk and no clock: live robots, recordings, simulation a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,27 +19,29 @@ from numpy.typing import NDArray
 
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.camera_occupancy import CameraOccupancyGrid
-from mapweave.agent.cautious_driving import ALONG_EDGES, CautiousDriving, lacks_rangers, speed_for
-from mapweave.agent.exploration.camera_exploration import CameraExploration, with_readings
+from mapweave.agent.cautious_driving import CautiousDriving, lacks_rangers
+from mapweave.agent.command_guard import CommandGuard
 from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
-from mapweave.agent.exploration.random_exploration import RandomExploration
+from mapweave.agent.exploration.new_explorer import new_explorer
 from mapweave.agent.global_localization.resumption import Resumption
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
 from mapweave.agent.navigation.navigator import Navigator
+from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
-from mapweave.agent.ranger_monitor import RangerMonitor, not_exploring
-from mapweave.agent.servo.proximity import guard
+from mapweave.agent.ranger_monitor import not_exploring
+from mapweave.agent.sensor_health.sensor_monitor import Fault, SensorMonitor
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
@@ -55,12 +56,14 @@ class Step:
         changes: to the map, in order.
         questions: for the fleet's map; answers come with a later observation.
         status: for people.
+        fault: the sensor that cannot be believed now, if any.
     """
 
     command: Command
     changes: tuple[ChangeBody, ...]
     questions: tuple[Question, ...]
     status: Status
+    fault: Fault | None = None
 
 
 class Pipeline:
@@ -104,13 +107,14 @@ class Pipeline:
         self._floor = self._new_floor()
         self._changes: list[ChangeBody] = []
         self._driven: Driven | None = None
-        self._rangers = RangerMonitor(description)
+        self._sensors = SensorMonitor(description)
+        self._command: Command | None = None
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
         self._passenger = CarriedMapping(self._mapper)
         self._navigator: Navigator | None = None
         self._resumption: Resumption | None = None
-        self._direction = 1.0
+        self._guard = CommandGuard(self._caution)
         self._lifted = self._put_elsewhere = False
         self._image: NDArray[np.uint8] | None = None
 
@@ -193,13 +197,27 @@ class Pipeline:
         match mission:
             case Explore() if self._explorer is None and self._explores:
                 self._explorer = self._new_explorer()
-            case GoTo(goal, via):
+            case GoTo(goal, via, passed, portal):
                 self._mapper.lose()
                 self._restart()
+                crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)
                 self._navigator = Navigator(
                     self._description, self._lens, self._sift, self.map, goal, self._settings,
-                    self._settings.seed, via,
+                    self._settings.seed, via[passed:], crossing,
                 )  # fmt: skip
+
+    def taken_through(self) -> None:
+        """A person says that the robot was taken through the portal at which it waits."""
+        if self._navigator is not None:
+            self._navigator.crossing.taken_through()
+
+    @property
+    def _progress(self) -> tuple[int, PortalWait | None]:
+        """How many nodes on the way of a goal were passed, and the portal at which the robot waits."""
+        if not isinstance(self._mission, GoTo) or self._navigator is None:
+            return 0, None
+        wait = None if self._navigator.given_up else self._navigator.crossing.wait
+        return self._mission.passed + self._navigator.passed, wait
 
     def step(
         self, observation: Observation, answers: tuple[Answer, ...] = (), driven: Driven | None = None
@@ -217,7 +235,11 @@ class Pipeline:
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
         self._image = observation.image
         observation = self.calibration.correct(observation)
-        self._rangers.see(observation.proximity)
+        observation = self._sensors.see(observation, self._command)
+        if self._sensors.clock_jumped:
+            self._mapper.forget_clock()
+        if self._sensors.pose_lost:
+            self._lose_pose()
         self._take_over(driven)
         self._feel(observation)
         match self._mission:
@@ -233,14 +255,14 @@ class Pipeline:
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers, self._held)
                 self._mapper.drove(self._navigator.traverse, self._navigator.refined)
+        if self._blind and not self._lifted:
+            command = self._sensors.trial
         safe, warning = self._safe(command if driven is None or self._lifted else driven.command, observation)
-        if observation.bumped and safe.forward * self._direction > 0:
-            safe, warning = Command(0.0, safe.turn), "stopped: the bumper is pressed"
-        elif not observation.bumped and safe.forward:
-            self._direction = math.copysign(1.0, safe.forward)
         self._see_changes()
         changes, self._changes = tuple(self._changes), []
-        return Step(safe, changes, tuple(questions), self._status(warning))
+        own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
+        self._command = safe if own else None
+        return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
 
     @property
     def _explores(self) -> bool:
@@ -255,8 +277,26 @@ class Pipeline:
 
     @property
     def _blind(self) -> str:
-        """Why the rangers forbid an autonomous robot to drive; empty if it may."""
-        return self._rangers.fault if isinstance(self._mission, Explore | GoTo) else ""
+        """Why its sensors forbid an autonomous robot to drive; empty if it may."""
+        fault = self._fault
+        return fault.words if fault is not None and isinstance(self._mission, Explore | GoTo) else ""
+
+    @property
+    def _fault(self) -> Fault | None:
+        """The sensor that cannot be believed. Who is moved by a person needs no rangers."""
+        fault = self._sensors.fault
+        if fault is not None and fault.sensor == "rangers" and not isinstance(self._mission, Explore | GoTo):
+            return None
+        return fault
+
+    def _lose_pose(self) -> None:
+        """The encoders have failed, or are back: what was measured since is void, nodes made before stay."""
+        if isinstance(self._mission, GoTo):
+            self.set_mission(self._mission)
+            return
+        self._resumption = None
+        self._mapper.lose()
+        self._restart()
 
     def _in_the_air(self, observation: Observation) -> bool:
         """Whether the base says that it is lifted. Put down again, the robot is at an unknown place."""
@@ -264,7 +304,8 @@ class Pipeline:
             self._mapper.lose()
         elif self._lifted and not observation.kidnapped:
             if isinstance(self._mission, GoTo):
-                self.set_mission(self._mission)
+                passed, portal = self._progress
+                self.set_mission(replace(self._mission, passed=passed, portal=portal))
             else:
                 self._put_elsewhere = bool(self.map.nodes) and not isinstance(self._mission, Idle)
                 self._restart()
@@ -281,12 +322,7 @@ class Pipeline:
         return floor
 
     def _new_explorer(self) -> Explorer:
-        settings, parts = self._settings, (self._map_id, self._description, self._mapper)
-        more = settings.exploration, settings.seed
-        if isinstance(self._floor, CameraOccupancyGrid):
-            return CameraExploration(*parts, self._floor, *more)
-        kind = RandomExploration if settings.exploration.random else Explorer
-        return kind(*parts, self._floor, *more)
+        return new_explorer(self._map_id, self._description, self._mapper, self._floor, self._settings)
 
     def _take_over(self, driven: Driven | None) -> None:
         """A person takes the wheels, or gives them back: the mission goes on from where the robot is then."""
@@ -313,18 +349,9 @@ class Pipeline:
 
     def _safe(self, command: Command, observation: Observation) -> tuple[Command, str]:
         """The command as far as it is safe, and why it is not the one that was wanted."""
-        if self._caution is None:
-            return guard(command, observation.proximity, self._description)
-        if self._driven:
-            return self._caution.command(command, self._description.max_forward, follow=True), ""
-        floor, warning, most = self._floor, "", ALONG_EDGES
-        if isinstance(self._mission, Explore) and isinstance(floor, CameraOccupancyGrid):
-            pose = self._mapper.map_from_robot.mean
-            command, warning = guard(command, floor.readings(pose), with_readings(self._description))
-            direction = 0.0 if command.forward >= 0.0 else math.pi
-            most = speed_for(floor.known_ahead(pose, direction, 0.5))
-        safe = self._caution.command(command, most)
-        return safe, "backing off from a touch" if self._caution.backing_off else warning
+        floor = self._floor if isinstance(self._mission, Explore) else None
+        pose, driven = self._mapper.map_from_robot.mean, self._driven is not None
+        return self._guard.safe(command, observation, self._description, driven, floor, pose)
 
     def _see_changes(self) -> None:
         """Take what was changed in the map; nodes show a robot without rangers where the floor is free."""
@@ -438,12 +465,15 @@ class Pipeline:
         if self._lifted or self._put_elsewhere:
             doing, detail = "lifted", "the robot begins a new map once it is on the floor"
         mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
+        if self._fault is not None and not self._blind:
+            warning = "; ".join(part for part in (self._fault.words, warning) if part)
         for more in (self._mapper.health if mapping else "", warning):
             detail = "; ".join(part for part in (detail, more) if part)
         nodes = len(self.map.nodes)
         if not nodes and isinstance(self._mission, Explore | Carried):
             detail = f"no nodes yet: {detail or self._mapper.track_report}"
         fix = self._navigator.fix if self._navigator is not None else None
+        passed, portal = self._progress
         c = (self._mapper.map_from_robot if fix is None else fix.node_from_robot).covariance
         return Status(
             doing=doing,
@@ -462,5 +492,7 @@ class Pipeline:
             progress=progress,
             located=mapping and self._located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
+            passed=passed,
+            portal=portal,
             covariance=(float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), float(c[2, 2])),
         )

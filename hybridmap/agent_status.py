@@ -11,6 +11,7 @@ from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.limits import Amount, Name, Number, Share, Stamp
 from mapweave.hybridmap.mission_order import MissionReport
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import Pose2
 
 MAX_STATUS_WORDS = 500
@@ -48,6 +49,8 @@ class Status:
         given_up: whether it stands, since the goal cannot be reached; `detail` is the reason.
         progress: share of the present route that is driven.
         tally: statistics of the drive so far.
+        passed: how many of the nodes that it must pass before its goal it has passed.
+        portal: the portal at which it waits; None while it drives.
         covariance: of the pose by which the robot knows itself, in its own frame: xx, xy, yy, m^2, and of the
             heading, rad^2; zeros if it is not known.
     """
@@ -68,6 +71,8 @@ class Status:
     given_up: bool = False
     progress: Share = 0.0
     tally: DriveStatistics = NOTHING_DRIVEN
+    passed: Number = 0
+    portal: PortalWait | None = None
     covariance: tuple[Amount, float, Amount, Amount] = (0.0, 0.0, 0.0, 0.0)
 
 

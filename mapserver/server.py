@@ -157,7 +157,7 @@ class MapServer:
         )  # fmt: skip
         self._annotator = Annotator(
             self._bus, self._keys, self._name, self._named_places, self._annotations, self._plans.check,
-            self._apply_annotations,
+            lambda: self._constraints.constraints, self._apply_annotations,
         )  # fmt: skip
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._publish)
@@ -242,13 +242,13 @@ class MapServer:
         """What people say about the map."""
         return self._annotations.annotations
 
-    def annotate(self, annotation: Annotation) -> str:
-        """Add an annotation to the record, from any thread; returns what it says, in words.
+    def annotate(self, annotation: Annotation, check: bool = False) -> str:
+        """Add an annotation to the record, or only check it, from any thread; says what it does in words.
 
         Raises:
             InvalidValue: it says nothing new, or is about something that is not there.
         """
-        return self._annotator.annotate(annotation)
+        return self._annotator.annotate(annotation, check)
 
     def plans(self) -> PlacedPlans:
         """Floor plans under the newest merged map, from any thread."""
@@ -263,13 +263,25 @@ class MapServer:
         """
         return self._plans.image(name)
 
-    def put_plan_image(self, data: bytes) -> PlanImage:
+    def kept_image(self, sha256: str) -> bytes:
+        """The PNG file of an image that was put here, whether a plan names it or not yet; from any thread.
+
+        Raises:
+            InvalidFile: it is not there, or damaged.
+        """
+        return self._plans.images.get(sha256)
+
+    def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
         """Keep the image of a floor plan, from any thread; an annotation names it afterwards.
+
+        Args:
+            data: an image file.
+            negate: exchange light and dark, as a map.yaml says.
 
         Raises:
             InvalidValue: it is no image, or too large.
         """
-        return self._plans.put(data)
+        return self._plans.put(data, negate)
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words, from any thread.
@@ -310,6 +322,14 @@ class MapServer:
     ) -> MissionReport:
         """Give a robot a mission that is newer than the one that holds it; see `command`."""
         return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id, via))
+
+    def portal_done(self, robot: str, by: str) -> str:
+        """Tell a robot that it was taken through a portal, from any thread; returns what it does, in words.
+
+        Raises:
+            InvalidValue: it does not wait at a portal, or does not answer.
+        """
+        return self._missions.portal_done(robot, by)
 
     def missions(self) -> Missions:
         """The missions that are known, oldest first."""

@@ -10,6 +10,7 @@ from dataclasses import replace
 from mapweave.hybridmap.errors import Busy, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
+from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.query import (
     KnownRequest,
     RelocalizeAnswer,
@@ -29,6 +30,7 @@ from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.route_rules import rule_words
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
+from mapweave.merge.floors import maps_elsewhere
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
@@ -131,8 +133,12 @@ class Services:
         return encode(within_range(self.locate(view)))
 
     def locate(self, view: View) -> RelocalizeAnswer:
-        """Where a view was taken, with the names of the places."""
-        return self._places().named(self._answers().relocalizer.answer(view))
+        """Where a view was taken, with the names of the places; on the floor that the robot knows, if any."""
+        answers, places = self._answers(), self._places()
+        elsewhere: frozenset[MapId] = frozenset()
+        if view.near is not None:
+            elsewhere = maps_elsewhere(answers.merged, places.annotations.floors, view.near)
+        return places.named(answers.relocalizer.answer(view, elsewhere))
 
     def _route(self, payload: bytes) -> bytes:
         request = decode(payload, RouteRequest)

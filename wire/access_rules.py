@@ -66,9 +66,9 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
     questions = [f"{keys.root}/server/*/{what}" for what in asks]
     questions += [keys.agent_statuses(), f"{keys.root}/server/*/ack/*"]
     if role is Role.OPERATOR:
-        questions += [f"{keys.root}/agent/*/mission", f"{keys.root}/agent/*/drive"]
+        questions += [f"{keys.root}/agent/*/{what}" for what in ("mission", "drive", "portal")]
     reads = [
-        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), f"{keys.root}/server/*/alive",
+        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), keys.servers_alive(),
         f"{keys.root}/server/*/poses/*",
     ]  # fmt: skip
     return [*_reads(reads), *_asks(questions)]
@@ -80,8 +80,9 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/drive",
+                  f"{agent}/portal",
                   f"{base}/describe", f"{base}/step"]),
-        *_reads([*addressed, f"{keys.root}/server/*/alive", f"{base}/driver/*", f"{agent}/alive/*"]),
+        *_reads([*addressed, keys.servers_alive(), f"{base}/driver/*", f"{agent}/alive/*"]),
         *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
                 f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
     ]  # fmt: skip

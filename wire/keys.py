@@ -7,6 +7,7 @@
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: a mission order
     mapweave/1/<fleet>/agent/<agent>/drive            question: a person's velocity command
+    mapweave/1/<fleet>/agent/<agent>/portal           question: it was taken through a portal
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain,
@@ -107,6 +108,10 @@ class Keys:
     def drive(self, agent: str) -> str:
         """Where an agent takes a person's velocity commands."""
         return f"{self.root}/agent/{check_name(agent)}/drive"
+
+    def portal(self, agent: str) -> str:
+        """Where an agent takes reports that it was taken through a portal."""
+        return f"{self.root}/agent/{check_name(agent)}/portal"
 
     # Keys of a server.
 
@@ -285,6 +290,10 @@ class Keys:
     def server_alive(self, server: str) -> str:
         """Under which a server is alive."""
         return self._of_server("alive", server)
+
+    def servers_alive(self) -> str:
+        """Likewise of every server."""
+        return f"{self.root}/server/*/alive"
 
     # Keys of a robot base.
 

@@ -156,7 +156,8 @@ class Ros2Base:
         unheard = not (self._twist.subscribers or self._stamped.subscribers)
         if moving and unheard and not self._unheard and self._node.connected():
             log.warning("no node subscribes to %s: the robot does not move", self._options.command)
-        self._unheard = unheard
+            self._unheard = True
+        self._unheard = self._unheard and unheard
 
     def publish(self, command: Command) -> None:
         """Publish a command in the type or types of its subscribers."""

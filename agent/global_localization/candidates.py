@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.global_localization.refuted_places import RefutedPlaces
 from mapweave.agent.global_localization.view_agreement import ViewAgreement
 from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.agent.mission import WhereAmI
@@ -72,15 +73,23 @@ class Candidates:
 
 
 class OwnMap:
-    """The robot's own map as a source."""
+    """The robot's own map as a source.
+
+    Attributes:
+        map: which may grow.
+        elsewhere: whether the robot knows that it is on another floor than this map.
+    """
 
     def __init__(self, hybrid_map: HybridMap, rng: np.random.Generator) -> None:
-        """Take the map, which may grow, and the source of verification's random samples."""
+        """Take the map, and the source of verification's random samples."""
         self.map = hybrid_map
+        self.elsewhere = False
         self._rng = rng
 
     def candidates(self, view: View, image: NDArray[np.uint8], features: Features) -> Candidates:
         """Nodes that a view shows, of an image with these features."""
+        if self.elsewhere:
+            return Candidates((), "", "the own map is of another floor")
         recalled = recognise_places(self.map, view, self._rng)
         if not recalled:
             return Candidates((), "", f"none of {len(self.map.nodes)} nodes is recognised")
@@ -97,10 +106,17 @@ class OwnMap:
 
 
 class FleetMap:
-    """The fleet's merged map as a source: a server, which knows whether another room looks the same."""
+    """The fleet's merged map as a source: a server, which knows whether another room looks the same.
+
+    Attributes:
+        refuted: its places that the robot's own view did not bear out.
+        near: the robot knows that it is on the floor of this node; None if it does not.
+    """
 
     def __init__(self, motion: MotionPrimitives) -> None:
         """Take the motion primitives, which ask and stand still until the answer comes."""
+        self.refuted = RefutedPlaces(motion)
+        self.near: NodeId | None = None
         self._motion = motion
         self._silent_until = 0.0
         self._agreement = ViewAgreement()
@@ -112,7 +128,7 @@ class FleetMap:
         """
         if self._motion.now < self._silent_until:
             return Candidates((), "", NO_ANSWER)
-        answer = yield from self._motion.ask(WhereAmI(self._motion.number(), view))
+        answer = yield from self._motion.ask(WhereAmI(self._motion.number(), view, self.near))
         if answer.content is None:
             self._silent_until = self._motion.now + (answer.retry_after or SILENCE)
         if not isinstance(answer.content, RelocalizeAnswer):
@@ -122,6 +138,8 @@ class FleetMap:
         place = self._agreement.take(content, motion.odom_from_robot, motion.way, motion.turned)
         if place is None:
             return Candidates((), ambiguous, content.reason)
+        if self.refuted.holds(place.node):
+            return Candidates((), ambiguous, f"again node {place.node}, of which nothing was in view")
         reason = content.reason
         if content.certainty is Certainty.UNKNOWN:
             reason = f"{place.inliers} landmarks of {place.node} agree, and so does an earlier view"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
 from mapweave.hybridmap.errors import InvalidMessage
@@ -36,7 +38,7 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
         InvalidValue: no message can hold it.
     """
     if isinstance(question, WhereAmI):
-        return keys.any_relocalize(), encode_view(question.view)
+        return keys.any_relocalize(), encode_view(replace(question.view, near=question.near))
     if isinstance(question, WhatIsKnown):
         around = KnownRequest(question.map, question.x, question.y, question.reach)
         return keys.any_known(), encode(around)
@@ -67,8 +69,16 @@ def decode_answer(
     route = decode(payload, RouteAnswer)
     for leg in route.legs:
         _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
-    if route.legs and route.legs[-1].node.id != question.goal:
-        raise InvalidMessage(f"route: it ends at node {route.legs[-1].node.id}, not at {question.goal}")
+    end = question.goal if route.portal is None else route.portal.entry
+    if route.legs and route.legs[-1].node.id != end:
+        raise InvalidMessage(f"route: it ends at node {route.legs[-1].node.id}, not at {end}")
+    nodes = [leg.node.id for leg in route.legs]
+    if twice := next((node for k, node in enumerate(nodes) if node in nodes[:k]), None):
+        raise InvalidMessage(f"route: it leads in a circle, to node {twice} twice")
+    blocked = {frozenset(pair) for pair in question.blocked}
+    for a, b in pairwise(nodes):
+        if frozenset((a, b)) in blocked:
+            raise InvalidMessage(f"route: it leads from {a} to {b}, where the robot did not get through")
     return route
 
 

@@ -175,6 +175,7 @@ def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, 
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_resuming_again_is_the_same_to_the_last_bit(
     begun: Begun, again: tuple[Life, dict[NodeId, Pose2]], tmp_path: Path
 ) -> None:
@@ -194,6 +195,7 @@ def moved(begun: Begun) -> Pose2:
     raise AssertionError("no room")
 
 
+@pytest.mark.slow
 def test_an_agent_that_was_killed_and_moved(begun: Begun, tmp_path: Path) -> None:
     """The time until two views agree is luck; that they do, and are right, is not."""
     life, _ = resumed(begun, tmp_path, moved(begun), 1.0)
@@ -217,6 +219,7 @@ def test_nothing_is_appended_where_nothing_is_recognised(begun: Begun, tmp_path:
     assert turned > math.pi, "it turns around"
 
 
+@pytest.mark.slow
 def test_after_a_drive_to_a_goal_it_maps_on(begun: Begun, tmp_path: Path) -> None:
     life, _ = resumed(begun, tmp_path, begun.standing, 1.0)
     life.pipeline.set_mission(GoTo(NodeId("r1", 1, 1)))
@@ -231,6 +234,7 @@ def test_after_a_drive_to_a_goal_it_maps_on(begun: Begun, tmp_path: Path) -> Non
 # Kidnapped while it maps
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_path: Path) -> None:
     """It knows where it is, drives on, and is put down elsewhere between two ticks, turned around."""

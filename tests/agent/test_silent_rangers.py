@@ -19,6 +19,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 from tests.agent.ranged_body import BODY, MAP, on, rangers
+from tests.quick import first_quick
 
 Broken = Callable[[np.ndarray], np.ndarray]
 ALLOWED = AgentSettings(exploration=ExplorerSettings(without_rangers=True))
@@ -72,6 +73,7 @@ def test_it_stops_and_reports_while_they_are_silent_and_then_goes_on(walls, miss
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_long_silence_does_not_count_against_what_the_robot_was_doing(walls):
     """The same commands as without the silence: behaviours have waited, not given up.
 
@@ -106,13 +108,13 @@ def test_a_robot_that_promises_none_is_not_held_back_by_their_silence(walls):
 def test_a_single_sensor_is_named() -> None:
     monitor = RangerMonitor(RobotDescription(BODY.camera, ranger_bearings=(0.0,), ranger_reach=1.0))
     assert monitor.fault == ""
-    monitor.see(np.zeros(0))
+    monitor.see(np.zeros(0), Odometry(0.0, 0.0))
     assert monitor.fault == "1 proximity sensor promised, none read for 0.1 s: standing"
-    monitor.see(np.array([0.4]))
+    monitor.see(np.array([0.4]), Odometry(0.0, 0.0))
     assert monitor.fault == ""
 
 
-@pytest.mark.parametrize("broken", [NONE, FEWER], ids=["none", "five"])
+@pytest.mark.parametrize("broken", first_quick([NONE, FEWER], 1))
 def test_a_simulated_robot_touches_nothing(broken):
     """24 s in an office: with free room assumed it touched a wall several times."""
     world = make_world("office", 3)

@@ -96,6 +96,7 @@ def test_a_persons_command_comes_before_the_mission_and_behind_the_guard(walls) 
     assert any(step.command != Command() for step in life.steps[-60:]), "then the mission goes on"
 
 
+@pytest.mark.slow
 def test_where_it_may_explore_it_creeps_backs_off_from_a_touch_and_maps(walls) -> None:
     pipeline = on(Explore(), ALLOWED, BARE)
     life = Life(walls, pipeline, end=0.1)

@@ -34,6 +34,7 @@ def run() -> MappingDrive:
     return drive(3, "arena", "line", 120)
 
 
+@pytest.mark.slow
 def test_the_command_draws_and_prints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

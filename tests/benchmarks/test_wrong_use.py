@@ -36,6 +36,7 @@ WRONG = [
     ("sim", "--robots 3 17", "--robots"),
     ("sim", "--seconds 0", "--seconds"),
     ("sim", "--seconds nan", "--seconds"),
+    ("trust", "--lying 0", "trust: a seed of 0 or more"),
     ("tracking", "--drives 0", "tracking: at least 1 drive, 12 frames and seed 0 are needed"),
     ("tracking", "--frames 3", "tracking: at least 1 drive, 12 frames and seed 0 are needed"),
 ]

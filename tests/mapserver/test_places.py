@@ -15,7 +15,7 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.fleet import Fleet
-from mapweave.hybridmap.annotation import Annotation, Annotations, Place
+from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
@@ -300,11 +300,19 @@ def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.C
                 assert "map r0.1" not in person.annotate("floor", "r0.1", node=str(first), label="ground")
                 with pytest.raises(InvalidValue, match=r"floor of map r1\.1 cannot be called 'r0.1'"):
                     person.annotate("floor", "r0.1", node="r1.1.1", label="upper")
+                upper = Annotation("r1.1", Floor(NodeId("r1", 1, 1), "upper"), False, "anna", 1)
+                count = len(server.merged().links)
+                said = server.annotate(upper, check=True)
+                assert said.endswith(f"; {count} links between this map and maps on other floors"), said
                 person.annotate("floor", "r1.1", node="r1.1.1", label="upper")
                 eventually(lambda: server.status()["components"] == 2)
             answer = server.locate(lambda: view, 1).result(20.0)
             assert {candidate.floor for candidate in answer.candidates} <= {"ground", "upper"}
             assert answer.candidates and answer.certainty is not Certainty.FOUND, "it may be on either floor"
+            for near, floor in ((first, "ground"), (NodeId("r1", 1, 3), "upper")):
+                known = server.locate(lambda: replace(view, near=near), near.number).result(20.0)  # noqa: B023
+                assert known.certainty is Certainty.FOUND, "a robot that knows its floor is on that"
+                assert {place.floor for place in known.candidates} == {floor}
             if not labels:
                 person.withdraw("floor", "r1.1")
                 eventually(lambda: server.status()["components"] == 1)

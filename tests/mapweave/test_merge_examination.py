@@ -95,6 +95,7 @@ def test_two_robots_of_one_walk_become_one_map(
     assert sum(row["kept"] == "yes" for row in rows) == report["links"]
 
 
+@pytest.mark.slow
 def test_a_robot_that_cannot_localize_begins_another_map(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

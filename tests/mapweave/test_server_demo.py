@@ -138,8 +138,14 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
             # It is undone, and taken back.
             a, b = page.run("return ['a', 'b'].map(name => document.getElementById(name).value)")
             standing = f"explain?a={a}&b={b}"
-            page.run("document.querySelector('#result form input').value = 'two kitchens'")
-            page.run("document.querySelector('#result form').requestSubmit()")
+            page.run(
+                "[...document.querySelectorAll('#result button')]"
+                ".find(one => one.textContent === 'Undo this link').click()"
+            )
+            page.type("#edit-because", "two kitchens")
+            page.run("document.getElementById('edit-check').click()")
+            eventually(lambda: "1 link is undone" in page.run(TEXT.format("edit-answer")))
+            page.run("document.getElementById('edit-apply').click()")
             eventually(lambda: "two kitchens" in page.run(TEXT.format("corrections")))
             eventually(lambda: get(http, standing).get("standing") == "undone")
             page.run("document.querySelector('#corrections button').click()")

@@ -22,6 +22,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdicts
 from synthetic.drives import Drive, DriveSettings, drives
 from synthetic.fleet import FleetSettings, link_between
+from tests.quick import first_quick
 
 FLOOR = FleetSettings(nodes=24, side=5.0)
 
@@ -75,7 +76,7 @@ def check(merged: MergedMap, fresh: MergedMap) -> None:
         assert merged.pose(node).distance(fresh.pose(node)) < 1e-3
 
 
-@pytest.mark.parametrize(("seed", "false_share"), [(60, 0.0), (61, 0.3), (62, 0.5)])
+@pytest.mark.parametrize(("seed", "false_share"), first_quick([(61, 0.3), (60, 0.0), (62, 0.5)], 1))
 def test_standing_decisions_agree_with_deciding_everything(seed: int, false_share: float) -> None:
     """Batch merges of all days are the second opinion.
 

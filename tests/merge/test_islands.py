@@ -19,6 +19,7 @@ from mapweave.merge.pose_graph import component_solver
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from tests.merge.lives import DENSE, Life
+from tests.quick import first_quick
 
 
 def contents(merged: MergedMap) -> tuple[object, ...]:
@@ -33,7 +34,7 @@ def contents(merged: MergedMap) -> tuple[object, ...]:
 
 
 @pytest.mark.parametrize(
-    ("seed", "false_share"), [(0, 0.0), (1, 0.3), (2, 0.3), (3, 0.5), (4, 0.0), (5, 0.6)]
+    ("seed", "false_share"), first_quick([(1, 0.3), (3, 0.5), (0, 0.0), (2, 0.3), (4, 0.0), (5, 0.6)], 2)
 )
 def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> None:
     """For any changes in any order: the outcome is that of a fresh merge, to the last bit."""
@@ -70,7 +71,7 @@ def test_joint_decisions_agree_with_a_fresh_merge(
             assert contents(merged) == contents(life.rebuilt())
 
 
-@pytest.mark.parametrize("seed", [43, 44, 45])
+@pytest.mark.parametrize("seed", first_quick([43, 44, 45], 1))
 def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is ever decided again here, and few nodes are moved at a time."""
     monkeypatch.setattr(islands_module, "CHANGED", math.inf)

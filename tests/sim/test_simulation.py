@@ -40,6 +40,7 @@ def fingerprint(seed: int) -> str:
     return digest.hexdigest()
 
 
+@pytest.mark.slow
 def test_same_seed_and_commands_give_the_same_bits() -> None:
     """Also in another process, whose hashes differ, and with robots that meet."""
     here = fingerprint(5)

@@ -52,7 +52,9 @@ export function drawAnnotations(c, viewport, model) {
     } else continue;
     c.font = "600 13px system-ui, sans-serif"; c.textAlign = "center";
     c.lineWidth = 3; c.strokeStyle = colours.ground;
-    c.strokeText(name, label[0], label[1] - 10); c.fillText(name, label[0], label[1] - 10);
+    // An edge is named by its nodes unless a person has named it.
+    const words = body.edge?.join(" ") === name ? body.kind : name;
+    c.strokeText(words, label[0], label[1] - 10); c.fillText(words, label[0], label[1] - 10);
     c.textAlign = "left";
   }
 }

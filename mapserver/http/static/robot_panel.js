@@ -44,7 +44,7 @@ export function showRobot(name, commands, goal) {
   const box = byId("selected");
   box.textContent = "";
   add(box, "h2", `Robot ${name}`);
-  panel = { name, facts: add(box, "div") };
+  panel = { name, facts: add(box, "div"), portal: null };
   if (!commands) { add(box, "p", "Robots take missions from the server's own machine alone.", "soft"); return; }
   const form = add(box, "form", "", "actions"), input = add(form, "input");
   input.id = "goal"; input.value = goal; input.placeholder = "node, x,y, place or home"; input.setAttribute("list", "names");
@@ -56,7 +56,7 @@ export function showRobot(name, commands, goal) {
     words.className = ""; words.textContent = "Asking ...";
     const answer = await ask(`robots/${encodeURIComponent(name)}/${path}`, { method: "POST" });
     words.className = answer.error ? "bad" : "good";
-    words.textContent = answer.error || missionWords(answer);
+    words.textContent = answer.error || answer.said || missionWords(answer);
   };
   form.addEventListener("submit", event => {
     event.preventDefault();
@@ -64,6 +64,8 @@ export function showRobot(name, commands, goal) {
   });
   button(actions, "Explore", () => give("explore?by=page"));
   button(actions, "Stop", () => give("stop?by=page"));
+  panel.portal = button(actions, "Taken through", () => give("portal-done?by=page"));
+  panel.portal.hidden = true;
 }
 export const leaveRobot = () => { panel = null; };
 export function updateRobot(robots) {
@@ -71,6 +73,8 @@ export function updateRobot(robots) {
   const robot = robots.find(one => one.robot === panel.name);
   panel.facts.textContent = "";
   if (!robot) { add(panel.facts, "p", "It is not known to the server any more.", "warn"); return; }
+  const portal = robot.status?.status.portal;
+  if (panel.portal) panel.portal.hidden = !portal || portal.done;
   const status = robot.status, [word, kind] = life(robot), pose = robot.merged_from_robot;
   const [xx = 0, , yy = 0, hh = 0] = (status?.status.covariance || []).map(Math.sqrt);
   const spread = xx + yy > 0 ? ` (sigma ${xx.toFixed(3)}, ${yy.toFixed(3)} m, ${degrees(hh)})` : "";

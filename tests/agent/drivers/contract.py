@@ -92,7 +92,7 @@ def drive_until(
 
 
 def drive_way(robot: Robot, command: Command, way: float) -> list[Observation]:
-    """Let the robot drive until its odometry has told of `way`, m, forward."""
+    """Let the robot drive until it has driven `way`, m, forward by its odometry."""
     seen: list[Observation] = []
     while sum(observation.odometry.forward for observation in seen) < way:
         before = len(seen)

@@ -22,7 +22,7 @@ from mapweave.hybridmap.errors import DeviceError, SettingsError
 from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.ros2.messages import decode
 from tests import ros2_peer as peer
-from tests.agent.drivers.contract import HEIGHT, WIDTH, RobotContract, drive, drive_way, until
+from tests.agent.drivers.contract import HEIGHT, WIDTH, RobotContract, drive, drive_until, drive_way, until
 from tests.agent.drivers.ros2_robot import Ros2Robot
 
 Start = Callable[..., CheckedRobot]
@@ -272,5 +272,8 @@ def test_that_no_node_listens_is_said_once(start: Start, caplog: pytest.LogCaptu
     emulator = Ros2Robot()
     robot = start(emulator, command="drive")
     with caplog.at_level(logging.WARNING):
-        drive(robot, Command(0.1, 0.0), 0.5)
+        # It stood before, and so there was nothing to say.
+        drive(robot, Command(), 0.1)
+        drive_until(robot, Command(0.1, 0.0), lambda: bool(caplog.records))
+        drive(robot, Command(0.1, 0.0), 0.1)
     assert [r.message for r in caplog.records] == ["no node subscribes to drive: the robot does not move"]

@@ -94,6 +94,7 @@ def assert_covariance(covariance: np.ndarray) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_the_covariance_stays_valid_for_ten_thousand_steps() -> None:
     """Symmetric to the last bit and positive, twenty times the paper's run."""
     run = draw_run(np.random.default_rng(4), "arc", 335, landmarks=8)

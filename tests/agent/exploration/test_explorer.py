@@ -96,6 +96,7 @@ def turns(steps: list[Step]) -> list[float]:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_the_papers_way_turns_to_a_side_by_chance_and_goes_on_by_chance(walls):
     by_chance = ExplorerSettings(random=True)
     steps = live(walls, by_chance, 250, {})

@@ -34,6 +34,7 @@ from tests.mapserver.log.acknowledged_fleet import (
     life,
     truth,
 )
+from tests.quick import first_quick
 from tests.waiting import eventually, free_port
 
 PAGE = 4096
@@ -71,7 +72,7 @@ def fleet(whole: Path, tmp_path: Path) -> Iterator[Fleet]:
     fleet.stop_robots()
 
 
-@pytest.mark.parametrize("seed", range(14))
+@pytest.mark.parametrize("seed", first_quick(range(14), 5))
 def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -113,9 +114,7 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     fleet.stop_server()
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(k, marks=[pytest.mark.slow] if k >= 16 else []) for k in range(60)]
-)
+@pytest.mark.parametrize("seed", first_quick(range(60), 8))
 def test_a_flipped_bit_anywhere_is_repaired_or_reported_in_one_line(
     whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -190,7 +189,7 @@ def test_damage_is_remembered_until_the_robot_comes(fleet: Fleet) -> None:
         fleet.stop_server()
 
 
-@pytest.mark.parametrize("bit", range(8))
+@pytest.mark.parametrize("bit", first_quick(range(8), 3))
 def test_a_damaged_key_misleads_no_reader(whole: Path, fleet: Fleet, bit: int) -> None:
     """A row that claims to be of another map: what it was stands between its neighbours."""
     logs, maps = truth(whole)

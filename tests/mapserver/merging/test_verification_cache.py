@@ -24,6 +24,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict
 from mapweave.merge.settings import ExclusionSettings, MergeSettings
 from synthetic.world import room, take_map
+from tests.quick import first_quick
 
 A, B = MapId("a", 1), MapId("b", 1)
 Log = list[tuple[MapId, ChangeBody]]
@@ -148,7 +149,7 @@ def test_a_node_that_is_no_longer_just_so_is_compared_again(logged: Log, tmp_pat
     assert 0 < again.counters.verified < 0.5 * whole.counters.verified
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "other", "version", "merging"])
+@pytest.mark.parametrize("damage", first_quick(["flipped", "version", "merging", "cut", "empty", "other"], 3))
 def test_a_damaged_index_is_built_again(
     logged: Log,
     tmp_path: Path,

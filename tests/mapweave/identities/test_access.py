@@ -171,13 +171,15 @@ def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[
 
 def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
     r0 = fleet.join("r0")
-    for key in (KEYS.mission("r0"), KEYS.drive("r0"), KEYS.agent_status("r0")):
+    for key in (KEYS.mission("r0"), KEYS.drive("r0"), KEYS.portal("r0"), KEYS.agent_status("r0")):
         r0.serve(key, answer)
     anna, bob = fleet.join("anna"), fleet.join("bob")
     eventually(lambda: asked(anna, KEYS.mission("r0")) and asked(anna, KEYS.drive("r0")))
+    eventually(lambda: asked(anna, KEYS.portal("r0")))
     eventually(lambda: asked(bob, KEYS.agent_status("r0")))
     assert not asked(bob, KEYS.mission("r0"))
     assert not asked(bob, KEYS.drive("r0"))
+    assert not asked(bob, KEYS.portal("r0"))
 
 
 def test_who_has_no_good_key_is_not_let_in(certified: Fleet) -> None:

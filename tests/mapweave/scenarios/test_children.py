@@ -58,6 +58,7 @@ def test_children_of_a_process_that_is_killed_end_by_themselves(tmp_path: Path, 
     assert "Traceback" not in said(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_child_is_ended_and_a_failed_one_is_reported(tmp_path: Path) -> None:
     with Children(tmp_path) as children:
         children.start(

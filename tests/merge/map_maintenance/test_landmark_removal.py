@@ -133,6 +133,7 @@ def test_expected_landmarks_are_visible_near_and_unoccluded() -> None:
     assert 20 < seen < len(points)
 
 
+@pytest.mark.slow
 def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Landmarks of a thing that stands elsewhere from the second drive on; it returns before the last."""
     rng = np.random.default_rng(2)
