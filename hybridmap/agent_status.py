@@ -134,6 +134,7 @@ class RobotEntry:
         component: number of that map's component; -1 if it is not known.
         place: the name of the place where it is; empty if it has none.
         floor: the floor of that map's component; empty if it is not known.
+        over_quota: what the server holds back of it, in words; empty if it sends and asks what it may.
     """
 
     robot: Name
@@ -144,6 +145,7 @@ class RobotEntry:
     component: Annotated[int, Meta(ge=-1)] = NO_COMPONENT
     place: Annotated[str, Meta(max_length=64)] = ""
     floor: Annotated[str, Meta(max_length=256)] = ""
+    over_quota: Line = ""
 
 
 @dataclass(frozen=True)

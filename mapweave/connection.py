@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 
 SOON = 1.0
 """s; a router that is there is found sooner. Commands say within 2 s of their start that there is none."""
+LOOK = 0.2
+"""s; without a router a person learns why in this time more."""
 ANSWERED = 2.0
 """s; a server or robot that is there answers sooner."""
 
@@ -33,8 +36,22 @@ def reach(settings: BusSettings, advice: str = "give --connect") -> ZenohBus:
     if not bus.wait_connected(SOON):
         bus.close()
         where = ", ".join(settings.endpoints)
+        if any(map(_listens, settings.endpoints)):
+            keys = "one of this fleet's keys" if settings.credentials is not None else "--keys FILE"
+            reason = "what listens there does not let this in"
+            raise NotConnected(f"no router at {where}: {reason}; if the fleet has keys, give {keys}")
         raise NotConnected(f"no router at {where}: start `mapweave server`, or {advice}")
     return bus
+
+
+def _listens(endpoint: str) -> bool:
+    """Whether a program takes connections there."""
+    host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), LOOK):
+            return True
+    except (OSError, ValueError):
+        return False
 
 
 def no_server(fleet: str) -> NotConnected:

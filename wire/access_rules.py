@@ -21,8 +21,8 @@ ASKS = (
 COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})
 """Those that change something."""
 WATCHES = ("liveliness_query", "declare_liveliness_subscriber")
-OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve", "status"})
-"""Those of robots."""
+OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve"})
+"""Those of robots, each in its own name."""
 
 
 def access_control(keys: Keys, access: Access, certified: bool) -> dict[str, object]:
@@ -76,6 +76,7 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
 
 def _robot(keys: Keys, name: str) -> list[_Rule]:
     agent, base = f"{keys.root}/agent/{name}", f"{keys.root}/robot/{name}"
+    questions = [keys.in_name_of(name, f"{keys.root}/server/*/{what}") for what in sorted(OF_ROBOTS)]
     addressed = [f"{keys.root}/server/*/{what}/{name}" for what in ("ack", "poses")]
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
@@ -83,7 +84,7 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
                   f"{agent}/portal",
                   f"{base}/describe", f"{base}/step"]),
         *_reads([*addressed, keys.servers_alive(), f"{base}/driver/*", f"{agent}/alive/*"]),
-        *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
+        *_asks([*addressed, *questions, f"{keys.root}/server/*/status",
                 f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
     ]  # fmt: skip
 

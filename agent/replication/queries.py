@@ -38,15 +38,16 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
         InvalidValue: no message can hold it.
     """
     if isinstance(question, WhereAmI):
-        return keys.any_relocalize(), encode_view(replace(question.view, near=question.near))
+        view = replace(question.view, near=question.near)
+        return keys.in_name_of(robot, keys.any_relocalize()), encode_view(view)
     if isinstance(question, WhatIsKnown):
         around = KnownRequest(question.map, question.x, question.y, question.reach)
-        return keys.any_known(), encode(around)
+        return keys.in_name_of(robot, keys.any_known()), encode(around)
     if isinstance(question, MayIDrive):
         reserve = ReserveRequest(robot, question.start, question.start_from_robot, question.route)
-        return keys.any_reserve(), encode(reserve)
+        return keys.in_name_of(robot, keys.any_reserve()), encode(reserve)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
-    return keys.any_route(), encode(request)
+    return keys.in_name_of(robot, keys.any_route()), encode(request)
 
 
 def decode_answer(

@@ -43,7 +43,7 @@ PATIENCE = 60.0
 
 @dataclass(frozen=True)
 class Orders:
-    """What the process is told.
+    """What the process has to do.
 
     Attributes:
         endpoint: of the router.

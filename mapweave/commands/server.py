@@ -70,12 +70,12 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
-    from mapweave.terminal import STAMP, stamped
+    from mapweave.terminal import log_with_time, stamped
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
-    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
+    log_with_time()
     for part in ("mapweave.mapserver", "mapweave.wire"):
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
-        how = ServerSettings(settings.admission_control, settings.merge)
+        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
             data = arguments.data or DATA

@@ -33,6 +33,7 @@ export function listRobots(robots, select) {
     const choice = button(item, robot.robot, () => select(robot.robot));
     choice.dataset.robot = robot.robot;
     add(item, "span", ` ${word}`, kind);
+    if (robot.over_quota) add(item, "span", ", over its quota", "bad");
     const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
       robot.component < 0 ? "not on the map" : ""];
     item.append(" " + parts.filter(Boolean).join(", "));
@@ -89,6 +90,7 @@ export function updateRobot(robots) {
     ["images skipped", status && status.skipped],
     ["battery", status?.battery != null ? percent(status.battery) : ""],
     ["sees the server", status && (status.linked ? "yes" : "no")],
+    ["quota", robot.over_quota, "bad"],
     ["last error", status?.last_error ? `${status.last_error} (${seconds(status.error_age)} before)` : "", "bad"],
   ]);
 }

@@ -76,6 +76,12 @@ def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.Capture
     for host in ('a"b', "a b", "-x", "a/b", ""):
         assert "write a name or an address" in complaint(capfd, "keys", "init", *fresh, f"--at={host}")
     assert not (tmp_path / "fresh").exists()
+    cut = tmp_path / "cut.key.toml"
+    whole = (keys / "r0.key.toml").read_bytes()
+    for length in (0, len(whole) // 2):
+        cut.touch(mode=0o600)
+        cut.write_bytes(whole[:length])
+        assert "copy it once more" in complaint(capfd, "status", "--keys", cut)
     (keys / "fleet.json").write_text('{"fleet": 3}')
     assert "fleet.json" in complaint(capfd, "keys", "list", *where)
 
