@@ -17,9 +17,11 @@ from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.hybridmap.mission_order import MissionOrder
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.traffic_meter import TrafficMeter
 
@@ -76,6 +78,7 @@ class FleetClient:
         self._closing = [
             bus.serve(keys.mission(map_id.agent), self._take_mission),
             bus.serve(keys.drive(map_id.agent), self._take_drive),
+            bus.serve(keys.portal(map_id.agent), self._take_portal),
             bus.serve(keys.agent_status(map_id.agent), self._tell_status),
             bus.watch(keys.server_alive(server), self._see_server),
             bus.announce(keys.agent_alive(map_id)),
@@ -168,6 +171,13 @@ class FleetClient:
         # A mission ends the wait for a person who has fallen silent.
         self._teleoperation.release()
         request.reply(encode(report))
+
+    def _take_portal(self, request: Request) -> None:
+        try:
+            done = decode(request.payload, PortalDone)
+            request.reply(encode_record({"said": self._missions.portal_done(done.by)}))
+        except MapweaveError as refused:
+            request.refuse(str(refused))
 
     def _take_drive(self, request: Request) -> None:
         answer_ns = self._teleoperation.take(decode(request.payload, DriveRequest))

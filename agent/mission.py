@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from mapweave.agent.observation import Command
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import KnownAnswer, RelocalizeAnswer, ReserveAnswer, RouteAnswer, View
 
@@ -32,10 +33,14 @@ class GoTo:
     Attributes:
         node: the goal.
         via: nodes to pass before, in order.
+        passed: how many of these were passed before the robot was switched off.
+        portal: the portal at which it was then.
     """
 
     node: NodeId
     via: tuple[NodeId, ...] = ()
+    passed: int = 0
+    portal: PortalWait | None = None
 
 
 Mission = Idle | Explore | Carried | GoTo
@@ -56,10 +61,17 @@ class Driven:
 
 @dataclass(frozen=True, eq=False)
 class WhereAmI:
-    """Question to the fleet's map: where was this view taken?"""
+    """Question to the fleet's map: where was this view taken?
+
+    Attributes:
+        number: of the question; the answer repeats it.
+        view: of the robot.
+        near: the robot knows that it is on the floor of this node; None if it does not.
+    """
 
     number: int
     view: View
+    near: NodeId | None = None
 
 
 @dataclass(frozen=True)

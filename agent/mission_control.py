@@ -37,11 +37,18 @@ Defer = Callable[[Callable[[], None]], object]
 
 
 def as_mission(order: MissionOrder) -> Mission:
-    """What the pipeline shall do."""
+    """What the pipeline shall do, from the beginning."""
     if order.node is not None:
         return GoTo(order.node, order.via)
     plain: dict[MissionKind, Mission] = {MissionKind.EXPLORE: Explore(), MissionKind.CARRIED: Carried()}
     return plain.get(order.kind, Idle())
+
+
+def _taken_up(mission: Mission, report: MissionReport) -> Mission:
+    """The same mission from where the robot was with it."""
+    return (
+        replace(mission, passed=report.passed, portal=report.portal) if isinstance(mission, GoTo) else mission
+    )
 
 
 class MissionControl:
@@ -85,6 +92,7 @@ class MissionControl:
             # There may be more to map.
             self._reports[held[-1].order.id] = replace(held[-1], state=MissionState.RUNNING)
         self._applied: tuple[str, Mission] | None = None
+        self._through = False
         self._linked_at: float | None = None
         self._interruption = ""
 
@@ -143,9 +151,10 @@ class MissionControl:
         if linked or self._linked_at is None or now < self._linked_at:  # or its clock has jumped back
             self._linked_at = now
         with self._lock:
-            order = None if self._current is None else self._reports[self._current].order
-            if order is None:
+            report = None if self._current is None else self._reports[self._current]
+            if report is None:
                 return None
+            order = report.order
             wanted = as_mission(order) if self._active(order) else Idle()
             gone = now - self._linked_at > GONE and not isinstance(wanted, Carried)
             self._interruption = ""
@@ -156,10 +165,38 @@ class MissionControl:
             if (order.id, wanted) == self._applied:
                 return None
             self._applied = order.id, wanted
-            return wanted
+            return _taken_up(wanted, report) if wanted == as_mission(order) else wanted
+
+    def portal_done(self, by: str) -> str:
+        """The robot was taken through the portal at which it waits, from any thread; returns that in words.
+
+        Raises:
+            InvalidValue: it waits at none.
+        """
+        with self._lock:
+            report = None if self._current is None else self._reports[self._current]
+            wait = None if report is None or not report.open else report.portal
+            if report is None or wait is None or wait.done:
+                what = "looks where it is already" if wait is not None else "does not wait at a portal"
+                raise InvalidValue(f"{self._robot} {what}")
+            self._note(replace(report, portal=replace(wait, done=True)))
+            self._through = True
+        self.save()
+        log.info("%s was taken through %s, says %s", self._robot, wait.portal.title, by or "a person")
+        return f"{self._robot} was taken through {wait.portal.title}: it looks where it is"
+
+    def taken_through(self) -> bool:
+        """Whether a person has said since the last call that the robot was taken through a portal."""
+        with self._lock:
+            through, self._through = self._through, False
+        return through
 
     def follow(self, status: Status) -> bool:
-        """Take note of how far the pipeline is with what `next` gave; returns whether that ended it."""
+        """Take note of how far the pipeline is with what `next` gave.
+
+        Returns:
+            Whether that ended it, or a further stop on its way was passed, or it came to a portal.
+        """
         with self._lock:
             report = None if self._current is None else self._reports[self._current]
             if report is None or report.state is not MissionState.RUNNING:
@@ -167,14 +204,17 @@ class MissionControl:
             if self._applied != (report.order.id, as_mission(report.order)):
                 self._reports[report.order.id] = replace(report, reason=self._interruption)
                 return False
-            report = replace(report, progress=status.progress, reason="")
+            before = report.passed, report.portal
+            report = replace(
+                report, progress=status.progress, reason="", passed=status.passed, portal=status.portal
+            )
             if status.given_up:
                 report = replace(report, state=MissionState.FAILED, reason=one_line(status.detail))
             elif status.finished or report.order.kind is MissionKind.STOP:
                 report = replace(
                     report, state=MissionState.DONE, progress=1.0, reason=one_line(status.detail)
                 )
-            if report.state is MissionState.RUNNING:
+            if report.state is MissionState.RUNNING and before == (report.passed, report.portal):
                 self._reports[report.order.id] = report
                 return False
             self._note(report)

@@ -11,7 +11,6 @@ It knows no network, no disk and no clock: live robots, recordings, simulation a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,28 +19,29 @@ from numpy.typing import NDArray
 
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.camera_occupancy import CameraOccupancyGrid
-from mapweave.agent.cautious_driving import ALONG_EDGES, CautiousDriving, lacks_rangers, speed_for
-from mapweave.agent.exploration.camera_exploration import CameraExploration, with_readings
+from mapweave.agent.cautious_driving import CautiousDriving, lacks_rangers
+from mapweave.agent.command_guard import CommandGuard
 from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
-from mapweave.agent.exploration.random_exploration import RandomExploration
+from mapweave.agent.exploration.new_explorer import new_explorer
 from mapweave.agent.global_localization.resumption import Resumption
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
 from mapweave.agent.navigation.navigator import Navigator
+from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.ranger_monitor import not_exploring
 from mapweave.agent.sensor_health.sensor_monitor import Fault, SensorMonitor
-from mapweave.agent.servo.proximity import guard
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
@@ -114,7 +114,7 @@ class Pipeline:
         self._passenger = CarriedMapping(self._mapper)
         self._navigator: Navigator | None = None
         self._resumption: Resumption | None = None
-        self._direction = 1.0
+        self._guard = CommandGuard(self._caution)
         self._lifted = self._put_elsewhere = False
         self._image: NDArray[np.uint8] | None = None
 
@@ -197,13 +197,27 @@ class Pipeline:
         match mission:
             case Explore() if self._explorer is None and self._explores:
                 self._explorer = self._new_explorer()
-            case GoTo(goal, via):
+            case GoTo(goal, via, passed, portal):
                 self._mapper.lose()
                 self._restart()
+                crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)
                 self._navigator = Navigator(
                     self._description, self._lens, self._sift, self.map, goal, self._settings,
-                    self._settings.seed, via,
+                    self._settings.seed, via[passed:], crossing,
                 )  # fmt: skip
+
+    def taken_through(self) -> None:
+        """A person says that the robot was taken through the portal at which it waits."""
+        if self._navigator is not None:
+            self._navigator.crossing.taken_through()
+
+    @property
+    def _progress(self) -> tuple[int, PortalWait | None]:
+        """How many nodes on the way of a goal were passed, and the portal at which the robot waits."""
+        if not isinstance(self._mission, GoTo) or self._navigator is None:
+            return 0, None
+        wait = None if self._navigator.given_up else self._navigator.crossing.wait
+        return self._mission.passed + self._navigator.passed, wait
 
     def step(
         self, observation: Observation, answers: tuple[Answer, ...] = (), driven: Driven | None = None
@@ -244,10 +258,6 @@ class Pipeline:
         if self._blind and not self._lifted:
             command = self._sensors.trial
         safe, warning = self._safe(command if driven is None or self._lifted else driven.command, observation)
-        if observation.bumped and safe.forward * self._direction > 0:
-            safe, warning = Command(0.0, safe.turn), "stopped: the bumper is pressed"
-        elif not observation.bumped and safe.forward:
-            self._direction = math.copysign(1.0, safe.forward)
         self._see_changes()
         changes, self._changes = tuple(self._changes), []
         own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
@@ -294,7 +304,8 @@ class Pipeline:
             self._mapper.lose()
         elif self._lifted and not observation.kidnapped:
             if isinstance(self._mission, GoTo):
-                self.set_mission(self._mission)
+                passed, portal = self._progress
+                self.set_mission(replace(self._mission, passed=passed, portal=portal))
             else:
                 self._put_elsewhere = bool(self.map.nodes) and not isinstance(self._mission, Idle)
                 self._restart()
@@ -311,12 +322,7 @@ class Pipeline:
         return floor
 
     def _new_explorer(self) -> Explorer:
-        settings, parts = self._settings, (self._map_id, self._description, self._mapper)
-        more = settings.exploration, settings.seed
-        if isinstance(self._floor, CameraOccupancyGrid):
-            return CameraExploration(*parts, self._floor, *more)
-        kind = RandomExploration if settings.exploration.random else Explorer
-        return kind(*parts, self._floor, *more)
+        return new_explorer(self._map_id, self._description, self._mapper, self._floor, self._settings)
 
     def _take_over(self, driven: Driven | None) -> None:
         """A person takes the wheels, or gives them back: the mission goes on from where the robot is then."""
@@ -343,18 +349,9 @@ class Pipeline:
 
     def _safe(self, command: Command, observation: Observation) -> tuple[Command, str]:
         """The command as far as it is safe, and why it is not the one that was wanted."""
-        if self._caution is None:
-            return guard(command, observation.proximity, self._description)
-        if self._driven:
-            return self._caution.command(command, self._description.max_forward, follow=True), ""
-        floor, warning, most = self._floor, "", ALONG_EDGES
-        if isinstance(self._mission, Explore) and isinstance(floor, CameraOccupancyGrid):
-            pose = self._mapper.map_from_robot.mean
-            command, warning = guard(command, floor.readings(pose), with_readings(self._description))
-            direction = 0.0 if command.forward >= 0.0 else math.pi
-            most = speed_for(floor.known_ahead(pose, direction, 0.5))
-        safe = self._caution.command(command, most)
-        return safe, "backing off from a touch" if self._caution.backing_off else warning
+        floor = self._floor if isinstance(self._mission, Explore) else None
+        pose, driven = self._mapper.map_from_robot.mean, self._driven is not None
+        return self._guard.safe(command, observation, self._description, driven, floor, pose)
 
     def _see_changes(self) -> None:
         """Take what was changed in the map; nodes show a robot without rangers where the floor is free."""
@@ -476,6 +473,7 @@ class Pipeline:
         if not nodes and isinstance(self._mission, Explore | Carried):
             detail = f"no nodes yet: {detail or self._mapper.track_report}"
         fix = self._navigator.fix if self._navigator is not None else None
+        passed, portal = self._progress
         c = (self._mapper.map_from_robot if fix is None else fix.node_from_robot).covariance
         return Status(
             doing=doing,
@@ -494,5 +492,7 @@ class Pipeline:
             progress=progress,
             located=mapping and self._located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
+            passed=passed,
+            portal=portal,
             covariance=(float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), float(c[2, 2])),
         )

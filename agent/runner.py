@@ -85,6 +85,8 @@ class Runner:
         mission = self._missions.next(self._fleet.server_in_reach(), observation.stamp_ns * 1e-9, home)
         if mission is not None:
             self._pipeline.set_mission(mission)
+        if self._missions.taken_through():
+            self._pipeline.taken_through()
         answers, self._answers = (*self._answers, *self._fleet.answers()), ()
         step = self._pipeline.step(observation, answers, self._fleet.driven())
         self._questions = step.questions

@@ -123,6 +123,21 @@ class NavigatorSettings:
 
 
 @dataclass(frozen=True)
+class PortalSettings:
+    """What a robot does at lifts, ramps and doors through which it asks to be taken.
+
+    Attributes:
+        command: program and arguments that take it through, for example by calling the lift; none waits for
+            people alone. Exit status 0 says that it is through; see docs/floors.md.
+        patience: how long it waits at one portal altogether before it gives its goal up, s. The command is
+            ended then, too.
+    """
+
+    command: tuple[str, ...] = ()
+    patience: Positive = 1800.0
+
+
+@dataclass(frozen=True)
 class OccupancyGridSettings:
     """What the robot keeps of what its proximity sensors saw.
 
@@ -161,6 +176,7 @@ class AgentSettings:
         tracking: of landmarks while a view is mapped.
         exploration: where to map next.
         navigation: to a goal.
+        portals: lifts, ramps and doors through which it asks to be taken.
         occupancy_grid: of what the proximity sensors saw.
     """
 
@@ -173,4 +189,5 @@ class AgentSettings:
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     exploration: ExplorerSettings = field(default_factory=ExplorerSettings)
     navigation: NavigatorSettings = field(default_factory=NavigatorSettings)
+    portals: PortalSettings = field(default_factory=PortalSettings)
     occupancy_grid: OccupancyGridSettings = field(default_factory=OccupancyGridSettings)

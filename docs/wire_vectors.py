@@ -1,6 +1,6 @@
 """Test vectors of `wire.md`: every message with its key, its bytes in hexadecimal and its value.
 
-python docs/wire_vectors.py    # writes docs/wire_vectors.json
+python -m docs.wire_vectors    # writes docs/wire_vectors.json
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ from mapweave.hybridmap.mission_order import (
 )
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pin import Pin
+from mapweave.hybridmap.portal import Portal, PortalDone, PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.ranges import Ranges
@@ -132,6 +133,9 @@ def landmarks(camera: Camera, count: int, by_rows: bool = True) -> Landmarks:
     return settled if by_rows else settled.take(np.arange(count)[::-1])
 
 
+LIFT = PortalStop("east lift", PortalMeans.LIFT, NODE, FAR, "second", "key at the desk")
+
+
 def node(node_id: NodeId = NODE, count: int = 3, camera: Camera = SMALL, by_rows: bool = True) -> Node:
     """One with nothing that may be left out."""
     return Node(node_id, STAMP, HERE, camera, landmarks(camera, count, by_rows))
@@ -184,6 +188,7 @@ def annotations() -> tuple[annotation.Annotation, ...]:
         "paint": annotation.Closure((NODE, NEXT), begin_ns=STAMP),
         "corridor": annotation.Preference(0.5, (NODE, FAR)),
         str(MAP): annotation.Floor(NODE, "ground"),
+        "east lift": Portal(NODE, FAR, PortalMeans.LIFT, "key at the desk"),
         "office": floor_plan.FloorPlan(pairs, image, 0.025, Pose2(-1.0, 2.0, 0.0)),
         "frame": Pin(NODE, Pose2(12.5, -3.0, 1.5)),
     }
@@ -217,7 +222,8 @@ def status() -> AgentStatus:
 def mission() -> MissionReport:
     """A drive to a place."""
     order = MissionOrder("7f3a9c", "r0", MissionKind.GO, STAMP, "anna", FAR, "kitchen", (NODE,))
-    return MissionReport(order, MissionState.RUNNING, 0.25, "driving")
+    wait = PortalWait(LIFT, 2, True)
+    return MissionReport(order, MissionState.RUNNING, 0.25, "driving", 1, wait)
 
 
 def explained() -> explanation.PairExplanation:
@@ -273,7 +279,7 @@ def answers() -> dict[str, tuple[Any, ...]]:
             query.RelocalizeAnswer(query.Certainty.FOUND, (where,), "41 landmarks agree"),
             query.RelocalizeAnswer(query.Certainty.UNKNOWN, (), "no place agrees", (similar,)),
         ),
-        "server/s0/route": (route, query.RouteAnswer(legs, "2 nodes")),
+        "server/s0/route": (route, query.RouteAnswer(legs, "2 nodes"), query.RouteAnswer(legs, "", LIFT)),
         "server/s0/known": (query.KnownRequest(MAP, 1.25, -2.5, 8.5), query.KnownAnswer(views, "2 views")),
         "server/s0/reserve": (
             query.ReserveRequest("r0", NODE, Pose2(0.1, 0.0, 0.2), (NEXT, FAR)),
@@ -306,6 +312,7 @@ def answers() -> dict[str, tuple[Any, ...]]:
         "server/s0/robots": (FleetStatus(robots),),
         "agent/r0/mission": (mission().order, mission()),
         "agent/r0/status": (status(),),
+        "agent/r0/portal": (PortalDone("r0", "anna"),),
         "agent/r0/drive": (DriveRequest(7, 0.25, -0.5, STAMP, True), DriveAnswer(status(), STAMP, 0.5, 0.75)),
     }  # fmt: skip
 
@@ -354,6 +361,7 @@ def others() -> list[dict[str, Any]]:
     news = PoseNews(2**62, 4, 5, placed, (NodeId("r0", 2, 3),))
     seen = landmarks(SMALL, 4, by_rows=False)
     view = query.View(seen.pixels, seen.codes, SMALL)
+    near = query.View(seen.pixels, seen.codes, SMALL, NODE)
     image = np.arange(12, dtype=np.uint8).reshape(3, 4)
     observation = Observation(STAMP, Odometry(0.025, -0.05), image, np.array([0.4, 1.5]), True, 0.75, True)
     geometry = DriveGeometry(wheel_scale=1.02, drift=0.01, heading=0.02, delay=0.03)
@@ -366,6 +374,7 @@ def others() -> list[dict[str, Any]]:
     cases: tuple[tuple[str, str, str, bytes, Callable[[bytes], Any]], ...] = (
         ("merged poses", "", "server/s0/poses/r0", news.encode("r0"), lambda d: PoseNews.decode(d, "r0")),
         ("view", "question", "server/s0/relocalize", encode_view(view), decode_view),
+        ("view", "of a known floor", "server/s0/relocalize", encode_view(near), decode_view),
         ("flat record", "answer", "server/s0/constrain", encode_record(answer), decode_record),
         ("refusal", "error reply", "server/s0/route", encode_refusal("no such node", 0.0), _refusal),
         ("refusal", "error reply of a busy server", "server/s0/route", encode_refusal("busy", 0.5), _refusal),

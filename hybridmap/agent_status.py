@@ -11,10 +11,12 @@ from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.limits import Amount, Name, Number, Share, Stamp
 from mapweave.hybridmap.mission_order import MissionReport
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import Pose2
 
 MAX_STATUS_WORDS = 500
 MAX_ROBOTS = 1024
+MAX_ACCUSATION = 1000
 Line = Annotated[str, Meta(max_length=MAX_STATUS_WORDS)]
 
 IDENTITY = Pose2()
@@ -48,6 +50,8 @@ class Status:
         given_up: whether it stands, since the goal cannot be reached; `detail` is the reason.
         progress: share of the present route that is driven.
         tally: statistics of the drive so far.
+        passed: how many of the nodes that it must pass before its goal it has passed.
+        portal: the portal at which it waits; None while it drives.
         covariance: of the pose by which the robot knows itself, in its own frame: xx, xy, yy, m^2, and of the
             heading, rad^2; zeros if it is not known.
     """
@@ -68,6 +72,8 @@ class Status:
     given_up: bool = False
     progress: Share = 0.0
     tally: DriveStatistics = NOTHING_DRIVEN
+    passed: Number = 0
+    portal: PortalWait | None = None
     covariance: tuple[Amount, float, Amount, Amount] = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -129,6 +135,9 @@ class RobotEntry:
         component: number of that map's component; -1 if it is not known.
         place: the name of the place where it is; empty if it has none.
         floor: the floor of that map's component; empty if it is not known.
+        over_quota: what the server holds back of it, in words; empty if it sends and asks what it may.
+        accusation: what the server holds against the newest of its maps with which something is wrong; empty
+            if there is none.
     """
 
     robot: Name
@@ -139,6 +148,8 @@ class RobotEntry:
     component: Annotated[int, Meta(ge=-1)] = NO_COMPONENT
     place: Annotated[str, Meta(max_length=64)] = ""
     floor: Annotated[str, Meta(max_length=256)] = ""
+    over_quota: Line = ""
+    accusation: Annotated[str, Meta(max_length=MAX_ACCUSATION)] = ""
 
 
 @dataclass(frozen=True)

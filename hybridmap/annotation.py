@@ -21,6 +21,7 @@ from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import MOST_WORDS
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
+from mapweave.hybridmap.portal import Portal
 from mapweave.hybridmap.wall_time import utc_words
 
 MAX_NAME = 64
@@ -166,9 +167,9 @@ class Floor:
         return f"on floor {self.label}"
 
 
-Body = Place | Closure | Preference | Floor | FloorPlan | Pin
+Body = Place | Closure | Preference | Floor | Portal | FloorPlan | Pin
 BODIES: dict[str, type[Body]] = {
-    body.TAG: body for body in (Place, Closure, Preference, Floor, FloorPlan, Pin)
+    body.TAG: body for body in (Place, Closure, Preference, Floor, Portal, FloorPlan, Pin)
 }
 """Kinds of annotations, by the word that names them in messages."""
 AnyBody = TypeVar("AnyBody", bound=Body)

@@ -207,7 +207,7 @@ class Hop:
         a: from here.
         b: to there.
         kind: of the edge, see mapweave.hybridmap.node.EdgeKind; `near` if the two are at one place,
-            `superseded` if one is superseded by the other.
+            `superseded` if one is superseded by the other; lift, ramp or door of a portal.
         distance: m, between the two.
         turn: rad, between their headings, signed.
         cost: what it adds to the cost of a route, m.

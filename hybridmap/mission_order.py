@@ -13,6 +13,7 @@ from msgspec import Meta
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import Name, Share, Stamp, Words
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.portal import PortalWait
 
 MAX_KEPT = 200
 """Missions in a history; older ones are dropped."""
@@ -147,12 +148,16 @@ class MissionReport:
         state: the last states are final.
         progress: share of the way to the goal; 1 when it is done.
         reason: why, in words.
+        passed: how many of the nodes of `via` were passed.
+        portal: the portal at which the robot waits; None while it drives.
     """
 
     order: MissionOrder
     state: MissionState
     progress: Share = 0.0
     reason: Words = ""
+    passed: Annotated[int, Meta(ge=0, le=MAX_VIA)] = 0
+    portal: PortalWait | None = None
 
     @property
     def open(self) -> bool:

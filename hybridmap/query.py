@@ -25,6 +25,7 @@ from mapweave.hybridmap.limits import (
     Words,
 )
 from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 MAX_CANDIDATES = 64
@@ -46,11 +47,13 @@ class View:
         pixels: (N, 2) float32, undistorted px.
         codes: (N, 32) uint8, compact SIFT descriptors.
         camera: the camera that took it; may be another than the mapping robot's.
+        near: the robot knows that it is on the floor of this node; None if it does not.
     """
 
     pixels: NDArray[np.float32]
     codes: NDArray[np.uint8]
     camera: Camera
+    near: NodeId | None = None
 
     def __len__(self) -> int:
         """How many features."""
@@ -157,10 +160,17 @@ class RouteLeg:
 
 @dataclass(frozen=True, eq=False)
 class RouteAnswer:
-    """A way through the merged map. `legs[0]` is the node where the robot is; empty if there is no way."""
+    """A way through the merged map.
+
+    Attributes:
+        legs: the first is the node where the robot is; empty if there is no way.
+        reason: in words.
+        portal: where the legs end if that is not the goal: from its other side on the robot asks again.
+    """
 
     legs: Annotated[tuple[RouteLeg, ...], Meta(max_length=MAX_LEGS)]
     reason: Words
+    portal: PortalStop | None = None
 
 
 @dataclass(frozen=True, eq=False)

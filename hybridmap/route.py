@@ -23,11 +23,14 @@ class RouteSettings:
         per_turn: a radian between the headings of two nodes.
         per_undriven: 1/m; an edge that was recognised but never driven costs more by its length times
             this: there may be an obstacle in between, as a wall where a room is seen through its door.
+        per_portal: a portal; the robot stands there until a person has come, two minutes perhaps, in which it
+            drives as far as this.
     """
 
     per_edge: float = 0.02
     per_turn: float = 0.1
     per_undriven: float = 1.5
+    per_portal: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,12 @@ class Ways:
         settings: RouteSettings | None = None,
         toll: float | None = None,
         factors: Mapping[frozenset[NodeId], float] | None = None,
+        portals: Mapping[EdgeId, tuple[NodeId, NodeId]] | None = None,
     ) -> None:
         """Take a map; the arguments are those of `find_route`.
+
+        Portals join nodes, also of different frames: distances say nothing of the ways through them, so that
+        with portals A* is Dijkstra's search.
 
         With factors, by pairs of nodes, edges cost so many times as much; they are positive.
 
@@ -93,7 +100,17 @@ class Ways:
             if not self._graph.has_edge(edge.a, edge.b):
                 self._graph.add_edge(edge.a, edge.b, choices=[], barred=barred)
             self._graph.edges[edge.a, edge.b]["choices"].append((cost, edge.id))
-        self._comparable = poses is not None or len({node_id.map for node_id in self._graph}) <= 1
+        for edge_id, (a, b) in sorted((portals or {}).items()):
+            barred = frozenset((a, b)) in self._barred
+            if a not in self._places or b not in self._places or (barred and toll is None):
+                continue
+            cost = s.per_portal * factors.get(frozenset((a, b)), 1.0)
+            if not self._graph.has_edge(a, b):
+                self._graph.add_edge(a, b, choices=[], barred=barred)
+            self._graph.edges[a, b]["choices"].append((cost, edge_id))
+        self._portals = tuple((portals or {}).values())
+        one_frame = poses is not None or len({node_id.map for node_id in self._graph}) <= 1
+        self._comparable = one_frame and not portals
 
     def find(self, start: NodeId, goal: NodeId) -> Route:
         """The cheapest way; see `find_route`."""
@@ -136,6 +153,9 @@ class Ways:
 
     def _why_not(self, start: NodeId, goal: NodeId) -> str:
         present = self._map.graph.subgraph(self._map.nodes)
+        if self._portals:
+            present = present.copy()
+            present.add_edges_from(self._portals)
         if not nx.has_path(present, start, goal):
             return f"{start} and {goal} are in parts of the map that nothing joins"
         ties = [hop for hop in present.edges(keys=True) if hop[2] in self._closed]

@@ -6,15 +6,19 @@ import logging
 import threading
 from collections.abc import Callable
 
-from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
+from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places
+from mapweave.mapserver.portals import check_portal
 from mapweave.mapserver.services import guarded
+from mapweave.merge.floors import floor_of, held_together
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Closing
 from mapweave.wire.keys import Keys
@@ -71,6 +75,7 @@ class Annotator:
         places: Callable[[], Places],
         record: AnnotationRecord,
         check: Callable[[Annotation], None],
+        constraints: Callable[[], ManualConstraints],
         changed: Callable[[Annotations], None],
     ) -> None:
         """Begin to answer.
@@ -82,10 +87,11 @@ class Annotator:
             places: of the newest merged map. May wait for it.
             record: of annotations.
             check: refuses an annotation that lacks something on this server (InvalidValue).
+            constraints: the record of manual constraints.
             changed: called with the whole record whenever there is a new entry.
         """
         self._places, self._record = places, record
-        self._check, self._changed = check, changed
+        self._check, self._constraints, self._changed = check, constraints, changed
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.annotate(name), guarded(self._annotate)),
@@ -116,8 +122,8 @@ class Annotator:
             InvalidValue: it says nothing new, or is about something that is not there.
         """
         with self._turn:
-            places = self._places()
-            check_annotation(places.merged, self._record.annotations, annotation)
+            places, annotations = self._places(), self._record.annotations
+            check_annotation(places.merged, annotations, annotation, self._constraints())
             self._check(annotation)
             if check:
                 words = "; ".join((annotation.words, *effects_of(annotation, places)))
@@ -131,16 +137,20 @@ class Annotator:
         return encode_record({"said": self.annotate(decode(payload, Annotation))})
 
 
-def check_annotation(merged: MergedMap, annotations: Annotations, annotation: Annotation) -> None:
+def check_annotation(
+    merged: MergedMap, annotations: Annotations, annotation: Annotation, constraints: ManualConstraints
+) -> None:
     """Refuse an annotation that is a mistake.
 
     Args:
         merged: what it is made about.
         annotations: the record.
         annotation: the new one.
+        constraints: manual constraints, merged already or not.
 
     Raises:
-        InvalidValue: it says nothing new, or is about something that is not there.
+        InvalidValue: it says nothing new, is about something that is not there, or contradicts what else
+            people have said.
     """
     kind, name = annotation.kind, annotation.name
     before = annotations.last(kind, name)
@@ -157,5 +167,29 @@ def check_annotation(merged: MergedMap, annotations: Annotations, annotation: An
     merged.check(anchor)
     if merged.component_of(anchor) is None:
         raise InvalidValue(f"node {anchor} is not in the merged map")
-    if isinstance(annotation.body, FloorPlan):
-        check_plan(annotation.body, merged)
+    match body:
+        case FloorPlan():
+            check_plan(body, merged)
+        case Portal():
+            check_portal(merged, annotations, name, body)
+        case Floor():
+            _check_floor(merged, annotations, body, constraints)
+
+
+def _check_floor(
+    merged: MergedMap, annotations: Annotations, floor: Floor, constraints: ManualConstraints
+) -> None:
+    """Refuse a label that contradicts links by hand, drives, or a lift (InvalidValue)."""
+    which, label = floor.node.map, floor.label
+    floors = {**annotations.floors, which: label}
+    if against := held_together(merged, constraints, floors, which):
+        raise InvalidValue(f"map {which} cannot be on floor {label}: {against}; take one of it back first")
+    for entry, portal in annotations.in_force(Portal):
+        first, second = (floor_of(merged, floors, node) for node in (portal.a, portal.b))
+        differ = first and second and first != second
+        same = first and first == second
+        if which in (portal.a.map, portal.b.map) and (differ if portal.means is PortalMeans.DOOR else same):
+            raise InvalidValue(
+                f"map {which} cannot be on floor {label}: {entry.words}, so that its sides would be on "
+                f"{'one floor' if same else 'two floors'}; first: mapweave map portal remove {entry.name!r}"
+            )

@@ -197,7 +197,7 @@ class Explainer:
         with self._turn:
             constraint, effects = check_manual_constraint(
                 self._answers().merged,
-                self._record.constraints,
+                self._record.constraints.with_floors(self._annotations().floors),
                 request.constraint,
                 self._record.maps(),
                 self._settings,

@@ -25,12 +25,14 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import MapId, NodeId, check_name
+from mapweave.hybridmap.portal import PortalDone
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.roster import Roster
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
@@ -95,6 +97,19 @@ class MissionRelay:
             known = self._note(self._resolved(request))
             self._replace_older(known.order, MissionState.SENT)
         return self._hand_on(known.order) if known.open else known
+
+    def portal_done(self, robot: str, by: str) -> str:
+        """Tell a robot that it was taken through a portal; returns what it does, in words.
+
+        Raises:
+            InvalidValue: it does not wait at a portal, or does not answer.
+        """
+        done = PortalDone(check_name(robot), by[:64])
+        for reply in self._bus.ask(self._keys.portal(robot), encode(done), ANSWER):
+            if reply.error:
+                raise InvalidValue(reply.error.removeprefix("refused: "))
+            return str(decode_record(reply.payload)["said"])
+        raise InvalidValue(f"{robot} does not answer")
 
     def request(
         self,

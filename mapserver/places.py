@@ -13,7 +13,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import reason_of
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
     REACH,
@@ -22,6 +22,7 @@ from mapweave.hybridmap.query import (
     Resolved,
     ResolveRequest,
 )
+from mapweave.merge.floors import labels_of
 
 if TYPE_CHECKING:
     # Programs that only give names of places need none of the server's libraries.
@@ -110,11 +111,7 @@ class Places:
 
     def floor_of(self, component: int) -> str:
         """The floor of a component; empty if none is known. Of several, joined by hand, all."""
-        floors = self.annotations.floors
-        if not floors or not 0 <= component < len(self.merged.graphs):
-            return ""
-        maps = {MapId(*map_id) for map_id in self.merged.graphs[component].maps}
-        return " and ".join(sorted({floors[map_id] for map_id in maps if map_id in floors}))
+        return " and ".join(labels_of(self.merged, self.annotations.floors, component))
 
     def named(self, answer: RelocalizeAnswer) -> RelocalizeAnswer:
         """An answer to a lost robot, with the names of the places."""

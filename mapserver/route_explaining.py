@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from mapweave.hybridmap.annotation import Annotation
 from mapweave.hybridmap.explanation import Hop, MapsExplanation, RouteExplanation
 from mapweave.hybridmap.node import Edge, MapId, NodeId
+from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.route import Route, edge_cost
@@ -82,6 +83,9 @@ def explain_route(
     if missing := router.missing(start, goal):
         if closed := router.closed_goal(goal):
             return RouteExplanation(start, goal, False, closed)
+        floors = {router.portals.floor(node) for node in (start, goal)} - {""}
+        if len(floors) == 2:
+            return RouteExplanation(start, goal, False, missing)
         return _apart(merged, start, goal, missing)
     if start == goal:
         return RouteExplanation(start, goal, True, "start and goal are one node")
@@ -108,15 +112,18 @@ def explain_route(
     reason = _why(router, route, best, hops, gaps)
     if rules:
         free = router.ways(poses, blocked, wary, within=None).find(start, goal)
-        reason += _detour(route, free, poses, hindrances)
+        reason += _detour(router, route, free, poses, hindrances)
     return RouteExplanation(start, goal, True, reason, hops, gaps)
 
 
-def _detour(route: Route, free: Route, poses: Mapping[NodeId, Pose2], hindrances: _Hindrances) -> str:
+def _detour(
+    router: Router, route: Route, free: Route, poses: Mapping[NodeId, Pose2], hindrances: _Hindrances
+) -> str:
     """What closures and preferences change of a route, in words; empty if it is the same without them."""
     if not free.nodes or free.nodes == route.nodes:
         return ""
-    longer = _length(route, poses) - _length(free, poses)
+    of = router.merged.component_of
+    longer = _length(route, poses, of) - _length(free, poses, of)
     reasons = [
         hindrances.words(pair) or hindrances.preferred(pair) for pair in map(frozenset, pairwise(free.nodes))
     ]
@@ -125,8 +132,9 @@ def _detour(route: Route, free: Route, poses: Mapping[NodeId, Pose2], hindrances
     return f"; a detour of {longer:.1f} m, since the way without it is {said}" if said else ""
 
 
-def _length(route: Route, poses: Mapping[NodeId, Pose2]) -> float:
-    return sum(poses[a].distance(poses[b]) for a, b in pairwise(route.nodes))
+def _length(route: Route, poses: Mapping[NodeId, Pose2], of: Callable[[NodeId], int | None]) -> float:
+    """How far a robot drives; not through portals, whose sides are in two frames."""
+    return sum(poses[a].distance(poses[b]) for a, b in pairwise(route.nodes) if of(a) == of(b))
 
 
 def _why(router: Router, route: Route, best: Route, hops: tuple[Hop, ...], gaps: tuple[Hop, ...]) -> str:
@@ -134,6 +142,10 @@ def _why(router: Router, route: Route, best: Route, hops: tuple[Hop, ...], gaps:
     steps = "1 step" if len(hops) == 1 else f"{len(hops)} steps"
     length = sum(hop.distance for hop in hops)
     reason = f"{steps} over {length:.1f} m, cost {route.cost:.2f} m"
+    begin = router.portals.floor(route.nodes[0])
+    reason += f", on floor {begin}" if begin else ""
+    for _, stop in router.portals.stops(route.nodes, route.edges):
+        reason += f", through {stop.title} to {stop.beyond}"
     if gaps:
         many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
         reason += f"; a way for {best.cost:.2f} m has {many} that robots do not drive"
@@ -148,9 +160,12 @@ def _why(router: Router, route: Route, best: Route, hops: tuple[Hop, ...], gaps:
 def _hops(
     router: Router, way: Route, poses: Mapping[NodeId, Pose2], hindrances: _Hindrances
 ) -> Iterator[Hop]:
-    edges = router.roads.union.edges
-    for (a, b), edge_id in zip(pairwise(way.nodes), way.edges, strict=True):
+    edges, portals = router.roads.union.edges, dict(router.portals.stops(way.nodes, way.edges))
+    for number, ((a, b), edge_id) in enumerate(zip(pairwise(way.nodes), way.edges, strict=True)):
         pair = frozenset((a, b))
+        if number in portals:
+            yield _through(router, portals[number], pair, hindrances)
+            continue
         edge, words = edges[edge_id], hindrances.words(pair)
         more = WARY_COST if words else 0.0
         hop = _hop(
@@ -165,7 +180,12 @@ def _gaps(
 ) -> tuple[Hop, ...]:
     """Those hops of a way that robots cannot drive, or should not."""
     roads, out = router.roads, []
-    for a, b in pairwise(way.nodes):
+    portals = dict(router.portals.stops(way.nodes, way.edges))
+    for number, (a, b) in enumerate(pairwise(way.nodes)):
+        if number in portals:
+            if hindrances.words(frozenset((a, b))):
+                out.append(_through(router, portals[number], frozenset((a, b)), hindrances))
+            continue
         between = [roads.union.edges[key] for key in roads.union.graph.get_edge_data(a, b)]
         best = min(between, key=lambda e: (edge_cost(e, poses, True, router.costs), e.id))
         words = hindrances.words(frozenset((a, b)))
@@ -173,6 +193,14 @@ def _gaps(
             hop = _hop(router, best, a, b, poses, 0.0)
             out.append(replace(hop, words=words) if words else hop)
     return tuple(out)
+
+
+def _through(router: Router, stop: PortalStop, pair: frozenset[NodeId], hindrances: _Hindrances) -> Hop:
+    """A portal as a step of a way."""
+    words = f"{stop.title}: the robot asks to be taken to {stop.beyond}"
+    said = "; ".join(filter(None, (words, hindrances.words(pair), hindrances.preferred(pair))))
+    cost = router.costs.per_portal * hindrances.rules.factors_for(hindrances.within).get(pair, 1.0)
+    return Hop(stop.entry, stop.exit, str(stop.means), 0.0, 0.0, cost, said)
 
 
 def _hop(

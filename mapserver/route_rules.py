@@ -89,6 +89,12 @@ class RouteRules:
         self.closed: dict[Hop, list[Annotation]] = {}
         self.factors: dict[Hop, float] = {}
         self.preferences: dict[Hop, list[Annotation]] = {}
+        for entry, pair in self._across(annotations, stamp_ns):
+            if isinstance(entry.body, Preference):
+                self.factors[pair] = self.factors.get(pair, 1.0) * entry.body.factor
+                self.preferences.setdefault(pair, []).append(entry)
+            else:
+                self.closed.setdefault(pair, []).append(entry)
         for extent in self._closures:
             for hop in self._hops(extent):
                 self.closed.setdefault(hop, []).append(extent.entry)
@@ -145,6 +151,15 @@ class RouteRules:
             one.component == component and one.entry not in within and one.covers(a, b)[0]
             for one in self._closures
         )
+
+    def _across(self, annotations: Annotations, stamp_ns: int) -> Iterator[tuple[Annotation, Hop]]:
+        """What holds for two nodes of different components: for a portal between them alone."""
+        of = self._roads.merged.component_of
+        closures = [entry for entry, body in annotations.in_force(Closure) if body.holds(stamp_ns)]
+        for entry in (*closures, *(entry for entry, _ in annotations.in_force(Preference))):
+            edge = entry.body.edge if isinstance(entry.body, Closure | Preference) else None
+            if edge is not None and of(edge[0]) != of(edge[1]):
+                yield entry, frozenset(edge)
 
     def _extent(self, entry: Annotation, edge: Pair | None, area: Area | None) -> _Extent | None:
         """Where something holds; None if its nodes are not in the merged map."""

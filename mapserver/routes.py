@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import copy
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.route import Route, RouteSettings, Ways
 from mapweave.mapserver.active_nodes import without_faded
+from mapweave.mapserver.portals import Portals
 from mapweave.mapserver.roadmap import Roadmap
 from mapweave.mapserver.route_rules import RouteRules, rule_words
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -113,6 +115,11 @@ class Router:
         """What is closed, preferred and avoided."""
         return self._shared.rules(self.annotations, self._stamp_ns)
 
+    @property
+    def portals(self) -> Portals:
+        """Where people take robots from one part of the map to another."""
+        return Portals(self.merged, self.annotations)
+
     def route(
         self,
         start: NodeId,
@@ -134,7 +141,8 @@ class Router:
 
         Returns:
             The legs. Their relative poses are those of the optimised graph: each is the best estimate
-            from all edges together. That of the first is relative to `start`.
+            from all edges together. That of the first is relative to `start`. A way through portals ends at
+            the first of them.
         """
         if missing := self.missing(start, goal):
             return RouteAnswer((), missing)
@@ -161,8 +169,9 @@ class Router:
                 why = f": {reason_of(retired)}" if retired is not None else ""
                 why = why or (f": map {node.map} is set apart, {apart}" if apart is not None else "")
                 return f"{name} {node} is not in the merged map{why or self._nearest(node)}"
-        if self.merged.component_of(start) != self.merged.component_of(goal):
-            return f"{start} and {goal} are in parts of the map that nothing joins yet"
+        parts = self.merged.component_of(start), self.merged.component_of(goal)
+        if parts[0] != parts[1] and not (portals := self.portals).lead(start, goal):
+            return portals.apart(start, goal)
         return self.closed_goal(goal)
 
     def _nearest(self, node: NodeId) -> str:
@@ -181,9 +190,10 @@ class Router:
     def choices(self, start: NodeId, goal: NodeId) -> Iterator[Mapping[NodeId, Pose2]]:
         """Sets of nodes over which a way is searched, one after the other.
 
-        Superseded nodes are passed only where necessary.
+        Superseded nodes are passed only where necessary, and at portals.
         """
-        yield self.roads.active_poses | {node: self.roads.poses[node] for node in (start, goal)}
+        sides = (node for pair in self.portals.edges.values() for node in pair)
+        yield self.roads.active_poses | {node: self.roads.poses[node] for node in (start, goal, *sides)}
         yield self.roads.poses
 
     def ways(
@@ -209,7 +219,7 @@ class Router:
         return Ways(
             self.roads.union, poses=poses, penalties=self._penalties(wary), blocked=barred,
             closed=self.roads.closed, settings=self.costs, toll=toll,
-            factors={} if within is None else rules.factors_for(within),
+            factors={} if within is None else rules.factors_for(within), portals=self.portals.edges,
         )  # fmt: skip
 
     def _all_closed(self, nodes: Sequence[NodeId], goal: NodeId, within: Collection[Annotation]) -> str:
@@ -248,12 +258,16 @@ class Router:
 
     def _answer(self, start: NodeId, best: Route) -> RouteAnswer:
         union = self.roads.union
-        nodes = {node: without_faded(union.nodes[node], self.merged) for node in best.nodes}
-        legs = [RouteLeg(nodes[best.nodes[0]], self._relative(start, best.nodes[0]), None)]
-        for before, node, edge_id in zip(best.nodes, best.nodes[1:], best.edges, strict=False):
+        stops = list(self.portals.stops(best.nodes, best.edges))
+        last, portal = stops[0] if stops else (len(best.edges), None)
+        way = best.nodes[: last + 1]
+        nodes = {node: without_faded(union.nodes[node], self.merged) for node in way}
+        legs = [RouteLeg(nodes[way[0]], self._relative(start, way[0]), None)]
+        for (before, node), edge_id in zip(pairwise(way), best.edges, strict=False):
             kind = union.edges[edge_id].kind
             legs.append(RouteLeg(nodes[node], self._relative(before, node), kind))
-        return RouteAnswer(tuple(legs), best.reason)
+        through = "".join(f", through {stop.title} to {stop.beyond}" for _, stop in stops)
+        return RouteAnswer(tuple(legs), best.reason + through, portal)
 
     def _entries(
         self,

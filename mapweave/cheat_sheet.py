@@ -18,8 +18,8 @@ GROUPS = {
     "Command": ("status", "go", "explore", "stop", "missions", "drive"),
     "Places and closures": (
         "place add", "place list", "place remove", "close", "reopen", "prefer", "avoid", "closures",
-        "floor",
     ),
+    "Floors": ("floor", "map portal add", "map portal list", "map portal remove", "portal done"),
     "Floor plans": ("plan add", "plan show", "plan export", "plan remove", "map pin"),
     "Maps": (
         "map show", "map diff", "open", "map explain", "map route", "map history", "map link", "map unmerge",

@@ -28,6 +28,7 @@ from mapweave.commands import (
     open_map,
     place,
     plan,
+    portal,
     record,
     relocalize,
     replay,
@@ -80,9 +81,9 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (
-        demo, server, router, sim, agent, drive, status, missions, place, plan, closures, floor, keys, robots,
-        doctor, find_port, find_cameras, calibrate, map_file, open_map, record, replay, info, relocalize,
-        evaluate, settings, completion,
+        demo, server, router, sim, agent, drive, status, missions, place, plan, closures, floor, portal, keys,
+        robots, doctor, find_port, find_cameras, calibrate, map_file, open_map, record, replay, info,
+        relocalize, evaluate, settings, completion,
     ):  # fmt: skip
         command.add_to(commands)
     add_examples(top)

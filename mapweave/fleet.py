@@ -34,11 +34,13 @@ from mapweave.hybridmap.mission_order import (
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
+from mapweave.hybridmap.portal import PortalDone
 from mapweave.identities.key_file import read_key_file
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -74,6 +76,23 @@ def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0)
     if replies[0].error:
         raise NotConnected(f"robot {order.robot} did not take its mission: {replies[0].error}")
     return decode(replies[0].payload, MissionReport)
+
+
+def send_portal_done(bus: Bus, keys: Keys, done: PortalDone, timeout: float = 10.0) -> str:
+    """Tell a robot directly that it was taken through a portal; returns what it does, in words.
+
+    Raises:
+        NotConnected: it does not answer.
+        InvalidValue: it does not wait at a portal.
+    """
+    replies = bus.ask(keys.portal(done.robot), encode(done), timeout)
+    if not replies:
+        raise NotConnected(
+            f"robot {done.robot} does not answer: is its agent running? `mapweave status` lists the robots"
+        )
+    if replies[0].error:
+        raise InvalidValue(replies[0].error.removeprefix("refused: "))
+    return str(decode_record(replies[0].payload)["said"])
 
 
 def login() -> str:
@@ -205,6 +224,19 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         if silent:
             raise NotConnected("; ".join(silent))
         return tuple(reports)
+
+    def portal_done(self, robot: str) -> str:
+        """Tell a robot that it was taken through the portal at which it waits; it looks where it is then.
+
+        Returns:
+            What it does, in words.
+
+        Raises:
+            NotConnected: it does not answer.
+            InvalidValue: it does not wait at a portal.
+        """
+        self._check_role()
+        return send_portal_done(self._bus, self._keys, PortalDone(check_name(robot), self._by))
 
     def wait(
         self,

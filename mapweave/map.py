@@ -313,7 +313,10 @@ class FileMap(Map):
         return self._read
 
     def _answer(self, view: View) -> RelocalizeAnswer:
-        return self._read.relocalizer.answer(view)
+        router = self._router()
+        from mapweave.mapserver.places import Places
+
+        return Places(router, router.annotations).named(self._read.relocalizer.answer(view))
 
     def _explained(self, request: ExplainRequest) -> Explanation:
         router = self._router()

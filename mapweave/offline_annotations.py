@@ -12,6 +12,7 @@ from typing import Any
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
+from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
@@ -112,7 +113,8 @@ class OfflineAnnotations:
         annotation = annotation_of_words(
             name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
         )
-        check_annotation(self._router.merged, self.annotations(), annotation)
+        constraints = ManualConstraints(self._opened.content.constraints)
+        check_annotation(self._router.merged, self.annotations(), annotation, constraints)
         body = annotation.body
         if isinstance(body, FloorPlan) and not annotation.removed:
             self.plan_image(body.image.sha256)

@@ -182,6 +182,14 @@ class ReadOnlyServer:
         """
         self._refuse("there are no robots to send")
 
+    def portal_done(self, robot: str, by: str) -> str:
+        """Refuse.
+
+        Raises:
+            InvalidValue: always.
+        """
+        self._refuse("there are no robots")
+
     def constraints(self) -> ConstraintList:
         """What people decided, in order."""
         return ConstraintList(tuple(self._opened.content.constraints))

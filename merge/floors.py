@@ -1,4 +1,4 @@
-"""Maps on different floors are never one: which links between maps their labels exclude.
+"""Floors: which links between maps their labels exclude, and on which floor a part of the merged map is.
 
 Twin rooms on two floors look the same, and no measurement of a robot on one floor contradicts a link to the
 other. People say on which floor a map is; maps without a label are on the floor of those with which they
@@ -9,11 +9,76 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
-from mapweave.hybridmap.node import MapId
-from mapweave.merge.pose_graph.links import Link
+import networkx as nx
+
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+
+if TYPE_CHECKING:
+    # Programs that only name floors need none of the merge's libraries.
+    from mapweave.merge.pose_graph.links import Link
+    from mapweave.merge.pose_graph.merged_map import MergedMap
 
 MapPair = tuple[MapId, MapId]
+
+
+def labels_of(merged: MergedMap, floors: Mapping[MapId, str], component: int | None) -> tuple[str, ...]:
+    """The labels of a component's maps, in order; none of a component that is not there."""
+    if not floors or component is None or not 0 <= component < len(merged.graphs):
+        return ()
+    maps = {MapId(*map_id) for map_id in merged.graphs[component].maps}
+    return tuple(sorted({floors[map_id] for map_id in maps if map_id in floors}))
+
+
+def floor_of(merged: MergedMap, floors: Mapping[MapId, str], node: NodeId) -> str:
+    """The label of the floor on which a node is: of its map, else of its component; empty if unknown."""
+    return floors.get(node.map) or " and ".join(labels_of(merged, floors, merged.component_of(node)))
+
+
+def maps_elsewhere(merged: MergedMap, floors: Mapping[MapId, str], node: NodeId) -> frozenset[MapId]:
+    """Maps on another floor than a node: their own label says so, or that of their component."""
+    here = floor_of(merged, floors, node)
+    if not here:
+        return frozenset()
+    elsewhere = {which for which, label in floors.items() if label != here}
+    for number, graph in enumerate(merged.graphs):
+        labels = labels_of(merged, floors, number)
+        if labels and here not in labels:
+            elsewhere.update(MapId(*map_id) for map_id in graph.maps)
+    return frozenset(elsewhere)
+
+
+def held_together(
+    merged: MergedMap, constraints: ManualConstraints, floors: Mapping[MapId, str], labelled: MapId
+) -> str:
+    """Why a map cannot be on the floor that its label says; empty if it may be.
+
+    Links that robots have found fall if labels contradict them: twin rooms look the same. A link by hand, and
+    a drive from one map to another, do not: they would leave two floors in one component.
+
+    Args:
+        merged: the map.
+        constraints: with the links by hand.
+        floors: labels of maps, the new one among them.
+        labelled: the map with the new label.
+    """
+    ties: nx.Graph = nx.Graph()
+    ties.add_node(labelled)
+    for a, b in constraints.links:
+        ties.add_edge(a.map, b.map, words=f"{a} and {b} are linked by hand")
+    for hybrid_map in merged.maps.values():
+        for edge in hybrid_map.edges.values():
+            if edge.a.map != edge.b.map and edge.kind is EdgeKind.DRIVEN:
+                words = f"a robot has driven between {edge.a} and {edge.b}"
+                ties.add_edge(edge.a.map, edge.b.map, words=words)
+    for other, way in sorted(nx.single_source_shortest_path(ties, labelled).items()):
+        if floors.get(other, floors[labelled]) != floors[labelled]:
+            steps = "; ".join(ties.edges[pair]["words"] for pair in pairwise(way))
+            return f"map {other} is on floor {floors[other]}, and {steps}"
+    return ""
 
 
 def across_floors(links: Iterable[Link], floors: Mapping[MapId, str]) -> dict[MapPair, str]:

@@ -14,6 +14,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.floors import floor_of
 from mapweave.merge.manual_constraints import apply_constraints, link_by_hand
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.outlier_rejection.loop_closures import distance2_of
@@ -58,6 +59,7 @@ def checked_link(
     known = next((link for link in merged.links if link.pair == (asked.a, asked.b)), None)
     if known is not None:
         raise InvalidValue(f"{asked} are linked already: {_landmarks(known)} of the images agree on one pose")
+    _check_floors(merged, asked, constraints.floors)
     linked, words = _by_images(merged, asked, constraint.because, settings.consistency)
     _check_geometry(merged, linked, settings.consistency)
     _check_exclusion(merged, linked, settings)
@@ -89,6 +91,17 @@ def _by_images(merged: MergedMap, asked: Linked, because: str, s: ConsistencySet
     if not because:
         raise InvalidValue(f"a pose by hand, without the images ({evidence}), needs a reason: --because")
     return Linked.of(asked.a, asked.b, _by_person(asked.pose)), f"by hand alone; {evidence}"
+
+
+def _check_floors(merged: MergedMap, asked: Linked, floors: Mapping[MapId, str]) -> None:
+    """Refuse a link between two floors."""
+    first, second = (floor_of(merged, floors, node) for node in (asked.a, asked.b))
+    if first and second and first != second:
+        raise InvalidValue(
+            f"{asked} cannot be linked: {asked.a} is on floor {first}, {asked.b} on floor {second}. If a "
+            "label is wrong, first take it back: mapweave floor --undo NODE; a lift or a ramp between them: "
+            "mapweave map portal add"
+        )
 
 
 def _by_person(pose: Pose2) -> PoseGaussian:

@@ -21,8 +21,8 @@ ASKS = (
 COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})
 """Those that change something."""
 WATCHES = ("liveliness_query", "declare_liveliness_subscriber")
-OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve", "status"})
-"""Those of robots."""
+OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve"})
+"""Those of robots, each in its own name."""
 
 
 def access_control(keys: Keys, access: Access, certified: bool) -> dict[str, object]:
@@ -66,9 +66,9 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
     questions = [f"{keys.root}/server/*/{what}" for what in asks]
     questions += [keys.agent_statuses(), f"{keys.root}/server/*/ack/*"]
     if role is Role.OPERATOR:
-        questions += [f"{keys.root}/agent/*/mission", f"{keys.root}/agent/*/drive"]
+        questions += [f"{keys.root}/agent/*/{what}" for what in ("mission", "drive", "portal")]
     reads = [
-        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), f"{keys.root}/server/*/alive",
+        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), keys.servers_alive(),
         f"{keys.root}/server/*/poses/*",
     ]  # fmt: skip
     return [*_reads(reads), *_asks(questions)]
@@ -76,13 +76,15 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
 
 def _robot(keys: Keys, name: str) -> list[_Rule]:
     agent, base = f"{keys.root}/agent/{name}", f"{keys.root}/robot/{name}"
+    questions = [keys.in_name_of(name, f"{keys.root}/server/*/{what}") for what in sorted(OF_ROBOTS)]
     addressed = [f"{keys.root}/server/*/{what}/{name}" for what in ("ack", "poses")]
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/drive",
+                  f"{agent}/portal",
                   f"{base}/describe", f"{base}/step"]),
-        *_reads([*addressed, f"{keys.root}/server/*/alive", f"{base}/driver/*", f"{agent}/alive/*"]),
-        *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
+        *_reads([*addressed, keys.servers_alive(), f"{base}/driver/*", f"{agent}/alive/*"]),
+        *_asks([*addressed, *questions, f"{keys.root}/server/*/status",
                 f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
     ]  # fmt: skip
 

@@ -54,3 +54,14 @@ def _meet(a: tuple[str, ...], b: tuple[str, ...]) -> bool:
     if b[0] == "**":
         return _meet(a, b[1:]) or _meet(a[1:], b)
     return (a[0] == b[0] or "*" in (a[0], b[0])) and _meet(a[1:], b[1:])
+
+
+def answered(asked: str, served: str) -> str:
+    """The key under which a question is answered: one that both its pattern and the service's match.
+
+    A pattern where both leave a chunk open.
+    """
+    if is_key(asked) or "**" in asked or "**" in served:
+        return asked if is_key(asked) else served
+    pairs = zip(asked.split("/"), served.split("/"), strict=True)
+    return "/".join(there if here == "*" else here for here, there in pairs)

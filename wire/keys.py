@@ -7,6 +7,7 @@
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: a mission order
     mapweave/1/<fleet>/agent/<agent>/drive            question: a person's velocity command
+    mapweave/1/<fleet>/agent/<agent>/portal           question: it was taken through a portal
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain,
@@ -14,6 +15,7 @@
                                                       plans, plan_image and put_plan_image
     mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
+    mapweave/1/<fleet>/server/<server>/relocalize/<agent>  the same of a robot; also route, known, reserve
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot base; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of the driver of that base
@@ -26,7 +28,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import MapId, check_name
+from mapweave.hybridmap.node import NAME, MapId, check_name
 
 VERSION = "1"
 MAX_EPOCH = 2**53
@@ -107,6 +109,10 @@ class Keys:
     def drive(self, agent: str) -> str:
         """Where an agent takes a person's velocity commands."""
         return f"{self.root}/agent/{check_name(agent)}/drive"
+
+    def portal(self, agent: str) -> str:
+        """Where an agent takes reports that it was taken through a portal."""
+        return f"{self.root}/agent/{check_name(agent)}/portal"
 
     # Keys of a server.
 
@@ -286,6 +292,20 @@ class Keys:
         """Under which a server is alive."""
         return self._of_server("alive", server)
 
+    def servers_alive(self) -> str:
+        """Likewise of every server."""
+        return f"{self.root}/server/*/alive"
+
+    # A robot asks in its own name, which access rules check: its questions count for its own quota.
+
+    def in_name_of(self, robot: str, question: str) -> str:
+        """A question to a server, asked by a robot."""
+        return f"{question}/{check_name(robot)}"
+
+    def in_any_name(self, question: str) -> str:
+        """Pattern: a question to a server, asked by any robot."""
+        return f"{question}/*"
+
     # Keys of a robot base.
 
     def robot_describe(self, robot: str) -> str:
@@ -365,6 +385,15 @@ class Keys:
         if len(given) != len(wanted) or any(w not in ("*", g) for w, g in zip(wanted, given, strict=True)):
             raise InvalidMessage(f"key {key[:256]!r} is not of the form {self.root}/{form}")
         return [g for w, g in zip(wanted, given, strict=True) if w == "*"]
+
+
+def robot_of(key: str) -> str:
+    """In whose name a message or a question comes: a robot's; empty for people and servers."""
+    match key.split("/")[3:]:
+        case ["agent" | "robot", name, *_] | ["server", _, _, name] if NAME.fullmatch(name):
+            return name
+        case _:
+            return ""
 
 
 def _name(chunk: str, key: str) -> str:

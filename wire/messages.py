@@ -14,12 +14,14 @@ import msgspec
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanPiece, PlanReceived
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.query import (
     MAX_CANDIDATES,
     MAX_KNOWN,
@@ -56,6 +58,7 @@ class KeptHistory:
         contradicted: links by hand that are reported as contradicted.
         frames: pins that are reported as not holding their component's frame, with the node of the older pin
             that does; a pin whose node is not in the merged map with its own.
+        implausible: maps that are reported as implausible.
     """
 
     events: tuple[MapEvent, ...] = ()
@@ -64,6 +67,7 @@ class KeptHistory:
     set_apart: frozenset[MapId] = frozenset()
     contradicted: frozenset[tuple[NodeId, NodeId]] = frozenset()
     frames: frozenset[tuple[NodeId, NodeId]] = frozenset()
+    implausible: frozenset[MapId] = frozenset()
 
 
 VIEW = Limit("view", MAX_LANDMARKS_BYTES + 256)
@@ -97,6 +101,7 @@ LIMITS: dict[type, Limit] = {
     MissionReport: Limit("mission report", 2**15),
     MissionRequest: Limit("mission request", 2048),
     Missions: Limit("missions", 2**22, 50_000),
+    PortalDone: Limit("portal done", 256),
     PlacedPlans: Limit("plans", 2**24, 1_000_000),
     PlanPiece: Limit("piece of a plan", PIECE + 1024),
     PlanReceived: Limit("plan image", 2048),
@@ -118,17 +123,26 @@ def decode(data: bytes, kind: type[Value]) -> Value:
 class _View(msgspec.Struct):
     camera: bytes
     features: bytes
+    near: tuple[str, int, int] | None = None
 
 
 def encode_view(view: View) -> bytes:
     """Encode a view; raises InvalidValue if it would not decode."""
-    return pack(
-        {"camera": pack_camera(view.camera), "features": pack_features(view.pixels, view.codes, view.camera)}
-    )
+    fields: dict[str, object] = {
+        "camera": pack_camera(view.camera),
+        "features": pack_features(view.pixels, view.codes, view.camera),
+    }
+    if view.near is not None:
+        fields["near"] = [*view.near]
+    return pack(fields)
 
 
 def decode_view(data: bytes) -> View:
     """Decode a view; raises InvalidMessage."""
     view: _View = unpack(data, _View, VIEW)
     camera = unpack_camera(view.camera)
-    return View(*unpack_features(view.features, camera), camera)
+    try:
+        near = None if view.near is None else typed.value_of([*view.near], NodeId)
+    except InvalidValue as error:
+        raise InvalidMessage(f"view: near: {error}") from None
+    return View(*unpack_features(view.features, camera), camera, near)

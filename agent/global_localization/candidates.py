@@ -73,15 +73,23 @@ class Candidates:
 
 
 class OwnMap:
-    """The robot's own map as a source."""
+    """The robot's own map as a source.
+
+    Attributes:
+        map: which may grow.
+        elsewhere: whether the robot knows that it is on another floor than this map.
+    """
 
     def __init__(self, hybrid_map: HybridMap, rng: np.random.Generator) -> None:
-        """Take the map, which may grow, and the source of verification's random samples."""
+        """Take the map, and the source of verification's random samples."""
         self.map = hybrid_map
+        self.elsewhere = False
         self._rng = rng
 
     def candidates(self, view: View, image: NDArray[np.uint8], features: Features) -> Candidates:
         """Nodes that a view shows, of an image with these features."""
+        if self.elsewhere:
+            return Candidates((), "", "the own map is of another floor")
         recalled = recognise_places(self.map, view, self._rng)
         if not recalled:
             return Candidates((), "", f"none of {len(self.map.nodes)} nodes is recognised")
@@ -102,11 +110,13 @@ class FleetMap:
 
     Attributes:
         refuted: its places that the robot's own view did not bear out.
+        near: the robot knows that it is on the floor of this node; None if it does not.
     """
 
     def __init__(self, motion: MotionPrimitives) -> None:
         """Take the motion primitives, which ask and stand still until the answer comes."""
         self.refuted = RefutedPlaces(motion)
+        self.near: NodeId | None = None
         self._motion = motion
         self._silent_until = 0.0
         self._agreement = ViewAgreement()
@@ -118,7 +128,7 @@ class FleetMap:
         """
         if self._motion.now < self._silent_until:
             return Candidates((), "", NO_ANSWER)
-        answer = yield from self._motion.ask(WhereAmI(self._motion.number(), view))
+        answer = yield from self._motion.ask(WhereAmI(self._motion.number(), view, self.near))
         if answer.content is None:
             self._silent_until = self._motion.now + (answer.retry_after or SILENCE)
         if not isinstance(answer.content, RelocalizeAnswer):

@@ -119,6 +119,7 @@ class GlobalLocalization:
             )
             if candidate is not None:
                 return candidate
+            self._forget_floor()
             if self._views < LEAST_VIEWS * self._attempts:
                 # With a covered lens, or in the dark, driving elsewhere does not help.
                 continue
@@ -277,6 +278,12 @@ class GlobalLocalization:
         yield from motion.turn(math.remainder(direction, math.tau), TURN_RATE)
         yield from motion.drive_on(way, SPEED)
         return True
+
+    def _forget_floor(self) -> None:
+        """All around nothing is known of the floor where the robot should be: it may be on any."""
+        self._own.elsewhere = False
+        if self._fleet is not None:
+            self._fleet.near = None
 
     def _take_hint(self, own: Candidates) -> None:
         """Remember the node with most inliers from here, even if its pose is uncertain."""

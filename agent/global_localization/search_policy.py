@@ -31,5 +31,8 @@ class SearchPolicy:
 TO_NAVIGATE = SearchPolicy(sure=(0.06, 0.03), leniency=1.0, views_needed=1, turns=(1, 1), places=0)
 """A robot that has to get somewhere never gives up, and one recognition will do."""
 
+BEYOND_PORTAL = SearchPolicy(sure=(0.06, 0.03), leniency=1.0, views_needed=1, turns=(1, 1), places=1)
+"""A robot that was taken through a portal stands where a person has put it: it turns once, then it asks."""
+
 TO_MAP = SearchPolicy(sure=(0.03, 0.018), leniency=0.0, views_needed=2, turns=(2, 1), places=4)
 """A robot that is to map on: a false edge bends the map for good, a fresh map is no harm."""

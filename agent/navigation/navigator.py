@@ -5,32 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 from enum import StrEnum
-from itertools import pairwise
 
 import numpy as np
 
-from mapweave.agent.cautious_driving import lacks_rangers
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
-from mapweave.agent.global_localization.candidates import Candidate, FleetMap, OwnMap
-from mapweave.agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
-from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_detector import Expected, NodeDetector
-from mapweave.agent.localization.node_localizer import NodeLocalizer
-from mapweave.agent.mission import Answer, Question, WhichWay
+from mapweave.agent.mission import Answer, Question
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.navigation.answer_trial import AnswerTrial
 from mapweave.agent.navigation.blocked_edges import BlockedEdges
 from mapweave.agent.navigation.local_planner import LocalPlanner
-from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.portal_crossing import PortalCrossing
+from mapweave.agent.navigation.positioning import Positioning
 from mapweave.agent.navigation.right_of_way import RightOfWay
 from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteProgress
+from mapweave.agent.navigation.route_source import RouteSource
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, Node, NodeId
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.registration.recognition import RecognitionSettings
@@ -50,15 +47,13 @@ class Stage(StrEnum):
     WAITING = "waiting for a route"
     YIELDING = "waiting for another robot"
     ASIDE = "stepping aside for another robot"
+    PORTAL = "waiting at a portal"
     ARRIVED = "parked at the goal"
     GIVEN_UP = "gave up its goal"
 
 
 UNDERWAY = (RouteProgress.DRIVING, RouteProgress.PARKING)
 
-RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
-"""Edges between places that look alike, which no robot need have driven. A robot without proximity sensors
-avoids those that are longer than its radius."""
 TIGHT = 0.07
 """Something nearer than this counts as what is in the way, m."""
 ANSWER_PATIENCE = 100
@@ -83,6 +78,8 @@ class Navigator:
         detail: why.
         fix: where the robot is, or None while lost.
         goal: the node to reach.
+        crossing: where it stands with the portals on its way.
+        passed: nodes to pass before that it has passed.
         legs: nodes on the first route that was given.
         progress: share of the present route that is driven.
         tally: statistics of the drive so far.
@@ -100,12 +97,15 @@ class Navigator:
         settings: AgentSettings | None = None,
         seed: int = 0,
         via: tuple[NodeId, ...] = (),
+        crossing: PortalCrossing | None = None,
     ) -> None:
-        """Start lost, with a goal, and nodes to pass before, in order."""
+        """Start lost, with a goal, and nodes to pass before, in order; or at a portal."""
         self.stage: str = Stage.LOST
         self.detail = ""
         self.fix: Fix | None = None
         self.goal = goal
+        self.crossing = crossing or PortalCrossing()
+        self.passed = 0
         self._via = list(via)
         self.legs = 0
         self.progress = 0.0
@@ -115,17 +115,13 @@ class Navigator:
         self._description = description
         self._lens = lens
         self._sift = sift
-        self._own_map = own_map
         self._settings = s = settings or AgentSettings()
         self._rng = np.random.default_rng(seed)
         self._local_planner = LocalPlanner(description, s.navigation)
         self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
-        fleet = FleetMap(self._motion)
-        self._localization = GlobalLocalization(
-            description, sift, self._motion, OwnMap(own_map, self._rng), TO_NAVIGATE, fleet
-        )
-        self._refuted = fleet.refuted
-        self._trial = AnswerTrial(self._motion, self._refuted)
+        self._routes = RouteSource(self._motion, own_map, description)
+        self._positioning = Positioning(description, lens, sift, own_map, self._motion, s, self._rng)
+        self._trial = AnswerTrial(self._motion, self._positioning.refuted)
         self._detector = NodeDetector(description, lens, sift, self._rng, s)
         self._blocks = BlockedEdges(s.navigation)
         self._traverse_recorder = TraverseRecorder(description)
@@ -133,12 +129,12 @@ class Navigator:
         self._expected: Pose2 | None = None
         self._failed_views = 0
         self._goal_hidden = False
-        self._following = self._searching = self._parking_retried = False
+        self._following = self._parking_retried = False
         self._touched = ""
         self._refused_since: float | None = None
         self._driven: set[tuple[NodeId, NodeId]] = set()
         self._progressed_at = 0.0
-        self._refusing = False
+        self._portal: PortalStop | None = None
         self._aside: NodeId | None = None
         self._trouble = "it does not know where it is"
         self._behaviour = self._go()
@@ -165,20 +161,23 @@ class Navigator:
         """
         self._motion.take_in(observation, answers)
         self._local_planner.see(observation)
-        if self.fix is not None and (standing or not self._following):
+        at_portal = self.crossing.wait is not None
+        if self.fix is not None and not at_portal and (standing or not self._following):
             self.fix.follow(observation, self._description)
-        if standing:
+        if standing or at_portal:
             self._progressed_at += self._description.tick
         elif not self.arrived and self._motion.now - self._progressed_at > self._settings.navigation.patience:
             self._give_up(f"no nearer in {self._settings.navigation.patience:g} s: {self._trouble}")
         elif not self.arrived and self._trial.ended:
             self._give_up(self._trial.ended)
         command = Command() if standing else next(self._behaviour)
-        fix = None if self._searching else self.fix
+        fix = None if self._positioning.search or self.crossing.wait else self.fix
+        if fix is not None:
+            self._positioning.keep(fix)
         self.traverse = self._traverse_recorder.see(fix, observation)
         self.refined = self._refinement.see(None if self.arrived else fix)
-        if self._searching:
-            self.detail = self._localization.detail
+        if self._positioning.search:
+            self.detail = self._positioning.detail
         return command, self._motion.questions()
 
     def touch(self, what: str) -> None:
@@ -193,11 +192,16 @@ class Navigator:
 
     def _go(self) -> Behaviour:
         while not (self.arrived or self.given_up):
+            if self.crossing.wait is not None:
+                yield from self._cross()
+                continue
             if self.fix is None:
                 yield from self._find()
             assert self.fix is not None, "the search ends with a fix"
-            route = yield from self._get_route(self.fix, self._via[0] if self._via else self.goal)
-            if (undriven := self._undriven(route)) is not None:
+            answer = yield from self._get_route(self.fix, self._via[0] if self._via else self.goal)
+            route, self._portal = answer.legs, answer.portal
+            self.crossing.check(self._portal)
+            if (undriven := self._routes.undriven(route)) is not None:
                 self._blocks.add(*undriven, self._motion.now)
             elif route:
                 self._refused_since = None
@@ -216,65 +220,55 @@ class Navigator:
         """Stand, and say why."""
         if not self.given_up:
             self.stage, self.detail = Stage.GIVEN_UP, reason
-            self._searching = self._following = False
+            self._positioning.search, self._following = None, False
             self._behaviour = self._stand()
 
+    def _cross(self) -> Behaviour:
+        """Ask to be taken through a portal; then look where it is."""
+        crossing = self.crossing
+        while crossing.wait is not None and not crossing.wait.done:
+            if late := crossing.late(self._motion.now):
+                self._give_up(late)
+                return
+            self.stage, self.detail = Stage.PORTAL, crossing.request
+            yield Command()
+        if crossing.wait is None:
+            return
+        self.stage, self.fix = Stage.LOST, None
+        self._start_from((yield from self._positioning.find_beyond(crossing)))
+        crossing.looked(self.fix is not None)
+
     def _find(self) -> Behaviour:
-        self.stage, self._searching, self._goal_hidden = Stage.LOST, True, False
+        self.stage, self._goal_hidden = Stage.LOST, False
         self._trouble = "it does not know where it is"
         expected, self._expected = self._expected, None
-        place = yield from self._localization.search(expected)
-        self._start_from(place)
+        self._start_from((yield from self._positioning.find(expected)))
 
-    def _start_from(self, place: Candidate | None) -> None:
-        """Go on from the place that was found, if one was."""
-        self._searching, self.detail, self.fix = False, self._localization.detail, None
-        self._trial.found(place)
-        if place is None:
-            return
-        self.tally = self.tally.found()
-        if (recognized := place.recognized) is None:
-            self.fix = Fix(place.node, place.node_from_robot)
-        else:
-            localizer = NodeLocalizer(
-                self._description, self._lens, recognized.node, recognized.image, recognized.features,
-                recognized.recognition, self._settings,
-            )  # fmt: skip
-            self.fix = Fix.of(localizer)
+    def _start_from(self, fix: Fix | None) -> None:
+        """Go on from where the robot was found, if it was."""
+        self.detail, self.fix = self._positioning.detail, fix
+        self._trial.found(self._positioning.place)
+        if fix is not None:
+            self.tally = self.tally.found()
 
-    def _get_route(self, fix: Fix, goal: NodeId) -> Generator[Command, None, tuple[RouteLeg, ...]]:
-        """Ask the fleet's map; without an answer use the own map."""
+    def _get_route(self, fix: Fix, goal: NodeId) -> Generator[Command, None, RouteAnswer]:
+        """Ask for a way."""
         self.stage = Stage.ASKING
-        node_from_robot, blocked = fix.node_from_robot.mean, self._blocks.at(self._motion.now)
-        question = WhichWay(self._motion.number(), fix.node, goal, node_from_robot, blocked)
-        answer = yield from self._motion.ask(question)
-        content, trouble = answer.content, ""
-        if not isinstance(content, RouteAnswer):
-            trouble = f"{answer.error or 'no answer'}; "
-            content = onboard_route(self._own_map, fix.node, goal, blocked)
-        self.detail = f"{trouble}{content.reason}"
-        if not content.legs:
+        answer = yield from self._routes.route(fix, goal, self._blocks.at(self._motion.now))
+        self.detail = answer.reason
+        if not answer.legs:
             self._trouble = self.detail
-        self._refusing = not (trouble or blocked)
-        self.legs = self.legs or len(content.legs)
-        return content.legs
-
-    def _undriven(self, route: tuple[RouteLeg, ...]) -> tuple[NodeId, NodeId] | None:
-        """The first leg of a route that no robot has driven; None without one, or if there are rangers."""
-        if not lacks_rangers(self._description):
-            return None
-        for before, leg in pairwise(route):
-            way = math.hypot(leg.previous_from_node.mean.x, leg.previous_from_node.mean.y)
-            if leg.kind in RECOGNISED and way > self._description.radius:
-                return before.node.id, leg.node.id
-        return None
+        self.legs = self.legs or len(answer.legs)
+        return answer
 
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""
         self.stage, now = Stage.WAITING, self._motion.now
         if not self._blocks.at(now) and self._refused_since is None:
             self.fix, self._refused_since = None, now
-        elif self._refusing and self._refused_since is not None and now - self._refused_since > REFUSED:
+        elif (
+            self._routes.refusing and self._refused_since is not None and now - self._refused_since > REFUSED
+        ):
             self._give_up(self._trouble)
         yield from self._motion.stand(PAUSE)
 
@@ -304,10 +298,11 @@ class Navigator:
             if follower.fix.in_sight:
                 self._failed_views = 0
                 self._trial.saw(follower.fix.node)
-            if self._via and follower.to_goal <= THERE:
+            if self._via and self._portal is None and follower.to_goal <= THERE:
                 del self._via[0]
+                self.passed += 1
                 self._following = False
-                self._trial = AnswerTrial(self._motion, self._refuted)
+                self._trial = AnswerTrial(self._motion, self._positioning.refuted)
                 return
             if self._touched:
                 follower.progress = RouteProgress.BLOCKED
@@ -317,7 +312,7 @@ class Navigator:
         self._following = False
         match follower.progress:
             case RouteProgress.ARRIVED:
-                self.tally = self.tally.passed([0.0])
+                self._reach()
             case RouteProgress.BLOCKED if not self._parking_retried and self._stuck_at_goal(follower):
                 # Nothing keeps it from its goal but its own precision: that blocks no other robot.
                 self.detail, self._parking_retried = "parking did not end: trying once more", True
@@ -326,15 +321,19 @@ class Navigator:
                 yield from self._report_block(*follower.blocked)
                 if self._parking_retried:
                     # Twice: localize again, so that parking begins from another heading.
-                    self.fix, self._expected, self._parking_retried = None, self._on_own_map(self.fix), False
+                    self.fix, self._expected, self._parking_retried = (
+                        None,
+                        self._positioning.on_own_map(self.fix),
+                        False,
+                    )
             case RouteProgress.UNSURE if (
                 self._goal_hidden
                 and self._trial.node is None
-                and not self._via
+                and not (self._via and self._portal is None)
                 and follower.fix.blind < self._settings.navigation.blind_distance
             ):
                 self.stage, self.detail = Stage.ARRIVED, HIDDEN
-                self.tally = self.tally.passed([0.0])
+                self._reach()
             case RouteProgress.UNSURE:
                 # By landmarks seen a moment ago it is at the goal, yet it sees none of the goal's landmarks.
                 blind, allowed = follower.fix.blind, self._settings.navigation.blind_distance
@@ -356,6 +355,14 @@ class Navigator:
         anywhere = Expected(0, node, fix.node_from_robot.mean, math.inf)
         seen = self._detector.find(image, [anywhere], RecognitionSettings())
         return fix if seen is None else Fix.of(seen[1])
+
+    def _reach(self) -> None:
+        """The robot is where the route ends: at the goal, or at a portal on the way there."""
+        self.tally = self.tally.passed([0.0])
+        if self._portal is not None:
+            self._trial = AnswerTrial(self._motion, self._positioning.refuted)
+            self.stage = Stage.PORTAL
+            self.crossing.begin(self._portal)
 
     def _let_pass(self, right_of_way: RightOfWay, follower: RouteFollower) -> Generator[Command, None, bool]:
         """Stand while another robot holds the way ahead; returns whether to go on then.
@@ -383,7 +390,7 @@ class Navigator:
     def _step_aside(self, fix: Fix, node: NodeId) -> Behaviour:
         """Drive to a node off another robot's way; then the way to the goal is asked for again."""
         self._aside = None
-        route = yield from self._get_route(fix, node)
+        route = (yield from self._get_route(fix, node)).legs
         if not route:
             yield from self._motion.stand(PAUSE)
             return
@@ -406,30 +413,21 @@ class Navigator:
         self._trouble = self.detail
         yield from self._motion.stand(PAUSE)
         if self.fix is not None and not self.fix.in_sight and self.fix.blind > TRUSTED:
-            self.fix, self._expected = None, self._on_own_map(self.fix)
+            self.fix, self._expected = None, self._positioning.on_own_map(self.fix)
 
     def _relocalize(self) -> Behaviour:
         """No landmark was visible for a while: try one view, else drive on by odometry a little."""
-        self._searching, self._localization.detail = True, self.detail
-        yield from self._motion.stand(STILL)
         before, s = self.fix, self._settings.navigation
-        place = yield from self._localization.look(LENIENT)
+        place = yield from self._positioning.look(self.detail)
         if place is None and before is not None and self._failed_views < s.looks:
-            self._failed_views, self._searching = self._failed_views + 1, False
+            self._failed_views += 1
             blind = max(s.blind_distance - s.further, 0.0)
             self.fix = Fix(before.node, before.node_from_robot, None, blind)
             return
         if place is None:
-            self._expected = self._on_own_map(before)
+            self._expected = self._positioning.on_own_map(before)
         self._failed_views = 0
         self._start_from(place)
-
-    def _on_own_map(self, fix: Fix | None) -> Pose2 | None:
-        """`map_from_robot` in the own map, if the fix is on one of its nodes."""
-        node = None if fix is None else self._own_map.nodes.get(fix.node)
-        if fix is None or node is None:
-            return None
-        return node.map_from_robot.mean @ fix.node_from_robot.mean
 
     def _obstacle(self) -> str:
         """The obstacle ahead, in words; empty if nothing is near."""

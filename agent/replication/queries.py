@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
@@ -37,15 +38,16 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
         InvalidValue: no message can hold it.
     """
     if isinstance(question, WhereAmI):
-        return keys.any_relocalize(), encode_view(question.view)
+        view = replace(question.view, near=question.near)
+        return keys.in_name_of(robot, keys.any_relocalize()), encode_view(view)
     if isinstance(question, WhatIsKnown):
         around = KnownRequest(question.map, question.x, question.y, question.reach)
-        return keys.any_known(), encode(around)
+        return keys.in_name_of(robot, keys.any_known()), encode(around)
     if isinstance(question, MayIDrive):
         reserve = ReserveRequest(robot, question.start, question.start_from_robot, question.route)
-        return keys.any_reserve(), encode(reserve)
+        return keys.in_name_of(robot, keys.any_reserve()), encode(reserve)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
-    return keys.any_route(), encode(request)
+    return keys.in_name_of(robot, keys.any_route()), encode(request)
 
 
 def decode_answer(
@@ -68,8 +70,9 @@ def decode_answer(
     route = decode(payload, RouteAnswer)
     for leg in route.legs:
         _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
-    if route.legs and route.legs[-1].node.id != question.goal:
-        raise InvalidMessage(f"route: it ends at node {route.legs[-1].node.id}, not at {question.goal}")
+    end = question.goal if route.portal is None else route.portal.entry
+    if route.legs and route.legs[-1].node.id != end:
+        raise InvalidMessage(f"route: it ends at node {route.legs[-1].node.id}, not at {end}")
     nodes = [leg.node.id for leg in route.legs]
     if twice := next((node for k, node in enumerate(nodes) if node in nodes[:k]), None):
         raise InvalidMessage(f"route: it leads in a circle, to node {twice} twice")

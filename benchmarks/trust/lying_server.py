@@ -71,9 +71,9 @@ class LyingServer:
         self.asked = 0
         self._world_from_robot = world_from_robot
         self._serving = [
-            bus.serve(keys.relocalize("s0"), self._relocalize),
-            bus.serve(keys.route("s0"), self._route),
-            bus.serve(keys.reserve("s0"), self._reserve),
+            bus.serve(keys.in_any_name(keys.relocalize("s0")), self._relocalize),
+            bus.serve(keys.in_any_name(keys.route("s0")), self._route),
+            bus.serve(keys.in_any_name(keys.reserve("s0")), self._reserve),
         ]
 
     @property

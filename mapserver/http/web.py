@@ -17,7 +17,7 @@
     POST /plans       an image: keeps it for a plan that an annotation adds; JSON: its name and size
                       (/plan-images/NAME.png is the image again)
     GET /constraints  what people have linked, unmerged and retired, JSON
-    POST /robots/ROBOT/go?goal=GOAL, /robots/ROBOT/explore, /robots/ROBOT/stop   a mission, JSON
+    POST /robots/ROBOT/go?goal=GOAL, .../explore, .../stop   a mission; .../portal-done   it is through, JSON
     POST /stop        stops every robot, JSON
     POST /constraints links, unmerges, retires, or takes back, JSON in and out; see constraint_request.py
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
@@ -78,13 +78,14 @@ MOST_AT_ONCE = 32
 WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
+OF_ROBOTS = tuple(f"/robots/ROBOT/{word}" for word in ("explore", "stop", "portal-done"))
 METHODS = {
     **dict.fromkeys(
         (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
     ),
     **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
-    **dict.fromkeys(("/relocalize", MISSION, "/robots/ROBOT/explore", "/robots/ROBOT/stop", "/stop"), "POST"),
+    **dict.fromkeys(("/relocalize", MISSION, *OF_ROBOTS, "/stop"), "POST"),
 }
 BY = "http"
 """Gives a mission, if the request does not say."""
@@ -274,9 +275,11 @@ class Questions:
     async def _give(self, request: Request) -> Mapping[str, Any]:
         self._check_commands(request)
         robot, kind = request.path_params["robot"], request.path_params["kind"]
+        query = request.query_params
+        if kind == "portal-done":
+            return {"said": await run_in_threadpool(self._server.portal_done, robot, query.get("by", BY))}
         if kind not in (MissionKind.GO, MissionKind.EXPLORE, MissionKind.STOP):
             raise HTTPException(HTTPStatus.NOT_FOUND, f"there is no mission {kind!r}: go, explore, stop")
-        query = request.query_params
         goal, by, mission_id = query.get("goal", ""), query.get("by", BY), query.get("id", "")
         report = await run_in_threadpool(
             self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id,

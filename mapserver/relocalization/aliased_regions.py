@@ -9,7 +9,7 @@ are aliased, or if their counterparts were not observed there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -137,12 +137,18 @@ class AliasedRegions:
                 most -= 1
         return len(self._left)
 
-    def counterpart(self, recognised: NodeMatch, ranked: Sequence[NodeId] = ()) -> Counterpart | None:
+    def counterpart(
+        self,
+        recognised: NodeMatch,
+        ranked: Sequence[NodeId] = (),
+        elsewhere: Collection[MapId] = (),
+    ) -> Counterpart | None:
         """Where else a robot may be.
 
         Args:
             recognised: the node that was recognised best.
             ranked: candidates of the view; a map that is not merged yet has no other neighbours.
+            elsewhere: maps on which the robot knows that it is not.
 
         Returns:
             The counterpart that shows most of what the view shows; None if there is none.
@@ -158,7 +164,10 @@ class AliasedRegions:
         if not has_depth.any():
             return None
         points, features = points[has_depth], features[has_depth]
-        votes = self._votes(self._around(node, frame, robot, points, ranked), frame, robot)
+        around = self._around(node, frame, robot, points, ranked)
+        votes = [
+            vote for vote in self._votes(around, frame, robot) if vote.alike.other.id.map not in elsewhere
+        ]
         best: tuple[list[_Vote], NDArray[np.bool_]] | None = None
         for party in self._parties(votes):
             shown = np.concatenate([vote.shown for vote in party])

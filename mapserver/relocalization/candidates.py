@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import View
 
 MOST_COMPARED = 16
 """Nodes that are compared with the view."""
+ALIKE_FLOORS = 16
+"""Of a robot that knows its floor so many times as many are retrieved: so many floors may look alike."""
 
 
 class Retrieval(Protocol):
@@ -28,14 +30,20 @@ class Candidates:
     Attributes:
         view: the image's features.
         ranked: nodes with their similarity to it, best first.
+        elsewhere: maps on which the robot knows that it is not.
     """
 
     view: View
     ranked: Sequence[tuple[NodeId, float]] = ()
+    elsewhere: Collection[MapId] = ()
 
 
-def retrieve(view: View, index: Retrieval, least_features: int) -> Candidates:
+def retrieve(
+    view: View, index: Retrieval, least_features: int, elsewhere: Collection[MapId] = ()
+) -> Candidates:
     """Find candidates; none for a view with fewer features than registration needs."""
     if len(view) < least_features:
         return Candidates(view)
-    return Candidates(view, index.query(view, MOST_COMPARED))
+    ranked = index.query(view, MOST_COMPARED * (ALIKE_FLOORS if elsewhere else 1))
+    left = [(node, score) for node, score in ranked if node.map not in elsewhere]
+    return Candidates(view, left[:MOST_COMPARED], elsewhere)

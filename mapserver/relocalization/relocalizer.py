@@ -7,10 +7,10 @@ the recognitions are certain of.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.query import RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions, AliasedRegionSettings
@@ -71,9 +71,14 @@ class Relocalizer:
         self.aliasing = AliasedRegions(index, node_of, merged, self.alike, s.regions)
         self.selection = HypothesisSelector(merged, self.aliasing, least)
 
-    def answer(self, view: View) -> RelocalizeAnswer:
-        """Where a view was taken, or unknown, with the reason in words."""
-        candidates = retrieve(view, self._index, self._least_features)
+    def answer(self, view: View, elsewhere: Collection[MapId] = ()) -> RelocalizeAnswer:
+        """Where a view was taken, or unknown, with the reason in words.
+
+        Args:
+            view: the image's features.
+            elsewhere: maps on which the robot knows that it is not.
+        """
+        candidates = retrieve(view, self._index, self._least_features, elsewhere)
         registration = self.registration.register(candidates)
         return self.conclude(registration)
 

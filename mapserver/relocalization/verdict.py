@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 import numpy as np
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
 from mapweave.mapserver.relocalization.place_hypotheses import (
@@ -90,7 +90,7 @@ class HypothesisSelector:
         if outcome is not None and not weak:
             return Verdict(outcome, registration, places, rivals)
         ranked = [node for node, _ in registration.candidates.ranked]
-        counterpart = self._counterpart(places[0], ranked)
+        counterpart = self._counterpart(places[0], ranked, registration.candidates.elsewhere)
         if counterpart is None:
             return Verdict(outcome or Outcome.FOUND, registration, places, rivals, weak)
         places, rivals = [*places, counterpart], [places[0], counterpart]
@@ -140,10 +140,12 @@ class HypothesisSelector:
             left = remaining
         return sorted(places, key=lambda place: (-len(place.features), place.best.node))
 
-    def _counterpart(self, place: PlaceHypothesis, ranked: Sequence[NodeId]) -> PlaceHypothesis | None:
+    def _counterpart(
+        self, place: PlaceHypothesis, ranked: Sequence[NodeId], elsewhere: Collection[MapId]
+    ) -> PlaceHypothesis | None:
         """Another pose where the robot may be, by aliased surroundings of a place."""
         best = place.best
-        region = self._aliasing.counterpart(best, ranked)
+        region = self._aliasing.counterpart(best, ranked, elsewhere)
         if region is None:
             return None
         twice = [pair for pair in best.recognition.pairs.tolist() if pair[1] in region.features]

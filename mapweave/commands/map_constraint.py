@@ -106,6 +106,7 @@ def _settled(arguments: argparse.Namespace) -> None:
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.commands.map_merge import merged_with_progress
     from mapweave.commands.network import settings_of
+    from mapweave.hybridmap.annotation import Annotations
     from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
     from mapweave.mapserver.map_files import map_file_of, merged_of
@@ -126,7 +127,7 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
         )
     content = read_map_file(arguments.map, "merged")
     before = merged_of(content, settings)
-    earlier = ManualConstraints(content.constraints)
+    earlier = ManualConstraints(content.constraints, floors=Annotations(content.annotations).floors)
     constraint, effects = check_manual_constraint(before, earlier, constraint, settings=settings)
     words = f"{event_words(constraint)}{f'; {effects}' if effects else ''}"
     if arguments.check:

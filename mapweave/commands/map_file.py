@@ -17,6 +17,7 @@ from mapweave.commands import (
     map_merge,
     map_photographs,
     map_pin,
+    map_portal,
     map_retire,
     map_route,
     map_show,
@@ -35,7 +36,7 @@ def add_to(commands: Any) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (
         map_show, map_diff, map_explain, map_route, map_history, map_link, map_unmerge, map_retire, map_undo,
-        map_pin,
+        map_pin, map_portal,
         map_merge, map_fetch, map_export, map_extract, map_import, map_photographs,
     ):  # fmt: skip
         action.add_to(actions)

@@ -117,7 +117,9 @@ def draw_route(
         content = map_file_of(merged)
     part, _ = content.poses[explanation.start]
     poses = {node: p.mean for node, (number, p) in content.poses.items() if number == part}
-    way = [poses[node] for node in (explanation.start, *(hop.b for hop in explanation.hops))]
+    stops = (explanation.start, *(hop.b for hop in explanation.hops))
+    # Beyond a portal it leads through another part.
+    way = [poses[node] for node in stops if node in poses]
     places = np.array([[pose.x, pose.y] for pose in way])
     drive = Drive(places, way[0], way[-1], "the way", begun="start")
     title = f"{explanation.start} to {explanation.goal}\n{explanation.reason}"

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, router_of
 from mapweave.commands.network import add_network, network_of, reach, settings_of
 from mapweave.commands.plan import add_plan_option, plan_of, plan_place
 from mapweave.exit_status import DONE, NO
@@ -124,10 +124,12 @@ def _by_server(
 
 def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer, Node | None]:
     """The answer of a map, and the best candidate's node."""
+    from mapweave.mapserver.places import Places
     from mapweave.offline_relocalization import relocalizer_in
 
-    merged = merged_with_progress(opened(arguments.map), settings_of(arguments).merge)
-    answer = relocalizer_in(merged).answer(view)
+    router = router_of(arguments)
+    merged = router.merged
+    answer = Places(router, router.annotations).named(relocalizer_in(merged).answer(view))
     if not answer.candidates:
         return answer, None
     best = answer.candidates[0].node

@@ -121,7 +121,8 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     from mapweave.agent.replication.journal import Journal
     from mapweave.hybridmap.change import NodePut
     from mapweave.photographs import send_map
-    from mapweave.processes.agent import FIRST_PATIENCE, epochs_of_files, map_path
+    from mapweave.processes.agent import FIRST_PATIENCE
+    from mapweave.processes.agent_files import epochs_of_files, map_path
     from mapweave.storage.map_file import MapFile, write_map_file
     from mapweave.terminal import EventLog, plain_or_terminal, tracked
     from mapweave.visual_mapping import keyframes, visual_maps

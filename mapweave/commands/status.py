@@ -120,7 +120,7 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
     status = robot.status
     age = "gone" if not robot.alive else f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
     if status is None:
-        return robot.robot, "", "", "", "", "", "", age, ""
+        return robot.robot, "", "", "", "", "", "", age, robot.over_quota
     doing = status.status
     mission = ""
     if (report := status.mission) is not None:
@@ -135,7 +135,8 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
         "" if status.battery is None else f"{status.battery:.0%}",
         str(status.unsent),
         age,
-        f"{status.last_error} ({status.error_age:.0f} s ago)" if status.last_error else "",
+        robot.over_quota
+        or (f"{status.last_error} ({status.error_age:.0f} s ago)" if status.last_error else ""),
     )
 
 

@@ -35,8 +35,10 @@ from mapweave.agent.teleoperation import Teleoperation
 from mapweave.extras import need
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import NUMBER, MapId, NodeId
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path
 from mapweave.processes.agent_progress import AgentProgress
+from mapweave.processes.portal_command import PortalCommand
 from mapweave.processes.ros2_publisher import Ros2Publisher
 from mapweave.processes.server_watch import ServerWatch
 from mapweave.processes.service_manager import ServiceManager
@@ -159,6 +161,9 @@ class Agent:
             if options.mission is not None or self.missions.report is None:
                 self.missions.begin(options.mission or options.otherwise)
             self.missions.unknown_goal = self._unknown_goal
+            self._portal_command = PortalCommand(
+                options.name, settings.portals, self.missions.portal_done, self._say
+            )
             self._description = measured(describe(), options.calibration)
             explores = settings.exploration.without_rangers
             for line in announcement(self._description, options.name, explores):
@@ -241,6 +246,7 @@ class Agent:
         if line and self._options.patience > 0.0:
             self._say(line)
         self._on_step(observation, step)
+        self._portal_command.see(step.status.portal)
         # A geometry that is found to be declared wrongly is reported once.
         for cause in self.pipeline.calibration.causes[self._causes :]:
             self._say(str(cause))
@@ -318,25 +324,10 @@ class Agent:
 
     def close(self) -> None:
         """Commit what was mapped and leave the fleet. The bus stays open."""
+        self._portal_command.close()
         self._leave()
         self.missions.save()
         self.journal.close()
-
-
-def map_path(folder: Path, map_id: MapId) -> Path:
-    """Where an agent writes a map: one file a map, for example `r0.3.mapweave`."""
-    return folder / f"{map_id}.mapweave"
-
-
-def trajectory_path(folder: Path, map_id: MapId) -> Path:
-    """Where an agent writes where it was at each observation, for example `r0.3.tum`."""
-    return folder / f"{map_id}.tum"
-
-
-def epochs_of_files(folder: Path, agent: str) -> list[int]:
-    """Numbers of the maps of an agent that have a file in a folder."""
-    numbers = (path.name.split(".")[1] for path in folder.glob(f"{agent}.*.mapweave"))
-    return [int(number) for number in numbers if NUMBER.fullmatch(number)]
 
 
 def run_agent(

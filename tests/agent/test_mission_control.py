@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from mapweave.hybridmap.mission_order import (
     MissionState,
 )
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 
 GOAL, HOME, NOWHERE = NodeId("r1", 1, 5), NodeId("r0", 1, 1), NodeId("r0", 1, 999)
@@ -157,6 +159,37 @@ def test_a_robot_that_is_switched_on_again_goes_on(tmp_path: Path) -> None:
     assert again.report is not None and again.report.state is MissionState.DONE
     assert again._applied == (again.report.order.id, Idle()), "it is there already, and stays"
     assert again.take(explored.order).state is MissionState.REPLACED
+
+
+def test_a_robot_that_is_switched_on_again_goes_on_from_the_stop_and_the_portal_where_it_was() -> None:
+    """A power failure at any moment of a drive with two stops and a lift."""
+    disk, stops = Disk(), (HOME, NodeId("r0", 1, 2))
+    portal = PortalWait(PortalStop("lift", PortalMeans.LIFT, HOME, GOAL, "2"))
+    disk.robot().take(replace(order(1), via=stops))
+
+    def after(*events: tuple[int, PortalWait | None], through: bool = False) -> GoTo:
+        """What a new process begins with, once an old one has got so far."""
+        control = disk.robot()
+        control.next(True, 0.0, None)
+        for passed, wait in events:
+            assert control.follow(replace(status(), passed=passed, portal=wait)), "it is on the disk"
+            assert not control.follow(replace(status(), passed=passed, portal=wait)), "and not again"
+            assert control.next(True, 0.0, None) is None, "the drive goes on"
+        if through:
+            control.portal_done("anna")
+        mission = disk.robot().next(True, 0.0, None)
+        assert isinstance(mission, GoTo)
+        return mission
+
+    assert after() == GoTo(GOAL, stops)
+    assert after((1, None)) == GoTo(GOAL, stops, 1)
+    assert after((2, None), (2, portal)) == GoTo(GOAL, stops, 2, portal)
+    assert after(through=True) == GoTo(GOAL, stops, 2, replace(portal, done=True))
+    with pytest.raises(InvalidValue, match="r0 looks where it is already"):
+        disk.robot().portal_done("bob")
+    assert after((2, None)) == GoTo(GOAL, stops, 2)
+    with pytest.raises(InvalidValue, match="r0 does not wait at a portal"):
+        disk.robot().portal_done("bob")
 
 
 def test_a_full_disk_does_not_keep_a_robot_from_stopping() -> None:

@@ -22,6 +22,8 @@ WRONG = [
     ("landmarks", "--pairs 1", "at least 2 pairs, 0 places and seed 0"),
     ("landmarks", "--places -1", "at least 2 pairs, 0 places and seed 0"),
     ("landmarks", "--pairs x", "--pairs"),
+    ("flood", "--seconds nan", "--seconds and --rate must be positive"),
+    ("flood", "--rate 0", "--seconds and --rate must be positive"),
     ("fuzz", "--seconds 0", "seconds above 0"),
     ("life_sim", "--drives 0", "at least one drive"),
     ("mapping_run", "--out {file}", "name a folder that can be written"),

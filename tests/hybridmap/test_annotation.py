@@ -20,6 +20,7 @@ from mapweave.hybridmap.annotation import (
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.storage.map_file import MapFile, pack_map_file, unpack_map_file
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.packing import pack
@@ -53,6 +54,7 @@ bodies = st.one_of(
     st.builds(lambda area, span: Closure(None, area, *span), areas, spans),
     st.builds(Preference, factors, edge=pairs),
     st.builds(Preference, factors, area=areas),
+    st.builds(lambda pair, means: Portal(*pair, means, "key: desk"), pairs, st.sampled_from(PortalMeans)),
 )
 lines = st.text(st.characters(categories=["L", "N", "P", "Zs"], codec="utf-8"), max_size=40).filter(
     str.isprintable

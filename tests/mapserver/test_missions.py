@@ -13,6 +13,7 @@ from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import mission_relay
 from mapweave.mapserver.http import web as web_module
@@ -23,6 +24,7 @@ from tests.mapserver.house import House
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)
+LIFT = PortalStop("east lift", PortalMeans.LIFT, THERE, NodeId("r1", 1, 5), "2")
 
 
 @pytest.fixture
@@ -189,6 +191,34 @@ def test_over_http_robots_are_sent_stopped_and_seen(house: House) -> None:
         connection.request("GET", "/map")
         assert len(unpack_map_file(connection.getresponse().read()).poses) == 7
         connection.close()
+    link.close()
+
+
+def test_a_robot_at_a_portal_takes_it_from_any_client_that_it_was_taken_through(house: House) -> None:
+    link, control = house.robot()
+    asking = Status(
+        "waiting at a portal", "take me up", 7, 0, Pose2(), False, "goto", portal=PortalWait(LIFT)
+    )
+    with pytest.raises(InvalidValue, match="r0 does not wait at a portal"):
+        house.person.portal_done("r0")
+    with pytest.raises(NotConnected, match="robot r9 does not answer"):
+        house.person.portal_done("r9")
+    with Web(("127.0.0.1", 0), house.server) as web:
+        for say in (
+            lambda: house.person.portal_done("r0"),
+            lambda: ask(web, "POST", "/robots/r0/portal-done")[1]["said"],
+        ):
+            house.person.go("r0", str(THERE))
+            control.next(True, 0.0, None)
+            control.follow(asking)
+            link.report(asking, 2)
+            assert say() == "r0 was taken through lift 'east lift': it looks where it is"
+            assert control.taken_through() and not control.taken_through()
+        status, refused = ask(web, "POST", "/robots/r0/portal-done")
+        assert (status, refused["error"]) == (400, "r0 looks where it is already")
+        (robot,) = ask(web, "GET", "/robots")[1]["robots"]
+        assert robot["status"]["status"]["portal"]["portal"]["name"] == "east lift"
+        assert ask(web, "POST", "/robots/r9/portal-done")[1]["error"] == "r9 does not answer"
     link.close()
 
 

@@ -309,6 +309,10 @@ def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.C
             answer = server.locate(lambda: view, 1).result(20.0)
             assert {candidate.floor for candidate in answer.candidates} <= {"ground", "upper"}
             assert answer.candidates and answer.certainty is not Certainty.FOUND, "it may be on either floor"
+            for near, floor in ((first, "ground"), (NodeId("r1", 1, 3), "upper")):
+                known = server.locate(lambda: replace(view, near=near), near.number).result(20.0)  # noqa: B023
+                assert known.certainty is Certainty.FOUND, "a robot that knows its floor is on that"
+                assert {place.floor for place in known.candidates} == {floor}
             if not labels:
                 person.withdraw("floor", "r1.1")
                 eventually(lambda: server.status()["components"] == 1)

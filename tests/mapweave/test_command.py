@@ -126,6 +126,8 @@ ASKING = {
     "map pin": ["r0.1.17"], "place add": ["kitchen", "r0.1.17"], "place list": [],
     "place remove": ["kitchen"], "close": ["r0.1.1"], "floor": ["first", "r0.1.17"],
     "reopen": ["kitchen"], "prefer": ["r0.1.1", "r0.1.2"], "avoid": ["r0.1.1", "r0.1.2"], "closures": [],
+    "map portal add": ["lift", "r0.1.1", "r1.1.2", "--kind", "lift"], "map portal list": [],
+    "map portal remove": ["lift"], "portal done": ["r0"],
     "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"],
     "relocalize": ["walk/images/0.png"],
     "record": ["r0", "--out", "drive"], "drive": ["r0", "--gamepad", "/dev/null"],

@@ -22,7 +22,8 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
-from mapweave.processes.agent import Agent, AgentOptions, epochs_of_files
+from mapweave.processes.agent import Agent, AgentOptions
+from mapweave.processes.agent_files import epochs_of_files
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
 from mapweave.wire.bus import Request

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.annotation import Annotation, Annotations, Floor
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.annotator import check_annotation
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger
@@ -204,3 +206,39 @@ def test_what_contradicts_a_link_later_is_reported_and_the_link_stays(seam: Scen
     assert "without it robots' measurements" in explain_nodes(merged, LAST, node(B, 5)).reason
     seam.ask(Linked(LAST, node(B, 5)), holds=False)
     assert not seam.merger.merged().contradicted
+
+
+def test_links_by_hand_and_labels_of_floors_know_of_each_other(seam: Scene) -> None:
+    seam.constraints = ManualConstraints(floors={A: "1", B: "2"})
+    with pytest.raises(InvalidValue, match=rf"cannot be linked: {LAST} is on floor 1, {FIRST} on floor 2"):
+        seam.ask(Linked(LAST, FIRST))
+    seam.constraints = ManualConstraints()
+    seam.ask(Linked(LAST, FIRST))
+    merged = seam.merger.merged()
+    first = Annotation(str(A), Floor(LAST, "1"), False, "anna", 1)
+    second = Annotation(str(B), Floor(FIRST, "2"), False, "anna", 2)
+    with pytest.raises(
+        InvalidValue, match=rf"map {A} is on floor 1, and {LAST} and {FIRST} are linked by hand"
+    ):
+        check_annotation(merged, Annotations((first,)), second, seam.constraints)
+    same_floor = replace(second, body=Floor(FIRST, "1"))
+    check_annotation(merged, Annotations((first,)), same_floor, seam.constraints)
+    undone = ManualConstraints([*seam.constraints.made, replace(seam.constraints.made[0], holds=False)])
+    check_annotation(merged, Annotations((first,)), second, undone)
+
+
+def test_a_drive_from_map_to_map_is_evidence_against_labels_and_likeness_is_not() -> None:
+    scene = Scene(room(0, 0, 6, 5, 700, np.random.default_rng(1)))
+    for which in (A, B):
+        scene.drive(which, [Pose2(2.5, 2.5, 1.0 * k) for k in range(3)])
+    first = Annotation(str(A), Floor(node(A, 1), "1"), False, "anna", 1)
+    second = Annotation(str(B), Floor(node(B, 1), "2"), False, "anna", 2)
+    merged = scene.merger.merged()
+    assert len(merged.components) == 1, "they look the same"
+    check_annotation(merged, Annotations((first,)), second, ManualConstraints())
+    between = merged.relative(node(A, 1), node(B, 1))
+    assert between is not None
+    drive = Edge(EdgeId(*A, 99), node(A, 1), node(B, 1), between, EdgeKind.DRIVEN)
+    scene.merger.on_change(Change(A, 99, 0, EdgePut(drive)))
+    with pytest.raises(InvalidValue, match=r"a robot has driven between a\.1\.1 and b\.1\.1"):
+        check_annotation(scene.merger.merged(), Annotations((first,)), second, ManualConstraints())

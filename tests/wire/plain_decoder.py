@@ -356,7 +356,7 @@ class Plain:
     def _view(self, data: bytes) -> Any:
         fields = message(data)
         lens = camera(fields["camera"])
-        return landmarks(fields["features"], lens) | {"camera": lens}
+        return landmarks(fields["features"], lens) | {"camera": lens, "near": fields.get("near")}
 
     def _flat_record(self, data: bytes) -> Any:
         return message(data)["s"]

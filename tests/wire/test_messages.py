@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -121,7 +122,12 @@ def test_a_view(some: SimpleNamespace) -> None:
     assert back.camera == some.camera
     assert np.array_equal(back.codes, landmarks.codes)
     assert np.abs(back.pixels - landmarks.pixels).max() <= 1 / 16
-    assert encode_view(back) == encoded
+    assert encode_view(back) == encoded and back.near is None
+    known = View(landmarks.pixels, landmarks.codes, some.camera, NodeId("r1", 1, 5))
+    assert decode_view(encode_view(known)).near == known.near
+    nowhere = pack({**msgspec.msgpack.decode(encoded), "near": ["R 1", 1, 5]})
+    with pytest.raises(InvalidMessage, match="near"):
+        decode_view(nowhere)
 
 
 def test_a_view_that_cannot_be_sent(some: SimpleNamespace) -> None:

@@ -86,4 +86,4 @@ def test_the_file_is_what_the_program_writes() -> None:
     """Bytes that have been written are read for ever: a change here is a change of the format."""
     written = runpy.run_path(str(ROOT / "docs" / "wire_vectors.py"))["as_json"]()
     for made, kept in zip(json.loads(written), VECTORS, strict=True):
-        assert made == kept, f"{kept['what']} {kept['note']}: run `python docs/wire_vectors.py`"
+        assert made == kept, f"{kept['what']} {kept['note']}: run `python -m docs.wire_vectors`"

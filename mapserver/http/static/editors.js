@@ -88,6 +88,15 @@ export const EDITORS = [
       const [node] = nodes(selection, 1, "A floor");
       return annotation(mapOf(node), { kind: "floor", node, label });
     } },
+  { id: "portal", group: "What is said about it", label: "Lift, ramp or door",
+    hint: "Two nodes, one at each side. A robot parks before it and asks to be taken through.",
+    fields: [{ name: "name", label: "Name", type: "text", required: true, maxLength: 64 },
+      { name: "means", label: "It is a", options: [["lift", "lift"], ["ramp", "ramp"], ["door", "door"]] },
+      { name: "note", label: "Note", type: "text", maxLength: 120, placeholder: "where the key is" }],
+    request(selection, { name, means, note }) {
+      const [a, b] = nodes(selection, 2, "A portal");
+      return annotation(name, { kind: "portal", a, b, means, note });
+    } },
   { id: "pin", group: "What is said about it", label: "Pin a frame",
     hint: "The node keeps its present pose, or gets the one that you give, so the frame of its component never jumps.",
     fields: [

@@ -33,6 +33,8 @@ export function listRobots(robots, select) {
     const choice = button(item, robot.robot, () => select(robot.robot));
     choice.dataset.robot = robot.robot;
     add(item, "span", ` ${word}`, kind);
+    if (robot.over_quota) add(item, "span", ", over its quota", "bad");
+    if (robot.accusation) add(item, "span", " not trusted", "bad").title = robot.accusation;
     const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
       robot.component < 0 ? "not on the map" : ""];
     item.append(" " + parts.filter(Boolean).join(", "));
@@ -44,7 +46,7 @@ export function showRobot(name, commands, goal) {
   const box = byId("selected");
   box.textContent = "";
   add(box, "h2", `Robot ${name}`);
-  panel = { name, facts: add(box, "div") };
+  panel = { name, facts: add(box, "div"), portal: null };
   if (!commands) { add(box, "p", "Robots take missions from the server's own machine alone.", "soft"); return; }
   const form = add(box, "form", "", "actions"), input = add(form, "input");
   input.id = "goal"; input.value = goal; input.placeholder = "node, x,y, place or home"; input.setAttribute("list", "names");
@@ -56,7 +58,7 @@ export function showRobot(name, commands, goal) {
     words.className = ""; words.textContent = "Asking ...";
     const answer = await ask(`robots/${encodeURIComponent(name)}/${path}`, { method: "POST" });
     words.className = answer.error ? "bad" : "good";
-    words.textContent = answer.error || missionWords(answer);
+    words.textContent = answer.error || answer.said || missionWords(answer);
   };
   form.addEventListener("submit", event => {
     event.preventDefault();
@@ -64,6 +66,8 @@ export function showRobot(name, commands, goal) {
   });
   button(actions, "Explore", () => give("explore?by=page"));
   button(actions, "Stop", () => give("stop?by=page"));
+  panel.portal = button(actions, "Taken through", () => give("portal-done?by=page"));
+  panel.portal.hidden = true;
 }
 export const leaveRobot = () => { panel = null; };
 export function updateRobot(robots) {
@@ -71,11 +75,14 @@ export function updateRobot(robots) {
   const robot = robots.find(one => one.robot === panel.name);
   panel.facts.textContent = "";
   if (!robot) { add(panel.facts, "p", "It is not known to the server any more.", "warn"); return; }
+  const portal = robot.status?.status.portal;
+  if (panel.portal) panel.portal.hidden = !portal || portal.done;
   const status = robot.status, [word, kind] = life(robot), pose = robot.merged_from_robot;
   const [xx = 0, , yy = 0, hh = 0] = (status?.status.covariance || []).map(Math.sqrt);
   const spread = xx + yy > 0 ? ` (sigma ${xx.toFixed(3)}, ${yy.toFixed(3)} m, ${degrees(hh)})` : "";
   facts(panel.facts, [
     ["state", word, kind],
+    ["held against it", robot.accusation, "bad"],
     ["last heard", `${seconds(robot.age)} ago`],
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
@@ -85,6 +92,7 @@ export function updateRobot(robots) {
     ["images skipped", status && status.skipped],
     ["battery", status?.battery != null ? percent(status.battery) : ""],
     ["sees the server", status && (status.linked ? "yes" : "no")],
+    ["quota", robot.over_quota, "bad"],
     ["last error", status?.last_error ? `${status.last_error} (${seconds(status.error_age)} before)` : "", "bad"],
   ]);
 }

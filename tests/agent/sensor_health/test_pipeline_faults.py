@@ -8,10 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission import Answer, Explore, GoTo
+from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, Step
-from mapweave.agent.sensor_health.sensor_monitor import FIRST_TRIAL, TRIAL_SIDE
+from mapweave.agent.runner import Runner
+from mapweave.agent.sensor_health.sensor_monitor import FIRST_TRIAL, TRIAL_SIDE, Fault
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
@@ -117,3 +122,36 @@ def test_a_simulated_robot_keeps_its_map_sound(how):
         true = truth[nodes[edge.a].stamp_ns].inverse() @ truth[nodes[edge.b].stamp_ns]
         # 99.9 % point of chi-square for 3 degrees of freedom.
         assert edge.a_from_b.mahalanobis2(true) < 16.3
+
+
+class Scripted:
+    """A pipeline whose faults are given, and the rest of a robot that does nothing."""
+
+    def __init__(self, *faults: Fault | None) -> None:
+        self.faults = list(faults)
+        self.map = HybridMap()
+
+    def step(self, *_: object) -> Step:
+        return Step(Command(), (), (), Status("idle", "", 0, 0, Pose2(), False), self.faults.pop(0))
+
+    def server_in_reach(self) -> bool:
+        return False
+
+    def driven(self) -> None:
+        return None
+
+    def answers(self) -> tuple[object, ...]:
+        return ()
+
+    def report(self, *_: object) -> None:
+        return None
+
+
+def test_the_log_has_one_line_when_a_sensor_fails_and_one_when_it_is_back():
+    frozen, dead = Fault("camera", "it is frozen"), Fault("encoders", "they do not count")
+    robot, lines = Scripted(None, frozen, frozen, dead, None, None), list[str]()
+    parts = MissionControl("r0"), MappingMonitor(BODY)
+    runner = Runner(robot, robot, None, *parts, print_line=lines.append)  # type: ignore[arg-type]
+    for tick in range(6):
+        runner.tick(Observation(tick * 100_000_000, Odometry(0.0, 0.0)))
+    assert lines == ["it is frozen", "they do not count", "believes its encoders again"]

@@ -132,7 +132,10 @@ def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet) -> None:
     r0 = fleet.join("r0")
     r0.announce(KEYS.agent_alive(MapId("r1", 1)))
     r0.announce(KEYS.agent_alive(MapId("r0", 1)))
-    for key in (KEYS.mission("r1"), KEYS.log(MapId("r1", 1)), KEYS.relocalize("s0"), KEYS.route("s0")):
+    for key in (
+        KEYS.mission("r1"), KEYS.log(MapId("r1", 1)), KEYS.relocalize("s0"),
+        *(KEYS.in_name_of("r1", question) for question in (KEYS.relocalize("s0"), KEYS.route("s0"))),
+    ):  # fmt: skip
         r0.serve(key, answer)
     r0.serve(KEYS.mission("r0"), answer)
     anna, r1 = fleet.join("anna"), fleet.join("r1")
@@ -141,18 +144,27 @@ def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet) -> None:
     assert alive == [KEYS.agent_alive(MapId("r0", 1))]
     assert not asked(anna, KEYS.mission("r1"))
     assert not asked(fleet.router, KEYS.log(MapId("r1", 1)))
-    assert not asked(r1, KEYS.relocalize("s0"))
-    assert not asked(r1, KEYS.route("s0"))
+    assert not asked(r1, KEYS.in_name_of("r1", KEYS.relocalize("s0")))
+    assert not asked(r1, KEYS.in_name_of("r1", KEYS.route("s0")))
+
+
+IN_ANOTHERS_NAME = {f"{what}/{name}" for what in OF_ROBOTS for name in ("r1", "*")}
 
 
 @pytest.mark.parametrize(
     ("name", "may"),
-    [("r0", OF_ROBOTS), ("bob", frozenset(ASKS) - COMMANDS), ("anna", frozenset(ASKS))],
+    [
+        ("r0", frozenset({"status", *(f"{what}/r0" for what in OF_ROBOTS)})),
+        ("bob", frozenset(ASKS) - COMMANDS),
+        ("anna", frozenset(ASKS)),
+    ],
 )
 def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[str]) -> None:
-    every = {what: f"{KEYS.root}/server/s0/{what}" for what in ASKS}
+    asks = {*ASKS, *IN_ANOTHERS_NAME, *(f"{what}/r0" for what in OF_ROBOTS)}
+    every = {what: f"{KEYS.root}/server/s0/{what}" for what in asks}
     for key in every.values():
-        certified.router.serve(key, answer)
+        if "*" in key or not key.endswith(("/r0", "/r1")):
+            certified.router.serve(key, answer)
     bus = certified.join(name)
     eventually(lambda: asked(bus, every["status"]))
     answered: set[str] = set()
@@ -171,13 +183,15 @@ def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[
 
 def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
     r0 = fleet.join("r0")
-    for key in (KEYS.mission("r0"), KEYS.drive("r0"), KEYS.agent_status("r0")):
+    for key in (KEYS.mission("r0"), KEYS.drive("r0"), KEYS.portal("r0"), KEYS.agent_status("r0")):
         r0.serve(key, answer)
     anna, bob = fleet.join("anna"), fleet.join("bob")
     eventually(lambda: asked(anna, KEYS.mission("r0")) and asked(anna, KEYS.drive("r0")))
+    eventually(lambda: asked(anna, KEYS.portal("r0")))
     eventually(lambda: asked(bob, KEYS.agent_status("r0")))
     assert not asked(bob, KEYS.mission("r0"))
     assert not asked(bob, KEYS.drive("r0"))
+    assert not asked(bob, KEYS.portal("r0"))
 
 
 def test_who_has_no_good_key_is_not_let_in(certified: Fleet) -> None:
@@ -248,7 +262,7 @@ def test_a_revoked_key_is_of_no_use_and_nothing_else_changes(
     stolen = read_key_file(fleet.folder.key_file("r0")).credentials
     got: list[bytes] = []
     fleet.router.subscribe(KEYS.changes(), lambda sample: got.append(sample.payload))
-    fleet.router.serve(KEYS.route("s0"), answer)
+    fleet.router.serve(KEYS.in_any_name(KEYS.route("s0")), answer)
     r1 = fleet.join("r1")
     fleet.folder.revoke("r0", "stolen")
     replacement = read_key_file(fleet.folder.add("r0", Role.ROBOT)).credentials
@@ -264,8 +278,8 @@ def test_a_revoked_key_is_of_no_use_and_nothing_else_changes(
 
     eventually(both)
     assert b"old" not in got
-    assert not asked(old, KEYS.route("s0"))
-    eventually(lambda: asked(r1, KEYS.route("s0")))
+    assert not asked(old, KEYS.in_name_of("r0", KEYS.route("s0")))
+    eventually(lambda: asked(r1, KEYS.in_name_of("r1", KEYS.route("s0"))))
     if fleet.folder.profile is Profile.PRODUCTION:
         eventually(lambda: "refused: r0 at" in caplog.text)
         assert "this key was revoked" in caplog.text

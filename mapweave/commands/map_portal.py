@@ -1,0 +1,84 @@
+"""`mapweave map portal`: lifts, ramps and doors through which robots ask to be taken."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from mapweave.commands.annotating import add_record_options, record_of
+
+KINDS = ("lift", "ramp", "door")
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action and its own actions."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "portal",
+        help="lifts, ramps and doors through which people take robots",
+        description="Portals join parts of the map between which no robot drives by itself. A route may lead "
+        "through them; the robot parks at one side and asks. See also `mapweave portal done`.",
+    )
+    steps = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    add: argparse.ArgumentParser = steps.add_parser(
+        "add",
+        help="add a lift, a ramp or a door",
+        description="Add a portal between two nodes, or named places. Robots park at them as at goals. A "
+        "lift and a ramp lead from one floor to another: label both with `mapweave floor`. The same name "
+        "again: the later one holds.",
+    )
+    add.add_argument("name", metavar="NAME", help="1 to 64 characters, for example 'east lift'")
+    add.add_argument("a", metavar="A", help="node or place at one side")
+    add.add_argument("b", metavar="B", help="at the other side")
+    add.add_argument("--kind", choices=KINDS, required=True, help="what it is")
+    add.add_argument("--note", default="", metavar="TEXT", help="for who takes a robot through")
+    add_record_options(add, changes=True)
+    add.set_defaults(run=run_add)
+
+    portals: argparse.ArgumentParser = steps.add_parser(
+        "list", help="all portals", description="List the portals: `mapweave map portal list`."
+    )
+    add_record_options(portals, changes=False)
+    portals.set_defaults(run=run_list)
+
+    remove: argparse.ArgumentParser = steps.add_parser(
+        "remove",
+        help="remove a portal",
+        description="Remove a portal: `mapweave map portal remove 'east lift'`. `mapweave map history` still "
+        "shows it; `map portal add` brings it back. For a time: `mapweave close A B`.",
+    )
+    remove.add_argument("name", metavar="NAME")
+    add_record_options(remove, changes=True)
+    remove.set_defaults(run=run_remove)
+
+
+def run_add(arguments: argparse.Namespace) -> int:
+    """Add a portal."""
+    a = arguments
+    with record_of(a) as record:
+        print(record.annotate("portal", a.name, a.because, a=a.a, b=a.b, means=a.kind, note=a.note))
+    return 0
+
+
+def run_remove(arguments: argparse.Namespace) -> int:
+    """Remove a portal."""
+    with record_of(arguments) as record:
+        print(record.withdraw("portal", arguments.name, arguments.because))
+    return 0
+
+
+def run_list(arguments: argparse.Namespace) -> int:
+    """Print the portals."""
+    from mapweave.hybridmap.portal import Portal
+    from mapweave.mapserver.http.json_values import json_values
+
+    with record_of(arguments) as record:
+        entries = [entry for entry, _ in record.annotations().in_force(Portal)]
+    if arguments.json:
+        print(json.dumps({"portals": [json_values(entry) for entry in entries]}))
+        return 0
+    for entry in entries:
+        print(entry.words)
+    if not entries:
+        print("there is no portal yet: mapweave map portal add NAME A B --kind lift")
+    return 0

@@ -1,0 +1,23 @@
+"""The files that an agent writes beside its journal: one map file a map, and where the robot was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mapweave.hybridmap.node import NUMBER, MapId
+
+
+def map_path(folder: Path, map_id: MapId) -> Path:
+    """Where an agent writes a map: one file a map, for example `r0.3.mapweave`."""
+    return folder / f"{map_id}.mapweave"
+
+
+def trajectory_path(folder: Path, map_id: MapId) -> Path:
+    """Where an agent writes where it was at each observation, for example `r0.3.tum`."""
+    return folder / f"{map_id}.tum"
+
+
+def epochs_of_files(folder: Path, agent: str) -> list[int]:
+    """Numbers of the maps of an agent that have a file in a folder."""
+    numbers = (path.name.split(".")[1] for path in folder.glob(f"{agent}.*.mapweave"))
+    return [int(number) for number in numbers if NUMBER.fullmatch(number)]
