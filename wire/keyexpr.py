@@ -44,6 +44,21 @@ def intersects(a: str, b: str) -> bool:
     return _meet(tuple(a.split("/")), tuple(b.split("/")))
 
 
+def asked_key(asked: str, served: str) -> str:
+    """The key of a question at a service: what both patterns say of it, or the service's own pattern.
+
+    A question for `server/*/constrain/anna` at the service `server/s0/constrain/*` is one for
+    `server/s0/constrain/anna`.
+    """
+    if is_key(asked):
+        return asked
+    theirs, own = asked.split("/"), served.split("/")
+    if len(theirs) != len(own):
+        return served
+    key = "/".join(b if a == "*" else a for a, b in zip(theirs, own, strict=True))
+    return key if is_key(key) else served
+
+
 def _meet(a: tuple[str, ...], b: tuple[str, ...]) -> bool:
     if not a:
         return all(chunk == "**" for chunk in b)
