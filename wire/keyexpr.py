@@ -44,19 +44,16 @@ def intersects(a: str, b: str) -> bool:
     return _meet(tuple(a.split("/")), tuple(b.split("/")))
 
 
-def asked_key(asked: str, served: str) -> str:
-    """The key of a question at a service: what both patterns say of it, or the service's own pattern.
+def answered(asked: str, served: str) -> str:
+    """The key under which a service answers: one that the question's pattern and its own both match.
 
-    A question for `server/*/constrain/anna` at the service `server/s0/constrain/*` is one for
-    `server/s0/constrain/anna`.
+    A question for `server/*/constrain/anna` at the service `server/s0/constrain/*` is answered under
+    `server/s0/constrain/anna`. Where both leave a chunk open it is a pattern.
     """
-    if is_key(asked):
-        return asked
-    theirs, own = asked.split("/"), served.split("/")
-    if len(theirs) != len(own):
-        return served
-    key = "/".join(b if a == "*" else a for a, b in zip(theirs, own, strict=True))
-    return key if is_key(key) else served
+    if is_key(asked) or "**" in asked or "**" in served:
+        return asked if is_key(asked) else served
+    pairs = zip(asked.split("/"), served.split("/"), strict=True)
+    return "/".join(there if here == "*" else here for here, there in pairs)
 
 
 def _meet(a: tuple[str, ...], b: tuple[str, ...]) -> bool:

@@ -13,7 +13,7 @@ import zenoh
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.dispatch import Dispatcher
-from mapweave.wire.keyexpr import asked_key
+from mapweave.wire.keyexpr import answered
 from mapweave.wire.refusal import decode_refusal, encode_refusal
 
 log = logging.getLogger(__name__)
@@ -130,7 +130,7 @@ class Service(Declared):
 
     def _receive(self, query: zenoh.Query) -> None:
         # A reply goes out on one key that the question's pattern matches.
-        key = asked_key(str(query.key_expr), self.key)
+        key = answered(str(query.key_expr), self.key)
         self._owner.dispatcher.question(self._handler, ZenohRequest(self._owner, key, query), self.wanted)
 
 
