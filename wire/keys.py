@@ -298,8 +298,6 @@ class Keys:
         """Likewise of every server."""
         return f"{self.root}/server/*/alive"
 
-    # A robot asks in its own name, which access rules check: its questions count for its own quota.
-
     # Keys of a robot base.
 
     def robot_describe(self, robot: str) -> str:

@@ -204,6 +204,8 @@ def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, t
     person.apply()
     assert last(server) == Apart((A, B))
     person.take_back(server)
+    assert server.settle(60.0) and len(server.merged().links) == 1
+    eventually(lambda: browser.run("return mapweave.model.links.length") == 1)
 
     # An area by dragging: its nodes are those that an independent test finds in it.
     (x, y), (u, v) = person.at(LAST), person.at(FIRST)
