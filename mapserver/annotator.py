@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
@@ -20,10 +21,11 @@ from mapweave.mapserver.portals import check_portal
 from mapweave.mapserver.services import guarded
 from mapweave.merge.floors import floor_of, held_together
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.bus import Bus, Closing
+from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import serve_senders
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +96,7 @@ class Annotator:
         self._check, self._constraints, self._changed = check, constraints, changed
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
-            bus.serve(keys.annotate(name), guarded(self._annotate)),
+            *serve_senders(bus, keys.annotate(name), self._annotate),
             bus.serve(keys.annotations(name), guarded(lambda _: encode(record.annotations))),
             bus.serve(
                 keys.resolve(name),
@@ -133,8 +135,12 @@ class Annotator:
         log.warning("%s", annotation.words)
         return annotation.words
 
-    def _annotate(self, payload: bytes) -> bytes:
-        return encode_record({"said": self.annotate(decode(payload, Annotation))})
+    def _annotate(self, request: Request, who: str) -> None:
+        def annotate(payload: bytes) -> bytes:
+            annotation = decode(payload, Annotation)
+            return encode_record({"said": self.annotate(replace(annotation, who=who or annotation.who))})
+
+        guarded(annotate)(request)
 
 
 def check_annotation(

@@ -37,6 +37,7 @@ from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys, robot_of
 from mapweave.wire.log_messages import Scalar, encode_record
 from mapweave.wire.messages import decode, decode_view, encode
+from mapweave.wire.senders import sent_by_any, serve_senders
 
 log = logging.getLogger(__name__)
 
@@ -109,11 +110,11 @@ class Services:
         self._closing: list[Closing] = [
             *(bus.serve(question, answer) for question, answer in of_robots.items()),
             *(
-                bus.serve(keys.in_any_name(question), self._limited(answer))
+                bus.serve(sent_by_any(question), self._limited(answer))
                 for question, answer in of_robots.items()
             ),
             bus.serve(keys.server_map(name), self._map.ask),
-            bus.serve(keys.server_mission(name), self._command_later),
+            *serve_senders(bus, keys.server_mission(name), self._command_later),
             bus.serve(keys.missions(name), guarded(lambda _: encode(missions.missions()))),
             bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(places())))),
             bus.serve(keys.server_status(name), guarded(self._tell_status)),
@@ -131,10 +132,13 @@ class Services:
         """The merged map as a map file, from any thread."""
         return self._map.packed()
 
-    def _command_later(self, request: Request) -> None:
+    def _command_later(self, request: Request, who: str) -> None:
+        def command(payload: bytes) -> bytes:
+            mission = decode(payload, MissionRequest)
+            return encode(self._missions.command(replace(mission, by=who or mission.by)))
+
         # It waits for a robot, which nothing else of the server may do.
-        command = guarded(lambda payload: encode(self._missions.command(decode(payload, MissionRequest))))
-        self._relays.submit(command, request)
+        self._relays.submit(guarded(command), request)
 
     def _limited(self, answer: Callable[[Request], None]) -> Callable[[Request], None]:
         """Answer a robot that asks no more than its quota."""

@@ -10,6 +10,7 @@ from mapweave.hybridmap.errors import NotConnected
 
 if TYPE_CHECKING:
     from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.credentials import Credentials
     from mapweave.wire.zenoh_bus import ZenohBus
 
 SOON = 1.0
@@ -37,9 +38,9 @@ def reach(settings: BusSettings, advice: str = "give --connect") -> ZenohBus:
         bus.close()
         where = ", ".join(settings.endpoints)
         if any(map(_listens, settings.endpoints)):
-            keys = "one of this fleet's keys" if settings.credentials is not None else "--keys FILE"
             reason = "what listens there does not let this in"
-            raise NotConnected(f"no router at {where}: {reason}; if the fleet has keys, give {keys}")
+            advice = _key_hint(settings.credentials) or "; if the fleet has keys, give --keys FILE"
+            raise NotConnected(f"no router at {where}: {reason}{advice}")
         raise NotConnected(f"no router at {where}: start `mapweave server`, or {advice}")
     return bus
 
@@ -54,8 +55,24 @@ def _listens(endpoint: str) -> bool:
         return False
 
 
-def no_server(fleet: str) -> NotConnected:
-    """The error that no map server answers."""
+def no_server(fleet: str, holder: Credentials | None = None) -> NotConnected:
+    """The error that no map server answers.
+
+    Args:
+        fleet: its name.
+        holder: of the key with which one is connected, if there is one.
+    """
     return NotConnected(
         f"a router is up, but no map server of fleet {fleet} answers: start `mapweave server` or give --fleet"
+        f"{_key_hint(holder)}"
+    )
+
+
+def _key_hint(holder: Credentials | None) -> str:
+    """A router drops what a key may not do, without a word."""
+    if holder is None:
+        return ""
+    return (
+        f"; or the key of {holder.name} was revoked, has expired or may not do this: `mapweave keys list` at "
+        "the server and the server's log say so"
     )

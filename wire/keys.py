@@ -17,6 +17,8 @@
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
     mapweave/1/<fleet>/server/<server>/relocalize/<agent>  the same of a robot; also route, known, reserve
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
+    mapweave/1/<fleet>/server/<server>/constrain/<who>  the same of a person with a key; also annotate and
+                                                      missions, see mapweave.wire.senders
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot base; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of the driver of that base
 
@@ -298,14 +300,6 @@ class Keys:
 
     # A robot asks in its own name, which access rules check: its questions count for its own quota.
 
-    def in_name_of(self, robot: str, question: str) -> str:
-        """A question to a server, asked by a robot."""
-        return f"{question}/{check_name(robot)}"
-
-    def in_any_name(self, question: str) -> str:
-        """Pattern: a question to a server, asked by any robot."""
-        return f"{question}/*"
-
     # Keys of a robot base.
 
     def robot_describe(self, robot: str) -> str:
@@ -388,7 +382,7 @@ class Keys:
 
 
 def robot_of(key: str) -> str:
-    """In whose name a message or a question comes: a robot's; empty for people and servers."""
+    """In whose name a message or a question comes: a robot's, or a person's with a key; else empty."""
     match key.split("/")[3:]:
         case ["agent" | "robot", name, *_] | ["server", _, _, name] if NAME.fullmatch(name):
             return name

@@ -20,6 +20,7 @@ from mapweave.hybridmap.query import (
 )
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode, encode_view
+from mapweave.wire.senders import sent_by
 
 FARTHEST = 100.0
 """m; no robot sees a node, or drives from one node to the next, from further away. Nodes of recordings from
@@ -39,15 +40,15 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
     """
     if isinstance(question, WhereAmI):
         view = replace(question.view, near=question.near)
-        return keys.in_name_of(robot, keys.any_relocalize()), encode_view(view)
+        return sent_by(keys.any_relocalize(), robot), encode_view(view)
     if isinstance(question, WhatIsKnown):
         around = KnownRequest(question.map, question.x, question.y, question.reach)
-        return keys.in_name_of(robot, keys.any_known()), encode(around)
+        return sent_by(keys.any_known(), robot), encode(around)
     if isinstance(question, MayIDrive):
         reserve = ReserveRequest(robot, question.start, question.start_from_robot, question.route)
-        return keys.in_name_of(robot, keys.any_reserve()), encode(reserve)
+        return sent_by(keys.any_reserve(), robot), encode(reserve)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
-    return keys.in_name_of(robot, keys.any_route()), encode(request)
+    return sent_by(keys.any_route(), robot), encode(request)
 
 
 def decode_answer(

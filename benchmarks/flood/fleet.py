@@ -19,6 +19,7 @@ from mapweave.hybridmap.query import View
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import encode_view
+from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.world import room, take_map, take_view
 
@@ -120,7 +121,7 @@ class HonestRobot:
 
     def _ask(self, end: float, waits: Waits) -> None:
         keys = Keys(FLEET)
-        key = keys.in_name_of(self.name, keys.any_relocalize())
+        key = sent_by(keys.any_relocalize(), self.name)
         while (began := time.monotonic()) < end:
             message = encode_view(self._room.view(self._rng)[0])
             began = time.monotonic()

@@ -19,6 +19,7 @@ from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Head, LogAnswer, LogRequest, Mark
 from mapweave.wire.messages import encode, encode_view
+from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
 
 KINDS = ("changes", "beacons", "questions")
@@ -84,12 +85,12 @@ class Flooder:
         route = encode(RouteRequest(a, b))
         for view in itertools.cycle(views):
             for what, payload in ((self._keys.any_relocalize(), view), (self._keys.any_route(), route)):
-                self._bus.ask(self._keys.in_name_of(self._name, what), payload, TIMEOUT)
+                self._bus.ask(sent_by(what, self._name), payload, TIMEOUT)
 
     def _ask_known(self) -> None:
         payload = encode(KnownRequest(MapId(self._name, 1), 0.0, 0.0, 20.0))
         while True:
-            self._bus.ask(self._keys.in_name_of(self._name, self._keys.any_known()), payload, TIMEOUT)
+            self._bus.ask(sent_by(self._keys.any_known(), self._name), payload, TIMEOUT)
 
     def _answer(self, request: Request) -> None:
         epoch = self._keys.parse_log(request.key).epoch

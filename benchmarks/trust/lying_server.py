@@ -27,6 +27,7 @@ from mapweave.registration.recognition import RecognitionSettings, recognise
 from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, decode_view, encode
+from mapweave.wire.senders import sent_by_any
 from synthetic.world import room, take_map
 
 EXACT = np.diag([1e-4, 1e-4, 1e-5])
@@ -71,9 +72,9 @@ class LyingServer:
         self.asked = 0
         self._world_from_robot = world_from_robot
         self._serving = [
-            bus.serve(keys.in_any_name(keys.relocalize("s0")), self._relocalize),
-            bus.serve(keys.in_any_name(keys.route("s0")), self._route),
-            bus.serve(keys.in_any_name(keys.reserve("s0")), self._reserve),
+            bus.serve(sent_by_any(keys.relocalize("s0")), self._relocalize),
+            bus.serve(sent_by_any(keys.route("s0")), self._route),
+            bus.serve(sent_by_any(keys.reserve("s0")), self._reserve),
         ]
 
     @property

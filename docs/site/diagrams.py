@@ -1,4 +1,4 @@
-"""Diagrams of the tutorials: a robot as its settings file describes it, and who sends what in a fleet."""
+"""Diagrams of the tutorials: a robot as its settings file describes it, and what is sent in a fleet."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def draw_robot(path: Path) -> None:
 
 
 def draw_fleet(path: Path) -> None:
-    """Who sends what to whom."""
+    """What is sent in a fleet."""
     _, axes = plt.subplots(figsize=(8.4, 3.0), dpi=90)
     boxes = {
         "r0": (0.0, 2.0, "agent r0\nits own disk"), "r1": (0.0, 0.0, "agent r1\nits own disk"),

@@ -64,13 +64,14 @@ def annotations_json(server: Annotating) -> Mapping[str, Any]:
     }
 
 
-def annotate(server: Annotating, data: bytes, by: str) -> Mapping[str, Any]:
+def annotate(server: Annotating, data: bytes, by: str, who: str = "") -> Mapping[str, Any]:
     """Add the annotation of a request.
 
     Args:
         server: keeps the record.
         data: JSON; the body's nodes may be words, see `body_of_words`.
         by: who says so, if the request does not tell.
+        who: has logged in; then the request is not asked.
 
     Raises:
         InvalidValue: it is none, or says nothing new.
@@ -81,7 +82,7 @@ def annotate(server: Annotating, data: bytes, by: str) -> Mapping[str, Any]:
         raise InvalidValue(f"{error}; {FORM}") from None
     annotation = annotation_of_words(
         posted.name[: MAX_NAME + 1], posted.body, posted.removed, server.annotations, server.resolve,
-        posted.who or by, posted.because, time.time_ns(),
+        who or posted.who or by, posted.because, time.time_ns(),
     )  # fmt: skip
     answer = {"said": server.annotate(annotation, posted.check), "annotation": json_values(annotation)}
     if posted.check and not posted.removed and isinstance(annotation.body, FloorPlan):

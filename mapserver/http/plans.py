@@ -9,7 +9,6 @@ from typing import Any, Protocol
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
-from starlette.routing import Route
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
@@ -36,25 +35,22 @@ class Planning(Protocol):
         """Keep the image of a plan."""
 
 
-def plan_routes(
-    server: Planning,
-    answering: Callable[[Answer], Callable[[Request], Awaitable[Response]]],
-    body_of: Callable[[Request], Awaitable[bytes]],
-) -> list[Route]:
-    """Routes of the questions about plans.
+def plan_answers(
+    server: Planning, body_of: Callable[[Request], Awaitable[bytes]]
+) -> list[tuple[str, str, str, Answer]]:
+    """Method, path, question and answer of what is asked about plans.
 
     Args:
         server: answers.
-        answering: makes an endpoint of an answer, with its refusals.
-        body_of: reads the body of a request of one who may command.
+        body_of: reads the body of a request.
     """
 
-    async def plans(request: Request) -> Mapping[str, Any]:
-        if request.method == "POST":
-            body = await body_of(request)
-            content_type = request.headers.get("Content-Type", "")
-            return await run_in_threadpool(keep_image, server, content_type, body)
+    async def plans(_: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(server.plans()))
+
+    async def put(request: Request) -> Mapping[str, Any]:
+        body = await body_of(request)
+        return await run_in_threadpool(keep_image, server, request.headers.get("Content-Type", ""), body)
 
     async def image(request: Request) -> Response:
         png = await run_in_threadpool(server.plan_image, request.path_params["name"])
@@ -65,9 +61,10 @@ def plan_routes(
         return Response(png, media_type="image/png")
 
     return [
-        Route("/plans", answering(plans), methods=["GET", "POST"]),
-        Route("/plan-images/{sha256}.png", answering(kept)),
-        Route("/plans/{name:path}.png", answering(image)),
+        ("GET", "/plans", "plans", plans),
+        ("POST", "/plans", "put_plan_image", put),
+        ("GET", "/plan-images/{sha256}.png", "plan_image", kept),
+        ("GET", "/plans/{name:path}.png", "plan_image", image),
     ]
 
 

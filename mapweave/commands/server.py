@@ -51,12 +51,8 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument(
         "--http", metavar="[HOST:]PORT",
-        help="answer people over HTTP as well, on this machine alone unless HOST is given, "
-        "for example 8080 or 0.0.0.0:8080 (default: off)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--http-commands", action="store_true",
-        help="with --http: other machines may move robots, too; there is no password",
+        help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
+        "0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
@@ -85,11 +81,11 @@ def run(arguments: argparse.Namespace) -> int:
     keys = Keys(router.fleet)
     if arguments.demo and arguments.data is not None:
         raise SettingsError("--demo keeps nothing: leave out --data")
-    address, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
+    people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
     if http is not None:
-        from mapweave.mapserver.http.web import Web, parse_address
+        from mapweave.commands.http_access import http_access
 
-        address = parse_address(http)
+        people = http_access(http, folder, name)
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
@@ -114,12 +110,13 @@ def run(arguments: argparse.Namespace) -> int:
             stack.enter_context(server)
             where = ", ".join(router.listen)
             print(stamped(f"map server {name} of fleet {keys.fleet} listens at {where}"), flush=True)
-            if address is not None:
-                stack.enter_context(Web(address, server, commands=arguments.http_commands))
-                print(stamped(f"for people: http://{':'.join(map(str, address))}/"), flush=True)
+            if people is not None:
+                stack.enter_context(people.serve(server))
+                print(stamped(f"for people: {people.url}"), flush=True)
             if arguments.demo:
                 stack.enter_context(RecordedFleet(bus, keys, name, data))
-            renewal = key_renewal(bus, folder, name, router)
+            renewed = people.renew if people is not None else lambda own: None
+            renewal = key_renewal(bus, folder, name, router, renewed)
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):

@@ -106,7 +106,7 @@ def link_status():
 def ask(web: Web, method: str, path: str, body: object = None) -> tuple[int, dict]:
     connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=20)
     data = body if isinstance(body, bytes) else json.dumps(body).encode() if body is not None else None
-    connection.request(method, path, data)
+    connection.request(method, path, data, {"Content-Type": "application/json"})
     reply = connection.getresponse()
     content = reply.read()
     connection.close()

@@ -66,6 +66,7 @@ def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
 
 def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> None:
     fleet = house.person
+    assert house.server.settle(20.0)
     with pytest.raises(InvalidValue, match="the image of this plan is not on the server"):
         fleet.annotate("plan", "flat", **fields())
     assert fleet.put_plan_image(PNG.png).sha256 == PNG.image.sha256
@@ -73,6 +74,7 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
         fleet.annotate("plan", "flat", **{**fields(), "pairs": fields()["pairs"][:2]})  # type: ignore[index]
     assert fleet.annotate("plan", "flat", **fields()) == "plan flat is flat.png, 4 pairs, 0.02 m/px, by anna"
     for _ in range(2):
+        assert house.server.settle(20.0)
         placed = fleet.plans().plan("flat")
         assert np.allclose(placed.part().plan_from_merged.vector, PLAN_FROM_MERGED.vector, atol=1e-6)
         assert fleet.plan_image(placed.plan.image.sha256) == PNG.png

@@ -18,6 +18,7 @@ from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings, TokenBucket
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.wire.messages import encode, encode_view
+from mapweave.wire.senders import sent_by
 from tests.mapserver.conftest import ROBOT
 from tests.mapserver.house import KEYS, House
 
@@ -48,11 +49,11 @@ def test_a_robot_that_asks_too_much_is_refused_and_shown_and_others_are_answered
     around = encode(KnownRequest(ROBOT, 0.0, 0.0, 9.0))
     most = round(BURST * QuotaSettings().questions)
     with caplog.at_level(logging.WARNING):
-        replies = [asker.ask(KEYS.in_name_of("r7", key), around, 20.0)[0] for _ in range(3 * most)]
+        replies = [asker.ask(sent_by(key, "r7"), around, 20.0)[0] for _ in range(3 * most)]
     refused = [reply for reply in replies if reply.error]
     assert most <= len(replies) - len(refused) < 2 * most
     assert all(0.0 < reply.retry_after <= 1.0 for reply in refused)
-    for other in (key, KEYS.in_name_of("r8", key)):
+    for other in (key, sent_by(key, "r8")):
         assert not asker.ask(other, around, 20.0)[0].error
     (entry,) = [entry for entry in house.person.status().robots if entry.robot == "r7"]
     assert entry.over_quota == cells(entry)[-1] == f"over its quota: {len(refused)} questions"
@@ -65,14 +66,14 @@ def test_a_robot_reserves_for_itself_alone(house: House) -> None:
     asker = house.bus()
     start = NodeId(*ROBOT, 1)
     for_r8 = encode(ReserveRequest("r8", start, Pose2(), ()))
-    (reply,) = asker.ask(KEYS.in_name_of("r9", KEYS.any_reserve()), for_r8, 20.0)
+    (reply,) = asker.ask(sent_by(KEYS.any_reserve(), "r9"), for_r8, 20.0)
     assert reply.error == "r9 reserves nothing for r8"
-    assert not asker.ask(KEYS.in_name_of("r8", KEYS.any_reserve()), for_r8, 20.0)[0].error
+    assert not asker.ask(sent_by(KEYS.any_reserve(), "r8"), for_r8, 20.0)[0].error
 
 
 def test_a_robot_is_localized_in_its_own_name(house: House) -> None:
     view = encode_view(house.mapped.view(min(house.mapped.truth)))
-    (reply,) = house.bus().ask(KEYS.in_name_of("r8", KEYS.any_relocalize()), view, 20.0)
+    (reply,) = house.bus().ask(sent_by(KEYS.any_relocalize(), "r8"), view, 20.0)
     assert not reply.error
 
 

@@ -65,7 +65,8 @@ def get(http: int, path: str) -> dict:
 
 
 def post(http: int, path: str, content: dict) -> dict:
-    request = Request(f"http://127.0.0.1:{http}/{path}", json.dumps(content).encode())
+    data, headers = json.dumps(content).encode(), {"Content-Type": "application/json"}
+    request = Request(f"http://127.0.0.1:{http}/{path}", data, headers)
     with urlopen(request, timeout=10) as reply:
         return json.load(reply)
 

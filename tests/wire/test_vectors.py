@@ -71,6 +71,8 @@ def test_every_key_is_on_the_page_and_has_a_vector() -> None:
             for argument in method.__code__.co_varnames[: method.__code__.co_argcount]
             if argument != "self"
         ]
+        if "question" in names:  # of a robot in its own name: the key of the question, and the name
+            continue
         key = method(keys, *(given[argument] for argument in names))
         if "*" in key:
             continue

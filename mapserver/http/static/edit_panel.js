@@ -46,6 +46,11 @@ export class EditPanel {
     });
     this.show(EDITORS[0].id);
   }
+  // The name of the login, which the server records.
+  sign(name) {
+    permission.name = byId("edit-name").value = name;
+    byId("edit-name").readOnly = true;
+  }
   fields({ id, fields, more }) {
     const set = add(byId("edit-kinds"), "div", "", "fields"), inputs = {};
     set.hidden = true;

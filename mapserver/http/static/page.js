@@ -7,6 +7,7 @@ import { listCorrections } from "./corrections.js";
 import { Drawing } from "./drawing.js";
 import { EditPanel } from "./edit_panel.js";
 import { explain, explainAddress, explanation } from "./explanation.js";
+import { admitted } from "./login.js";
 import { forget, showNode } from "./node_panel.js";
 import { leaveRobot, listRobots, poseOf, showRobot, updateRobot } from "./robot_panel.js";
 import { listen } from "./input.js";
@@ -31,7 +32,7 @@ const moved = () => painter.ask();
 const selection = new Selection(model), drawing = new Drawing(viewport, corners => selection.enclose(corners));
 const planEditor = new PlanEditor(model, viewport, moved);
 const panel = new EditPanel(model, selection, drawing, { moved, planning: openPlan });
-const page = { robots: [], commands: false, node: "", robot: "", photo: [], places: [], readOnly: false };
+const page = { robots: [], commands: false, whyNot: "", node: "", robot: "", photo: [], places: [], readOnly: false };
 // For tests and measurements.
 window.mapweave = { model, viewport, painter, page, selection, drawing, planEditor };
 
@@ -68,7 +69,7 @@ function selectRobot(name, goal = page.node) {
   page.robot = painter.robot = name;
   forget();
   openTab("selected");
-  showRobot(name, page.commands, goal);
+  showRobot(name, page.whyNot, goal);
   updateRobot(page.robots);
   const robot = painter.robots.find(one => one.name === name);
   if (robot) viewport.show(robot.x, robot.y);
@@ -188,12 +189,12 @@ painter.overlays.push(drawAnnotations, (c, v) => {
 });
 
 watch({
-  hello({ commands, read_only }) {
+  hello({ name, commands, read_only, why_not }) {
     page.commands = commands;
+    page.whyNot = why_not;
+    if (name) panel.sign(name);
     page.readOnly = read_only;
-    permit(commands, commands ? "" : read_only ? "This is a map file, which is only shown. Commands such as mapweave map "
-      + "link --map FILE -o OUT write a corrected copy." : "The map is corrected from the server's own machine alone, unless "
-      + "the server is started with --http-commands.");
+    permit(commands, why_not);
     byId("connection").textContent = read_only ? "map file" : "live";
     clearEvents();
   },
@@ -232,7 +233,7 @@ watch({
   if (!up) permit(false, "The map server does not answer: nothing can be changed until it does. What you have typed stays.");
   byId("connection").className = up ? "" : "lost";
   byId("connection").textContent = up ? "live" : "no server, trying again";
-});
+}, admitted);
 async function loadSaid() {
   loadPlans(() => { planEditor.list(); painter.ask(); });
   const places = await loadAnnotations(selectNode);
@@ -270,4 +271,4 @@ for (const [id, factor] of [["closer", 1.4], ["farther", 1 / 1.4]])
   byId(id).addEventListener("click", () => { viewport.zoom(factor); painter.ask(); });
 addEventListener("popstate", () => { if (location.pathname.endsWith("/why")) { openTab("why"); explainAddress(); } });
 new ResizeObserver(() => { painter.resize(); if (!viewport.touched) fit(); }).observe(byId("map"));
-if (location.pathname.endsWith("/why")) { openTab("why"); explainAddress(); }
+if (location.pathname.endsWith("/why")) { openTab("why"); admitted().then(explainAddress); }

@@ -42,12 +42,12 @@ export function listRobots(robots, select) {
   }
 }
 // The frame of the panel is made once, so that a goal can be typed while statuses come.
-export function showRobot(name, commands, goal) {
+export function showRobot(name, whyNot, goal) {
   const box = byId("selected");
   box.textContent = "";
   add(box, "h2", `Robot ${name}`);
   panel = { name, facts: add(box, "div"), portal: null };
-  if (!commands) { add(box, "p", "Robots take missions from the server's own machine alone.", "soft"); return; }
+  if (whyNot) { add(box, "p", whyNot, "soft"); return; }
   const form = add(box, "form", "", "actions"), input = add(form, "input");
   input.id = "goal"; input.value = goal; input.placeholder = "node, x,y, place or home"; input.setAttribute("list", "names");
   input.setAttribute("aria-label", `Where to send ${name}`);
