@@ -32,7 +32,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.flood.fleet import FLEET, HonestRobot, Waits
+from benchmarks.flood.fleet import FLEET, NODES, PATIENCE, HonestRobot, Waits
 from benchmarks.flood.flooder import KINDS, flood
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus_settings import BusSettings
@@ -77,6 +77,21 @@ def resident_mb(process: int) -> float:
     return round(int(kilobytes) / 1024, 1)
 
 
+def merged_nodes(asker: ZenohBus) -> int:
+    """Nodes in the merged map; -1 without an answer."""
+    replies = asker.ask(Keys(FLEET).server_status("s0"), b"", PATIENCE)
+    return int(decode_record(replies[0].payload)["nodes"]) if replies else -1
+
+
+def wait_until_merged(asker: ZenohBus) -> None:
+    """The maps of the honest robots are merged before anything is measured."""
+    end = time.monotonic() + PATIENCE
+    while merged_nodes(asker) < ROBOTS * NODES:
+        if time.monotonic() > end:
+            raise SystemExit("the server has not merged the maps in time")
+        time.sleep(0.1)
+
+
 def end(flooders: list[BaseProcess]) -> None:
     """End the flood."""
     while flooders:
@@ -98,6 +113,7 @@ def measure(seconds: float, rate: float, seed: int, folder: Path) -> dict[str, d
         try:
             if not all(robot.hand_over() for robot in robots):
                 raise SystemExit("the server has not taken the maps in time")
+            wait_until_merged(asker)
             parts: dict[str, dict[str, float]] = {}
             for part in PARTS:
                 progress.update(step, description=part)
@@ -110,9 +126,7 @@ def measure(seconds: float, rate: float, seed: int, folder: Path) -> dict[str, d
                     flooders[-1].start()
                     time.sleep(2.0)
                 waits = work(robots, seconds)
-                replies = asker.ask(Keys(FLEET).server_status("s0"), b"", 60.0)
-                nodes = int(decode_record(replies[0].payload)["nodes"]) if replies else -1
-                parts[part] = figures(waits) | {"rss_mb": resident_mb(server), "nodes": nodes}
+                parts[part] = figures(waits) | {"rss_mb": resident_mb(server), "nodes": merged_nodes(asker)}
                 end(flooders)
                 children.check()
                 progress.advance(step)

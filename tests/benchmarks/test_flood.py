@@ -23,4 +23,4 @@ def test_honest_robots_are_acknowledged_and_answered_in_every_flood(tmp_path: Pa
             part,
             figures,
         )
-    assert parts["changes"]["nodes"] > quiet["nodes"], "what it sends within its quota is taken"
+    assert parts["questions"]["nodes"] > quiet["nodes"], "what it sent within its quota is taken"
