@@ -15,6 +15,25 @@ ASIDE = 0.06
 BEFORE = 0.12
 """m, kept free ahead of it."""
 
+TIGHT = 0.14
+"""Something nearer than this counts as what is in the way, m."""
+
+
+def obstacle_words(description: RobotDescription, proximity: NDArray[Any]) -> str:
+    """What is next to the robot, in words; empty if nothing is near.
+
+    Args:
+        description: footprint and rangers.
+        proximity: (K,) m from the robot's edge.
+    """
+    bearings = description.ranger_bearings
+    if len(proximity) == len(bearings) and len(bearings):
+        nearest = int(np.argmin(proximity))
+        if proximity[nearest] < TIGHT:
+            side = math.degrees(math.remainder(bearings[nearest], math.tau))
+            return f"something is {proximity[nearest]:.2f} m off, at {side:.0f} degrees to the left"
+    return ""
+
 
 def clearance(
     description: RobotDescription, proximity: NDArray[Any], direction: float, unknown: float = math.inf

@@ -41,7 +41,6 @@ from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
-from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 from mapweave.vision.sift import Sift
@@ -169,8 +168,9 @@ class Pipeline:
 
     @property
     def mission(self) -> Mission:
-        """What the robot shall do."""
-        return self._mission
+        """What the robot shall do; of a drive to a goal, from where it is with it."""
+        mission, navigator = self._mission, self._navigator
+        return navigator.taken_up(mission) if isinstance(mission, GoTo) and navigator else mission
 
     @property
     def lost(self) -> bool:
@@ -198,26 +198,20 @@ class Pipeline:
             case Explore() if self._explorer is None and self._explores:
                 self._explorer = self._new_explorer()
             case GoTo(goal, via, passed, portal):
+                fix = None if self._navigator is None else self._navigator.fix
+                near = min(self.map.nodes) if self._located and self.map.nodes else fix and fix.node
                 self._mapper.lose()
                 self._restart()
                 crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)
                 self._navigator = Navigator(
                     self._description, self._lens, self._sift, self.map, goal, self._settings,
-                    self._settings.seed, via[passed:], crossing,
+                    self._settings.seed, via[passed:], crossing, near,
                 )  # fmt: skip
 
     def taken_through(self) -> None:
         """A person says that the robot was taken through the portal at which it waits."""
         if self._navigator is not None:
             self._navigator.crossing.taken_through()
-
-    @property
-    def _progress(self) -> tuple[int, PortalWait | None]:
-        """How many nodes on the way of a goal were passed, and the portal at which the robot waits."""
-        if not isinstance(self._mission, GoTo) or self._navigator is None:
-            return 0, None
-        wait = None if self._navigator.given_up else self._navigator.crossing.wait
-        return self._mission.passed + self._navigator.passed, wait
 
     def step(
         self, observation: Observation, answers: tuple[Answer, ...] = (), driven: Driven | None = None
@@ -304,8 +298,7 @@ class Pipeline:
             self._mapper.lose()
         elif self._lifted and not observation.kidnapped:
             if isinstance(self._mission, GoTo):
-                passed, portal = self._progress
-                self.set_mission(replace(self._mission, passed=passed, portal=portal))
+                self.set_mission(self.mission)
             else:
                 self._put_elsewhere = bool(self.map.nodes) and not isinstance(self._mission, Idle)
                 self._restart()
@@ -473,7 +466,7 @@ class Pipeline:
         if not nodes and isinstance(self._mission, Explore | Carried):
             detail = f"no nodes yet: {detail or self._mapper.track_report}"
         fix = self._navigator.fix if self._navigator is not None else None
-        passed, portal = self._progress
+        drive = mission if isinstance(mission := self.mission, GoTo) else None
         c = (self._mapper.map_from_robot if fix is None else fix.node_from_robot).covariance
         return Status(
             doing=doing,
@@ -492,7 +485,7 @@ class Pipeline:
             progress=progress,
             located=mapping and self._located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
-            passed=passed,
-            portal=portal,
+            passed=0 if drive is None else drive.passed,
+            portal=None if drive is None else drive.portal,
             covariance=(float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), float(c[2, 2])),
         )

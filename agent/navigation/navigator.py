@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator
+from dataclasses import replace
 from enum import StrEnum
 
 import numpy as np
 
+from mapweave.agent.clearance import obstacle_words
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_detector import Expected, NodeDetector
-from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission import Answer, GoTo, Question
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.navigation.answer_trial import AnswerTrial
 from mapweave.agent.navigation.blocked_edges import BlockedEdges
@@ -54,8 +55,6 @@ class Stage(StrEnum):
 
 UNDERWAY = (RouteProgress.DRIVING, RouteProgress.PARKING)
 
-TIGHT = 0.07
-"""Something nearer than this counts as what is in the way, m."""
 ANSWER_PATIENCE = 100
 """Ticks that an answer may take before the question counts as lost."""
 PAUSE = 2.0
@@ -98,8 +97,12 @@ class Navigator:
         seed: int = 0,
         via: tuple[NodeId, ...] = (),
         crossing: PortalCrossing | None = None,
+        near: NodeId | None = None,
     ) -> None:
-        """Start lost, with a goal, and nodes to pass before, in order; or at a portal."""
+        """Start lost, or at a portal, with a goal and nodes to pass before, in order.
+
+        The robot is on the floor of the node `near`, if that is known.
+        """
         self.stage: str = Stage.LOST
         self.detail = ""
         self.fix: Fix | None = None
@@ -120,7 +123,7 @@ class Navigator:
         self._local_planner = LocalPlanner(description, s.navigation)
         self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
         self._routes = RouteSource(self._motion, own_map, description)
-        self._positioning = Positioning(description, lens, sift, own_map, self._motion, s, self._rng)
+        self._positioning = Positioning(description, lens, sift, own_map, self._motion, s, self._rng, near)
         self._trial = AnswerTrial(self._motion, self._positioning.refuted)
         self._detector = NodeDetector(description, lens, sift, self._rng, s)
         self._blocks = BlockedEdges(s.navigation)
@@ -143,6 +146,11 @@ class Navigator:
     def arrived(self) -> bool:
         """Whether the robot is parked at the goal."""
         return self.stage == Stage.ARRIVED
+
+    def taken_up(self, mission: GoTo) -> GoTo:
+        """Its mission, from where it is with it now."""
+        wait = None if self.given_up else self.crossing.wait
+        return replace(mission, passed=mission.passed + self.passed, portal=wait)
 
     @property
     def given_up(self) -> bool:
@@ -433,14 +441,7 @@ class Navigator:
         """The obstacle ahead, in words; empty if nothing is near."""
         if self._touched:
             return f"something was touched: {self._touched}"
-        ranges = self._motion.observation.proximity
-        bearings = self._description.ranger_bearings
-        if len(ranges) == len(bearings) and len(bearings):
-            nearest = int(np.argmin(ranges))
-            if ranges[nearest] < 2.0 * TIGHT:
-                side = math.degrees(math.remainder(bearings[nearest], math.tau))
-                return f"something is {ranges[nearest]:.2f} m off, at {side:.0f} degrees to the left"
-        return ""
+        return obstacle_words(self._description, self._motion.observation.proximity)
 
     def _stuck_at_goal(self, follower: RouteFollower) -> bool:
         """Whether the robot is near the route's last node, with nothing in its way."""

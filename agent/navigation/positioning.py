@@ -16,6 +16,7 @@ from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
@@ -43,6 +44,7 @@ class Positioning:
         motion: MotionPrimitives,
         settings: AgentSettings,
         rng: np.random.Generator,
+        near: NodeId | None,
     ) -> None:
         """Take the means; see mapweave.agent.navigation.navigator.Navigator."""
         self.search: GlobalLocalization | None = None
@@ -52,6 +54,7 @@ class Positioning:
         self._description, self._lens, self._settings = description, lens, settings
         self._own, self._fleet = OwnMap(own_map, rng), FleetMap(motion)
         self.refuted = self._fleet.refuted
+        self._fleet.near = near
         self._localization, self._beyond = (
             GlobalLocalization(description, sift, motion, self._own, policy, self._fleet)
             for policy in (TO_NAVIGATE, BEYOND_PORTAL)

@@ -16,7 +16,7 @@ from mapweave.storage.settings_file import build
 ALL_ROBOTS = "all"
 MISSION_KINDS = {"idle": MissionKind.STOP, "explore": MissionKind.EXPLORE, "carried": MissionKind.CARRIED}
 """By their names in scenarios."""
-GOALS = ("foreign", "own", "photographed")
+GOALS = ("foreign", "own", "photographed", "beyond")
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Send:
     Attributes:
         robot: name; the robot that was lost last if not given.
         goal: the node; `foreign`: another robot's, in another room; `own`: one of its own, in view of which
-            it is not now; `photographed`: the last photograph.
+            it is not now; `photographed`: the last photograph; `beyond`: beyond the lift.
     """
 
     robot: str = ""
@@ -98,6 +98,16 @@ class Photograph:
             raise InvalidValue("photograph: count must be 3 to 100, spacing 0.1 to 2 m")
         check_name(self.name)
         camera_from_table(self.camera, "photograph: camera")
+
+
+@dataclass(frozen=True)
+class Floors:
+    """Each robot's map is labelled as a floor of its own; a lift leads from the first to the second."""
+
+
+@dataclass(frozen=True)
+class TakeThrough:
+    """The robots that ask at a lift are put down at its other side, and a person says so."""
 
 
 @dataclass(frozen=True)
@@ -166,6 +176,8 @@ Action = (
     | Abduct
     | Send
     | Photograph
+    | Floors
+    | TakeThrough
     | KillAgent
     | StartAgent
     | KillServer
@@ -182,6 +194,8 @@ KINDS: dict[str, type[Any]] = {
     "abduct": Abduct,
     "goto": Send,
     "photograph": Photograph,
+    "floors": Floors,
+    "take_through": TakeThrough,
     "kill_agent": KillAgent,
     "start_agent": StartAgent,
     "kill_server": KillServer,

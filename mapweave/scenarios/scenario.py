@@ -49,6 +49,7 @@ CONDITIONS = {
     "explored": "no robot finds anything new to explore",
     "found": "the robot that was lost last knows where it is",
     "arrived": "the robots that were sent report that they have arrived",
+    "asked": "a robot asks to be taken through a lift",
     "grown": "the agent that was started last has made a new node",
 }
 

@@ -19,13 +19,14 @@ from mapweave.scenarios.actions import MISSION_KINDS
 from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, Fleet, Stage
 from mapweave.scenarios.kidnap_events import KidnapEvents
 from mapweave.scenarios.photographing import beside, photograph
+from mapweave.scenarios.portal_events import PortalEvents
 from mapweave.scenarios.recording import Lost, Moment
 from mapweave.scenarios.reports import Reports
 from mapweave.scenarios.scenario import CONDITIONS, LONGEST, ScenarioEvent, When
 from mapweave.sim import events
 from mapweave.storage.map_file import MapFile
 
-CHECK_EVERY = {"joined": 10.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "grown": 1.0}
+CHECK_EVERY = {"joined": 10.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "asked": 1.0, "grown": 1.0}
 """How often a condition is checked, simulated s."""
 STRIDE = 5.0
 """Time is let go on by at most this without showing progress, s."""
@@ -83,6 +84,7 @@ class ScenarioRunner:
         self._cut: set[str] = set()
         self.photographed: dict[NodeId, Pose2] = {}
         self._losing = KidnapEvents(stage, fleet, self._command, self.note)
+        self._portals = PortalEvents(stage, fleet, self.note)
         self._grown: tuple[str, int] = ("", 0)
 
     def run(self) -> None:
@@ -157,6 +159,8 @@ class ScenarioRunner:
             case "arrived":
                 sent = self._losing.sent.values()
                 return bool(sent) and all(one.arrived_ns is not None for one in sent)
+            case "asked":
+                return bool(self._portals.waiting(self.agents))
             case _:
                 robot, nodes = self._grown
                 return robot in self.agents and self.agents[robot].status.nodes > nodes
@@ -180,6 +184,10 @@ class ScenarioRunner:
                     if not self.photographed:
                         raise InvalidValue("goto: goal = 'photographed', and nothing was photographed before")
                     goal = str(next(reversed(self.photographed)))
+                if goal == "beyond":
+                    if self._portals.goal is None:
+                        raise InvalidValue("goto: goal = 'beyond', and there are no floors")
+                    goal = str(self._portals.goal)
                 self._losing.send(robot, goal)
             case actions.Photograph(robot):
                 self.photographed |= photograph(self._stage, fleet, action)
@@ -187,6 +195,11 @@ class ScenarioRunner:
                 self.note(f"{action.count} photographs become map {action.name}")
                 fleet.control.kidnap(robot, beside(first, self._stage.seed))
                 self._losing.mark(robot)
+            case actions.Floors():
+                self._portals.label(self.merged())
+            case actions.TakeThrough():
+                if not self._portals.take_through(self.agents, self.merged()):
+                    self.note("no robot asks to be taken through a lift", True)
             case events.Kidnap(robot):
                 self._happen(event.table)
                 self._losing.mark(robot)
