@@ -199,7 +199,9 @@ class Pipeline:
                 self._explorer = self._new_explorer()
             case GoTo(goal, via, passed, portal):
                 fix = None if self._navigator is None else self._navigator.fix
-                near = min(self.map.nodes) if self._located and self.map.nodes else fix and fix.node
+                near = None if fix is None else fix.node
+                if self._located and self.map.nodes:
+                    near = min(self.map.nodes)
                 self._mapper.lose()
                 self._restart()
                 crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)
