@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed-$(EXTRA)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: setup demo test check docs bench slow scenarios clean
+.PHONY: setup demo test check docs bench slow scenarios sbom audit clean
 
 setup: $(STAMP)
 
@@ -51,6 +51,18 @@ check: setup
 # The pages as a site, in out/site; a broken link is an error.
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
+# What Mapweave is installed with, exactly, as CycloneDX: the same file each time.
+SBOM := out/sbom.json
+sbom: setup
+	@mkdir -p $(dir $(SBOM))
+	@$(BIN)/cyclonedx-py requirements constraints.txt --pyproject pyproject.toml --output-reproducible --no-validate \
+	  --of JSON -o $(SBOM)
+	@echo "written: $(SBOM)"
+
+# Known vulnerabilities of these versions, by the advisories of PyPI. One that cannot be looked up is an error.
+audit: setup
+	$(BIN)/pip-audit --strict --no-deps --disable-pip -r constraints.txt
 
 bench: setup
 	@for b in $$(dirname benchmarks/*/__main__.py); do \

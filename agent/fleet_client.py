@@ -23,6 +23,7 @@ from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import serve_senders
 from mapweave.wire.traffic_meter import TrafficMeter
 
 NO_ANSWER = "no map server answered"
@@ -76,9 +77,9 @@ class FleetClient:
         self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._open_questions = 0
         self._closing = [
-            bus.serve(keys.mission(map_id.agent), self._take_mission),
+            *serve_senders(bus, keys.mission(map_id.agent), self._take_mission),
             bus.serve(keys.drive(map_id.agent), self._take_drive),
-            bus.serve(keys.portal(map_id.agent), self._take_portal),
+            *serve_senders(bus, keys.portal(map_id.agent), self._take_portal),
             bus.serve(keys.agent_status(map_id.agent), self._tell_status),
             bus.watch(keys.server_alive(server), self._see_server),
             bus.announce(keys.agent_alive(map_id)),
@@ -166,16 +167,17 @@ class FleetClient:
         del key
         self._server_alive = alive
 
-    def _take_mission(self, request: Request) -> None:
-        report = self._missions.take(decode(request.payload, MissionOrder))
+    def _take_mission(self, request: Request, who: str) -> None:
+        order = decode(request.payload, MissionOrder)
+        report = self._missions.take(replace(order, by=who or order.by))
         # A mission ends the wait for a person who has fallen silent.
         self._teleoperation.release()
         request.reply(encode(report))
 
-    def _take_portal(self, request: Request) -> None:
+    def _take_portal(self, request: Request, who: str) -> None:
         try:
             done = decode(request.payload, PortalDone)
-            request.reply(encode_record({"said": self._missions.portal_done(done.by)}))
+            request.reply(encode_record({"said": self._missions.portal_done(who or done.by)}))
         except MapweaveError as refused:
             request.refuse(str(refused))
 

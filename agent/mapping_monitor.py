@@ -85,6 +85,9 @@ class MappingMonitor:
             A line for the log when there has been no node for long; else nothing.
         """
         now = observation.stamp_ns
+        if now < self._last_node_ns:
+            # The clock has jumped back.
+            self._last_look_ns = self._last_node_ns = self._reported_ns = 0
         if not self._last_node_ns or status.nodes != self._nodes or status.finished:
             self._nodes, self._last_node_ns, self._reported, self._fault = status.nodes, now, "", ""
         self._remember(observation)

@@ -148,7 +148,7 @@ class MissionControl:
             now: s.
             home: where the robot goes home to, if it has a home yet.
         """
-        if linked or self._linked_at is None:
+        if linked or self._linked_at is None or now < self._linked_at:  # or its clock has jumped back
             self._linked_at = now
         with self._lock:
             report = None if self._current is None else self._reports[self._current]

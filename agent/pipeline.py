@@ -33,7 +33,8 @@ from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
-from mapweave.agent.ranger_monitor import RangerMonitor, not_exploring
+from mapweave.agent.ranger_monitor import not_exploring
+from mapweave.agent.sensor_health.sensor_monitor import Fault, SensorMonitor
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
@@ -54,12 +55,14 @@ class Step:
         changes: to the map, in order.
         questions: for the fleet's map; answers come with a later observation.
         status: for people.
+        fault: the sensor that cannot be believed now, if any.
     """
 
     command: Command
     changes: tuple[ChangeBody, ...]
     questions: tuple[Question, ...]
     status: Status
+    fault: Fault | None = None
 
 
 class Pipeline:
@@ -103,7 +106,8 @@ class Pipeline:
         self._floor = self._new_floor()
         self._changes: list[ChangeBody] = []
         self._driven: Driven | None = None
-        self._rangers = RangerMonitor(description)
+        self._sensors = SensorMonitor(description)
+        self._command: Command | None = None
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
         self._passenger = CarriedMapping(self._mapper)
@@ -225,7 +229,11 @@ class Pipeline:
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
         self._image = observation.image
         observation = self.calibration.correct(observation)
-        self._rangers.see(observation.proximity)
+        observation = self._sensors.see(observation, self._command)
+        if self._sensors.clock_jumped:
+            self._mapper.forget_clock()
+        if self._sensors.pose_lost:
+            self._lose_pose()
         self._take_over(driven)
         self._feel(observation)
         match self._mission:
@@ -241,10 +249,14 @@ class Pipeline:
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers, self._held)
                 self._mapper.drove(self._navigator.traverse, self._navigator.refined)
+        if self._blind and not self._lifted:
+            command = self._sensors.trial
         safe, warning = self._safe(command if driven is None or self._lifted else driven.command, observation)
         self._see_changes()
         changes, self._changes = tuple(self._changes), []
-        return Step(safe, changes, tuple(questions), self._status(warning))
+        own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
+        self._command = safe if own else None
+        return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
 
     @property
     def _explores(self) -> bool:
@@ -259,8 +271,26 @@ class Pipeline:
 
     @property
     def _blind(self) -> str:
-        """Why the rangers forbid an autonomous robot to drive; empty if it may."""
-        return self._rangers.fault if isinstance(self._mission, Explore | GoTo) else ""
+        """Why its sensors forbid an autonomous robot to drive; empty if it may."""
+        fault = self._fault
+        return fault.words if fault is not None and isinstance(self._mission, Explore | GoTo) else ""
+
+    @property
+    def _fault(self) -> Fault | None:
+        """The sensor that cannot be believed. Who is moved by a person needs no rangers."""
+        fault = self._sensors.fault
+        if fault is not None and fault.sensor == "rangers" and not isinstance(self._mission, Explore | GoTo):
+            return None
+        return fault
+
+    def _lose_pose(self) -> None:
+        """The encoders have failed, or are back: what was measured since is void, nodes made before stay."""
+        if isinstance(self._mission, GoTo):
+            self.set_mission(self._mission)
+            return
+        self._resumption = None
+        self._mapper.lose()
+        self._restart()
 
     def _in_the_air(self, observation: Observation) -> bool:
         """Whether the base says that it is lifted. Put down again, the robot is at an unknown place."""
@@ -428,6 +458,8 @@ class Pipeline:
         if self._lifted or self._put_elsewhere:
             doing, detail = "lifted", "the robot begins a new map once it is on the floor"
         mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
+        if self._fault is not None and not self._blind:
+            warning = "; ".join(part for part in (self._fault.words, warning) if part)
         for more in (self._mapper.health if mapping else "", warning):
             detail = "; ".join(part for part in (detail, more) if part)
         nodes = len(self.map.nodes)

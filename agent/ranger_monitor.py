@@ -1,12 +1,22 @@
-"""Whether the proximity sensors that a robot promises are read: without them free room is unknown."""
+"""Whether promised proximity sensors are read, and live: without them free room is unknown."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from mapweave.agent.cautious_driving import ALONG_EDGES, CREEP, SLOW, lacks_rangers
-from mapweave.agent.observation import RobotDescription
-from mapweave.hybridmap.pose import Array
+from mapweave.agent.observation import Odometry, RobotDescription
+from mapweave.hybridmap.pose import Array, Pose2
+
+TOWARD = math.radians(45.0)
+"""A reading within this of the direction of the drive gets shorter or longer on the way,"""
+WAY = 0.2
+"""after this much of it, m, by several steps of any sensor. What is nearer than that, the guard has stopped
+the drive for."""
+TURN = 0.5
+"""After this turn, rad, no reading that hits anything is what it was."""
 
 
 def not_exploring(name: str) -> str:
@@ -41,7 +51,11 @@ class RangerMonitor:
 
     A robot that promises no rangers drives without them, by the choice of who described it. One that
     promises some and sends none, or another number, has a broken sensor or driver: its readings belong to
-    no known bearing, and everywhere counts as free.
+    no known bearing, and everywhere counts as free. Readings that stay the same to the last bit while the
+    robot moves toward or past what they hit are old. Where all are at their maximum that does not show.
+
+    Attributes:
+        frozen: whether the readings are old.
     """
 
     def __init__(self, description: RobotDescription) -> None:
@@ -50,16 +64,35 @@ class RangerMonitor:
         self._tick = description.tick
         self._read = self._promised
         self._missing_ticks = 0
+        self._bearings = np.array(description.ranger_bearings)
+        self._reach = description.ranger_reach
+        self.frozen = False
+        self._last: Array = np.zeros(0)
+        self._moved = Pose2()
 
-    def see(self, proximity: Array) -> None:
+    def see(self, proximity: Array, odometry: Odometry) -> None:
         """Take one tick's readings, m; those that are not finite or negative are none."""
+        self._compare(proximity, odometry)
         good = int((np.isfinite(proximity) & (proximity >= 0.0)).sum())
         self._read = good if len(proximity) == self._promised else len(proximity)
         self._missing_ticks = 0 if good == len(proximity) == self._promised else self._missing_ticks + 1
 
+    def _compare(self, proximity: Array, odometry: Odometry) -> None:
+        self._moved = self._moved @ odometry.motion()
+        if len(proximity) != self._promised or not np.array_equal(proximity, self._last):
+            self._last, self._moved, self.frozen = proximity, Pose2(), False
+            return
+        hits = proximity < self._reach - 1e-6
+        way, turn = math.hypot(self._moved.x, self._moved.y), abs(self._moved.heading)
+        aside = self._bearings - (0.0 if self._moved.x >= 0.0 else math.pi)
+        toward = hits & (np.cos(aside) >= math.cos(TOWARD))
+        self.frozen = self.frozen or bool(hits.any() and turn > TURN) or bool(toward.any() and way > WAY)
+
     @property
     def fault(self) -> str:
-        """What is missing now, in words; empty if every promised sensor was read in this tick."""
+        """What is wrong now, in words; empty if every promised sensor was read in this tick, and lives."""
+        if self.frozen:
+            return "the proximity sensors read the same again and again while the wheels move: frozen"
         if not self._missing_ticks:
             return ""
         sensors = "proximity sensor" if self._promised == 1 else "proximity sensors"

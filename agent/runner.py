@@ -63,6 +63,7 @@ class Runner:
         self._print = print_line
         self._clock = clock
         self._previous: tuple[int, float] | None = None
+        self._faulty = ""
         self._pipeline = pipeline
         self._fleet = fleet
         self._replicator = replicator
@@ -96,6 +97,7 @@ class Runner:
         if step.changes:
             self._replicator.submit(step.changes, observation.stamp_ns)
             self._synchronization.changes_submitted(self._replicator, self._fleet)
+        self._report_fault(step)
         line = self._monitor.see(observation, step.status, step.command)
         if line:
             self._print(line)
@@ -105,6 +107,14 @@ class Runner:
         self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
         self._ticks += 1
         self._on_step(observation, step)
+
+    def _report_fault(self, step: Step) -> None:
+        """One line when a sensor fails, and one when it is back."""
+        faulty = "" if step.fault is None else step.fault.sensor
+        if faulty == self._faulty:
+            return
+        self._faulty, before = faulty, self._faulty
+        self._print(step.fault.words if step.fault is not None else f"believes its {before} again")
 
     @property
     def curious(self) -> bool:

@@ -16,6 +16,7 @@ from mapweave.hybridmap.pose import Pose2
 
 MAX_STATUS_WORDS = 500
 MAX_ROBOTS = 1024
+MAX_ACCUSATION = 1000
 Line = Annotated[str, Meta(max_length=MAX_STATUS_WORDS)]
 
 IDENTITY = Pose2()
@@ -134,6 +135,9 @@ class RobotEntry:
         component: number of that map's component; -1 if it is not known.
         place: the name of the place where it is; empty if it has none.
         floor: the floor of that map's component; empty if it is not known.
+        over_quota: what the server holds back of it, in words; empty if it sends and asks what it may.
+        accusation: what the server holds against the newest of its maps with which something is wrong; empty
+            if there is none.
     """
 
     robot: Name
@@ -144,6 +148,8 @@ class RobotEntry:
     component: Annotated[int, Meta(ge=-1)] = NO_COMPONENT
     place: Annotated[str, Meta(max_length=64)] = ""
     floor: Annotated[str, Meta(max_length=256)] = ""
+    over_quota: Line = ""
+    accusation: Annotated[str, Meta(max_length=MAX_ACCUSATION)] = ""
 
 
 @dataclass(frozen=True)

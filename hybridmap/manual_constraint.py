@@ -203,15 +203,15 @@ def reason_of(constraint: ManualConstraint) -> str:
 
 def event_words(constraint: ManualConstraint) -> str:
     """A manual constraint as an event, in one sentence."""
-    about, who = constraint.about, constraint.who or "a person"
+    about, how = constraint.about, decided(constraint)
     match about:
         case Apart() | Linked() if constraint.holds:
             return f"{about}: {reason_of(constraint)}"
         case Apart():
-            return f"{about}: may be linked again, by {who}"
+            return f"{about}: may be linked again, {how}"
         case Linked():
-            return f"{about}: the link by hand is taken back, by {who}"
-    return reason_of(constraint) if constraint.holds else f"{about} {verb_of(about)} in use again, by {who}"
+            return f"{about}: the link by hand is taken back, {how}"
+    return reason_of(constraint) if constraint.holds else f"{about} {verb_of(about)} in use again, {how}"
 
 
 def verb_of(about: Subject) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from mapweave.hybridmap.constraint_subject import RetiredWindow
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
+from mapweave.mapserver.plausibility import fragments
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.wire_limits import FARTHEST
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -53,7 +54,7 @@ class ActiveNodes:
         )
         retired = merged.constraints.nodes
         self._inactive = frozenset(
-            (*left_out, *retired, *set_apart, *_misplaced(merged), *_out_of_range(merged))
+            (*left_out, *retired, *set_apart, *_misplaced(merged), *_adrift(merged), *_out_of_range(merged))
         )
         windows = (constraint.about for constraint in merged.constraints.in_force)
         self._windows = tuple(about for about in windows if isinstance(about, RetiredWindow))
@@ -77,16 +78,25 @@ class ActiveNodes:
 
 
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
-    """Nodes of maps with wrong geometry that show places of other maps.
+    """Nodes of maps with wrong geometry and of implausible maps that show places of other maps.
 
     Each is at the same place as the node that it is linked to, seen by a robot whose map has it elsewhere: it
     is no second place where a robot could be. Unlinked nodes of such a map are still used.
     """
-    for refusal in merged.refused if merged.wrong else ():
+    wrong = {*merged.wrong, *merged.implausible}
+    for refusal in merged.refused if wrong else ():
         if refusal.link is not None and not refusal.link.within:
-            ends = [node for node in refusal.pair if node.map in merged.wrong]
+            ends = [node for node in refusal.pair if node.map in wrong]
             if len(ends) == 1:
                 yield ends[0]
+
+
+def _adrift(merged: MergedMap) -> Iterator[NodeId]:
+    """Nodes of fragments that nothing joins with a larger map: an answer from there would be of no use."""
+    small = set(fragments(merged.maps))
+    for graph in merged.graphs if small else ():
+        if graph.maps <= small:
+            yield from graph.nodes
 
 
 def _out_of_range(merged: MergedMap) -> Iterator[NodeId]:

@@ -49,6 +49,8 @@ class AdmissionSettings:
         return self.workers or min(os.cpu_count() or 1, 4)
 
 
+SHORTEST_PAUSE = 0.1
+"""Retry time of a robot whose last question is still open, s, at least."""
 LONGEST_PAUSE = 10.0
 """Longest retry time, s."""
 
@@ -82,10 +84,13 @@ class AdmissionControl:
         self._seconds = self._settings.first_guess
         self._appointment = -math.inf
         self._booked: dict[int, float] = {}
+        self._asking: set[str] = set()
         workers = self._settings.threads
         self._pool = executor or ThreadPoolExecutor(workers, thread_name_prefix="admission")
 
-    def submit(self, work: Callable[[], _T], ticket: int | None = None, usual: bool = True) -> Future[_T]:
+    def submit(
+        self, work: Callable[[], _T], ticket: int | None = None, usual: bool = True, asker: str = ""
+    ) -> Future[_T]:
         """Submit a job.
 
         Args:
@@ -93,14 +98,19 @@ class AdmissionControl:
             ticket: the same when the same question comes again, and hardly ever that of another one; without
                 one it never has precedence.
             usual: whether it takes as long as other questions do: else its duration is not recorded.
+            asker: a robot, which asks one question after the other; empty for people.
 
         Returns:
             Its result, or what it raised, some time later; Busy if it has waited too long.
 
         Raises:
-            Busy: it would wait too long; nothing was done.
+            Busy: it would wait too long, or the robot's last question is open; nothing was done.
         """
         with self._lock:
+            if asker and asker in self._asking:
+                # It gets no appointment: those are for robots that wait.
+                self._refused += 1
+                raise Busy(max(self._seconds, SHORTEST_PAUSE))
             s, now, wait = self._settings, self._clock(), self._wait()
             latest = s.too_late * s.in_time
             kept = self._keeps_appointment(ticket, now)
@@ -109,8 +119,10 @@ class AdmissionControl:
                 self._refused += 1
                 raise Busy(self._next_appointment(wait, ticket, kept))
             self._open += 1
+            if asker:
+                self._asking.add(asker)
         by = now + latest if wait > 0.0 else math.inf
-        return self._pool.submit(self._unless_late, work, ticket, by, usual)
+        return self._pool.submit(self._unless_late, work, ticket, by, usual, asker)
 
     def counters(self) -> dict[str, int | float]:
         """Questions answered and refused so far, those open now, and how long one takes, ms."""
@@ -161,22 +173,26 @@ class AdmissionControl:
             self._booked[ticket] = due
         return due - now
 
-    def _unless_late(self, work: Callable[[], _T], ticket: int | None, latest: float, usual: bool) -> _T:
+    def _unless_late(
+        self, work: Callable[[], _T], ticket: int | None, latest: float, usual: bool, asker: str
+    ) -> _T:
         """What a worker does with a question when its turn has come."""
         with self._lock:
             if self._clock() + self._seconds > latest:
                 self._open -= 1
+                self._asking.discard(asker)
                 self._refused += 1
                 raise Busy(self._next_appointment(self._wait(), ticket, True))
-        return self._timed(work, usual)
+        return self._timed(work, usual, asker)
 
-    def _timed(self, work: Callable[[], _T], usual: bool) -> _T:
+    def _timed(self, work: Callable[[], _T], usual: bool, asker: str) -> _T:
         began = self._clock()
         try:
             return work()
         finally:
             with self._lock:
                 self._open -= self._pool is not None
+                self._asking.discard(asker)
                 self._answered += 1
                 if usual:
                     self._seconds += self._settings.smoothing * (self._clock() - began - self._seconds)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
@@ -12,6 +13,7 @@ from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places
@@ -19,10 +21,11 @@ from mapweave.mapserver.portals import check_portal
 from mapweave.mapserver.services import guarded
 from mapweave.merge.floors import floor_of, held_together
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.bus import Bus, Closing
+from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import serve_senders
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +96,7 @@ class Annotator:
         self._check, self._constraints, self._changed = check, constraints, changed
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
-            bus.serve(keys.annotate(name), guarded(self._annotate)),
+            *serve_senders(bus, keys.annotate(name), self._annotate),
             bus.serve(keys.annotations(name), guarded(lambda _: encode(record.annotations))),
             bus.serve(
                 keys.resolve(name),
@@ -110,23 +113,34 @@ class Annotator:
         """Nodes for words, from any thread; see Places.answer."""
         return self._places().answer(request)
 
-    def annotate(self, annotation: Annotation) -> str:
+    def annotate(self, annotation: Annotation, check: bool = False) -> str:
         """Add an annotation to the record, from any thread; returns what it says, in words.
+
+        Args:
+            annotation: the new one.
+            check: only say what it would do; nothing changes.
 
         Raises:
             InvalidValue: it says nothing new, or is about something that is not there.
         """
         with self._turn:
-            annotations = self._record.annotations
-            check_annotation(self._places().merged, annotations, annotation, self._constraints())
+            places, annotations = self._places(), self._record.annotations
+            check_annotation(places.merged, annotations, annotation, self._constraints())
             self._check(annotation)
+            if check:
+                words = "; ".join((annotation.words, *effects_of(annotation, places)))
+                return f"only checked, nothing is changed: {words}"
             self._record.add(annotation)
             self._changed(self._record.annotations)
         log.warning("%s", annotation.words)
         return annotation.words
 
-    def _annotate(self, payload: bytes) -> bytes:
-        return encode_record({"said": self.annotate(decode(payload, Annotation))})
+    def _annotate(self, request: Request, who: str) -> None:
+        def annotate(payload: bytes) -> bytes:
+            annotation = decode(payload, Annotation)
+            return encode_record({"said": self.annotate(replace(annotation, who=who or annotation.who))})
+
+        guarded(annotate)(request)
 
 
 def check_annotation(

@@ -40,6 +40,7 @@ from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import serve_senders
 
 log = logging.getLogger(__name__)
 
@@ -136,7 +137,7 @@ class Explainer:
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
-            bus.serve(keys.constrain(name), self._constrain_later),
+            *serve_senders(bus, keys.constrain(name), self._constrain_later),
             bus.serve(keys.constraints(name), guarded(lambda _: encode(self.constraints()))),
             bus.serve(keys.history(name), guarded(lambda _: encode(History(self.history())))),
         ]
@@ -149,12 +150,16 @@ class Explainer:
     def _explain_later(self, request: Request) -> None:
         self._later(request, lambda: self._explain(request.payload))
 
-    def _constrain_later(self, request: Request) -> None:
+    def _constrain_later(self, request: Request, who: str) -> None:
         """A link is compared with the images and the map, which takes its time."""
-        self._later(
-            request,
-            lambda: encode_record({"said": self.constrain(decode(request.payload, ConstraintRequest))}),
-        )
+
+        def constrain() -> bytes:
+            asked = decode(request.payload, ConstraintRequest)
+            if who:
+                asked = replace(asked, constraint=replace(asked.constraint, who=who))
+            return encode_record({"said": self.constrain(asked)})
+
+        self._later(request, constrain)
 
     def _later(self, request: Request, answer: Callable[[], bytes]) -> None:
         done = self._admission.submit(answer, usual=False)

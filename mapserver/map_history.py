@@ -98,6 +98,11 @@ class MapHistory:
         bad, before_bad = merged.set_apart, self._kept.set_apart
         left_out = [f"map {map_id} is set apart: {bad[map_id]}" for map_id in sorted(bad.keys() - before_bad)]
         taken_in = [f"map {map_id} is no longer set apart" for map_id in sorted(before_bad - bad.keys())]
+        odd = merged.implausible
+        implausible = [
+            f"map {which} is implausible: {odd[which]}"
+            for which in sorted(odd.keys() - self._kept.implausible)
+        ]
         # A link that is taken back, or no longer contradicted, may be reported once more.
         against_hand = merged.contradicted
         said = self._kept.contradicted & against_hand.keys()
@@ -107,7 +112,7 @@ class MapHistory:
         ]
         for words in (*joined, *taken_in):
             log.info("%s", words)
-        for words in (*parted, *held, *left_out, *contradicted):
+        for words in (*parted, *held, *left_out, *implausible, *contradicted):
             log.warning("%s", words)
         frames = {
             (change.pinned, change.holding or change.pinned): change for change in frame_changes(merged)
@@ -128,12 +133,15 @@ class MapHistory:
             *_briefly(MapEventKind.KEPT_APART, held),
             *_briefly(MapEventKind.PARTED, parted),
             *_briefly(MapEventKind.SET_APART, taken_in),
+            *_briefly(MapEventKind.IMPLAUSIBLE, implausible),
             *_briefly(MapEventKind.SET_APART, left_out),
             *_briefly(MapEventKind.CONTRADICTED, contradicted),
         ]
         apart_pairs = frozenset(still | set(new))
         self._links = merged.links
-        after = KeptHistory((), now, apart_pairs, frozenset(bad), frozenset(against_hand), frozenset(frames))
+        after = KeptHistory(
+            (), now, apart_pairs, frozenset(bad), frozenset(against_hand), frozenset(frames), frozenset(odd)
+        )
         if fresh or replace(after, events=self._kept.events) != self._kept:
             self._keep(fresh, after)
 

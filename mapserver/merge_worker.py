@@ -11,7 +11,7 @@ from itertools import islice
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
@@ -21,6 +21,7 @@ from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import Job, Schedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
+from mapweave.wire.fair_queue import FairQueue
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +67,7 @@ class MergeWorker:
         self._dirty = self._reading = self._curious = False
         self._plight = ""
         self._merger.suspect(self._history.set_apart)
+        self._waiting: FairQueue[Change] = FairQueue(0, 0)
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
         schedule.idle(self._idle)
@@ -108,7 +110,13 @@ class MergeWorker:
                 self._merger.places.announce(change.body.node)
             except Exception:  # it is tried once more when its turn comes
                 log.exception("change %s of %s cannot be found yet", change.sequence, change.map)
-        self._post(lambda: self._take(change))
+        with self._counting:
+            self._waiting.put(change.map.agent, change, bounded=False)
+        self._post(self._take_next)
+
+    def unmerged(self, robot: str) -> int:
+        """Changes of a robot that wait to be taken in: robots take turns."""
+        return self._waiting.waiting(robot)
 
     def read(self, changes: Iterable[Change]) -> None:
         """Take in all that is in a store, map by map in the order of its log, once this has started.
@@ -128,6 +136,10 @@ class MergeWorker:
             self._schedule.post(lambda: self._end_reading(taken))
         self._schedule.catch_up()
         taken.wait()
+
+    def note_refusal(self, map_id: MapId, reason: str) -> None:
+        """Note that a change of a map was refused. Returns at once."""
+        self._post(lambda: self._merger.note_refusal(map_id, reason))
 
     def constrain(self, constraints: ManualConstraints) -> None:
         """Apply exactly these manual constraints from now on. Returns at once."""
@@ -205,6 +217,11 @@ class MergeWorker:
         if self._merger.uncompared:
             self._publish_parts()
         taken.set()
+
+    def _take_next(self) -> None:
+        with self._counting:
+            _, change = self._waiting.pop()
+        self._take(change)
 
     def _take(self, change: Change) -> None:
         if isinstance(change.body, NodePut):

@@ -107,9 +107,9 @@ class PlanService:
             raise InvalidValue("the image was damaged on its way: send it again")
         return PlanReceived(piece.size, self.images.put(bytes(data)))
 
-    def put(self, data: bytes) -> PlanImage:
-        """Keep an image of any kind as a PNG file; raises InvalidValue if it is none."""
-        return self.images.put(plan_file(data).png)
+    def put(self, data: bytes, negate: bool = False) -> PlanImage:
+        """Keep an image of any kind as a PNG file, also as a negative; raises InvalidValue if it is none."""
+        return self.images.put(plan_file(data, negate=negate).png)
 
     def check(self, annotation: Annotation) -> None:
         """Refuse a plan without its image (InvalidValue)."""

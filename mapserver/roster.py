@@ -6,15 +6,18 @@ import threading
 from collections.abc import Callable
 
 from mapweave.hybridmap.agent_status import (
+    MAX_ACCUSATION,
     MAX_ROBOTS,
     NO_COMPONENT,
     AgentStatus,
     FleetStatus,
     RobotEntry,
+    one_line,
 )
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.places import Places
+from mapweave.mapserver.quotas import Quotas
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
@@ -25,7 +28,12 @@ class Roster:
     """Listens until closed. Thread-safe."""
 
     def __init__(
-        self, bus: Bus, keys: Keys, clock: Callable[[], float], hear: Callable[[AgentStatus], None]
+        self,
+        bus: Bus,
+        keys: Keys,
+        clock: Callable[[], float],
+        hear: Callable[[AgentStatus], None],
+        quotas: Quotas,
     ) -> None:
         """Begin to listen.
 
@@ -34,7 +42,9 @@ class Roster:
             keys: of the fleet.
             clock: only grows, s.
             hear: called with each status.
+            quotas: of robots.
         """
+        self._quotas = quotas
         self._keys, self._clock, self._hear = keys, clock, hear
         self._turn = threading.Lock()
         self._alive: dict[str, set[MapId]] = {}
@@ -64,17 +74,24 @@ class Roster:
         merged = places.merged
         now = self._clock()
         with self._turn:
-            names = sorted({name for name, maps in self._alive.items() if maps} | self._heard.keys())
+            known = {name for name, maps in self._alive.items() if maps} | self._heard.keys()
             heard, alive = dict(self._heard), {name for name, maps in self._alive.items() if maps}
+        over = self._quotas.over()
+        against: dict[str, str] = {}
+        for map_id, words in sorted(merged.accusations().items()):
+            against[map_id.agent] = words[:MAX_ACCUSATION]
         entries = []
-        for name in names[:MAX_ROBOTS]:
+        for name in sorted(known | over.keys())[:MAX_ROBOTS]:
             status, at = heard.get(name, (None, now))
             pose, component = (None, NO_COMPONENT) if status is None else whereabouts(status, merged)
             place, floor = "", ""
             if pose is not None:
                 place, floor = places.name_at(component, pose), places.floor_of(component)
             age = max(now - at, 0.0)
-            entries.append(RobotEntry(name, name in alive, age, status, pose, component, place, floor))
+            words, accusation = one_line(over.get(name, "")), against.get(name, "")
+            entries.append(
+                RobotEntry(name, name in alive, age, status, pose, component, place, floor, words, accusation)
+            )
         return FleetStatus(tuple(entries))
 
     def _take(self, sample: Sample) -> None:

@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.node import EdgeId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -167,11 +168,19 @@ class Router:
                 apart = self.merged.set_apart.get(node.map)
                 why = f": {reason_of(retired)}" if retired is not None else ""
                 why = why or (f": map {node.map} is set apart, {apart}" if apart is not None else "")
-                return f"{name} {node} is not in the merged map{why}"
+                return f"{name} {node} is not in the merged map{why or self._nearest(node)}"
         parts = self.merged.component_of(start), self.merged.component_of(goal)
         if parts[0] != parts[1] and not (portals := self.portals).lead(start, goal):
             return portals.apart(start, goal)
         return self.closed_goal(goal)
+
+    def _nearest(self, node: NodeId) -> str:
+        """Which maps or nodes there are instead of one that is not there."""
+        try:
+            self.merged.check(node)
+        except InvalidValue as error:
+            return f": {error}"
+        return ""
 
     def closed_goal(self, goal: NodeId) -> str:
         """Why a goal is closed, in words; empty if it is not."""

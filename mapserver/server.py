@@ -39,6 +39,7 @@ from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.plan_service import PlanService
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
+from mapweave.mapserver.quotas import Quotas, QuotaSettings
 from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
@@ -59,10 +60,12 @@ class ServerSettings:
     Attributes:
         admission_control: how questions that take long are shared out.
         merge: how maps are merged.
+        quotas: what it takes of one robot.
     """
 
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
+    quotas: QuotaSettings = field(default_factory=QuotaSettings)
 
 
 STATUS_EVERY = 0.5
@@ -127,6 +130,7 @@ class MapServer:
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
         )
         self._blockages = Blockages()
+        self._quotas = Quotas(s.quotas, clock.monotonic)
 
     def __enter__(self) -> MapServer:
         """Begin to serve."""
@@ -136,18 +140,20 @@ class MapServer:
         self._ingest = Ingest(
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
+            self._quotas, lambda: self._constraints.constraints.retired, worker.unmerged, worker.note_refusal,
         )  # fmt: skip
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,
             lambda: self._annotations.annotations, self._path, base.images,
         )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
-        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear)
+        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear, self._quotas)
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
             self._events, self._missions, self._roster,
             clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places, self._plans.files,
+            self._quotas,
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
@@ -204,6 +210,7 @@ class MapServer:
         traffic = self._store.traffic()
         return {
             **merged.counts(),
+            "over_quota": ", ".join(self._quotas.over())[:1000],
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
             "event": self._ingest.failure or self._worker.event,
             "settled": self._worker.settled,
@@ -242,13 +249,13 @@ class MapServer:
         """What people say about the map."""
         return self._annotations.annotations
 
-    def annotate(self, annotation: Annotation) -> str:
-        """Add an annotation to the record, from any thread; returns what it says, in words.
+    def annotate(self, annotation: Annotation, check: bool = False) -> str:
+        """Add an annotation to the record, or only check it, from any thread; says what it does in words.
 
         Raises:
             InvalidValue: it says nothing new, or is about something that is not there.
         """
-        return self._annotator.annotate(annotation)
+        return self._annotator.annotate(annotation, check)
 
     def plans(self) -> PlacedPlans:
         """Floor plans under the newest merged map, from any thread."""
@@ -263,13 +270,25 @@ class MapServer:
         """
         return self._plans.image(name)
 
-    def put_plan_image(self, data: bytes) -> PlanImage:
+    def kept_image(self, sha256: str) -> bytes:
+        """The PNG file of an image that was put here, whether a plan names it or not yet; from any thread.
+
+        Raises:
+            InvalidFile: it is not there, or damaged.
+        """
+        return self._plans.images.get(sha256)
+
+    def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
         """Keep the image of a floor plan, from any thread; an annotation names it afterwards.
+
+        Args:
+            data: an image file.
+            negate: exchange light and dark, as a map.yaml says.
 
         Raises:
             InvalidValue: it is no image, or too large.
         """
-        return self._plans.put(data)
+        return self._plans.put(data, negate)
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words, from any thread.

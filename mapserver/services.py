@@ -6,8 +6,9 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
+from functools import partial
 
-from mapweave.hybridmap.errors import Busy, MapweaveError
+from mapweave.hybridmap.errors import Busy, InvalidMessage, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
 from mapweave.hybridmap.node import MapId
@@ -26,15 +27,17 @@ from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.packed_map import PackedMap
 from mapweave.mapserver.places import Places
+from mapweave.mapserver.quotas import Quotas
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.route_rules import rule_words
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.merge.floors import maps_elsewhere
 from mapweave.wire.bus import Bus, Closing, Request
-from mapweave.wire.keys import Keys
+from mapweave.wire.keys import Keys, robot_of
 from mapweave.wire.log_messages import Scalar, encode_record
 from mapweave.wire.messages import decode, decode_view, encode
+from mapweave.wire.senders import sent_by_any, serve_senders
 
 log = logging.getLogger(__name__)
 
@@ -61,6 +64,7 @@ class Services:
         executor: Executor,
         places: Callable[[], Places],
         images: Callable[[], Mapping[str, bytes]],
+        quotas: Quotas,
     ) -> None:
         """Begin to answer.
 
@@ -80,8 +84,10 @@ class Services:
             executor: packs the whole map; it is shut down with this.
             places: named places of the newest merged map. May wait for it.
             images: of the plans, for the map's file.
+            quotas: of robots.
         """
         self._places = places
+        self._quotas = quotas
         self._clock = clock
         self._answers = answers
         self._admission = admission
@@ -95,13 +101,20 @@ class Services:
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
             lambda: places().annotations, images,
         )  # fmt: skip
+        of_robots: dict[str, Callable[[Request], None]] = {
+            keys.relocalize(name): self._relocalize_later,
+            keys.route(name): guarded(self._route),
+            keys.known(name): guarded(self._known),
+            keys.reserve(name): self._reserve_in_name,
+        }
         self._closing: list[Closing] = [
-            bus.serve(keys.relocalize(name), self._relocalize_later),
-            bus.serve(keys.route(name), guarded(self._route)),
-            bus.serve(keys.known(name), guarded(self._known)),
+            *(bus.serve(question, answer) for question, answer in of_robots.items()),
+            *(
+                bus.serve(sent_by_any(question), self._limited(answer))
+                for question, answer in of_robots.items()
+            ),
             bus.serve(keys.server_map(name), self._map.ask),
-            bus.serve(keys.reserve(name), guarded(self._reserve)),
-            bus.serve(keys.server_mission(name), self._command_later),
+            *serve_senders(bus, keys.server_mission(name), self._command_later),
             bus.serve(keys.missions(name), guarded(lambda _: encode(missions.missions()))),
             bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(places())))),
             bus.serve(keys.server_status(name), guarded(self._tell_status)),
@@ -119,13 +132,26 @@ class Services:
         """The merged map as a map file, from any thread."""
         return self._map.packed()
 
-    def _command_later(self, request: Request) -> None:
+    def _command_later(self, request: Request, who: str) -> None:
+        def command(payload: bytes) -> bytes:
+            mission = decode(payload, MissionRequest)
+            return encode(self._missions.command(replace(mission, by=who or mission.by)))
+
         # It waits for a robot, which nothing else of the server may do.
-        command = guarded(lambda payload: encode(self._missions.command(decode(payload, MissionRequest))))
-        self._relays.submit(command, request)
+        self._relays.submit(guarded(command), request)
+
+    def _limited(self, answer: Callable[[Request], None]) -> Callable[[Request], None]:
+        """Answer a robot that asks no more than its quota."""
+
+        def handle(request: Request) -> None:
+            self._quotas.ask(robot_of(request.key))
+            answer(request)
+
+        return handle
 
     def _relocalize_later(self, request: Request) -> None:
-        done = self._admission.submit(lambda: self._relocalize(request.payload), hash(request.payload))
+        work, robot = partial(self._relocalize, request.payload), robot_of(request.key)
+        done = self._admission.submit(work, hash(request.payload), asker=robot)
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _relocalize(self, payload: bytes) -> bytes:
@@ -152,8 +178,13 @@ class Services:
 
         return encode(drivable(route, request.blocked))
 
-    def _reserve(self, payload: bytes) -> bytes:
+    def _reserve_in_name(self, request: Request) -> None:
+        guarded(lambda payload: self._reserve(payload, robot_of(request.key)))(request)
+
+    def _reserve(self, payload: bytes, robot: str) -> bytes:
         request = decode(payload, ReserveRequest)
+        if robot not in ("", request.robot):
+            raise InvalidMessage(f"{robot} reserves nothing for {request.robot}")
         router, closed = self._answers().router, None
         if rules := router.rules:
             within = rules.around(request.start, request.start_from_robot)

@@ -26,7 +26,7 @@ GROUPS = {
         "map retire", "map undo", "map merge",
         "map fetch", "map export", "map extract", "map import", "map from-photos", "relocalize",
     ),
-    "Keys": ("keys init", "keys add", "keys list", "keys revoke", "keys bundle"),
+    "Keys": ("keys init", "keys add", "keys token", "keys list", "keys revoke", "keys bundle"),
     "Recordings": ("info", "replay", "eval replay", "eval relocalize", "eval merge"),
 }  # fmt: skip
 """Commands by what a person wants; the rest comes last."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,10 +10,13 @@ from mapweave.hybridmap.errors import NotConnected
 
 if TYPE_CHECKING:
     from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.credentials import Credentials
     from mapweave.wire.zenoh_bus import ZenohBus
 
 SOON = 1.0
 """s; a router that is there is found sooner. Commands say within 2 s of their start that there is none."""
+LOOK = 0.2
+"""s; without a router a person learns why in this time more."""
 ANSWERED = 2.0
 """s; a server or robot that is there answers sooner."""
 
@@ -33,12 +37,42 @@ def reach(settings: BusSettings, advice: str = "give --connect") -> ZenohBus:
     if not bus.wait_connected(SOON):
         bus.close()
         where = ", ".join(settings.endpoints)
+        if any(map(_listens, settings.endpoints)):
+            reason = "what listens there does not let this in"
+            advice = _key_hint(settings.credentials) or "; if the fleet has keys, give --keys FILE"
+            raise NotConnected(f"no router at {where}: {reason}{advice}")
         raise NotConnected(f"no router at {where}: start `mapweave server`, or {advice}")
     return bus
 
 
-def no_server(fleet: str) -> NotConnected:
-    """The error that no map server answers."""
+def _listens(endpoint: str) -> bool:
+    """Whether a program takes connections there."""
+    host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), LOOK):
+            return True
+    except (OSError, ValueError):
+        return False
+
+
+def no_server(fleet: str, holder: Credentials | None = None) -> NotConnected:
+    """The error that no map server answers.
+
+    Args:
+        fleet: its name.
+        holder: of the key with which one is connected, if there is one.
+    """
     return NotConnected(
         f"a router is up, but no map server of fleet {fleet} answers: start `mapweave server` or give --fleet"
+        f"{_key_hint(holder)}"
+    )
+
+
+def _key_hint(holder: Credentials | None) -> str:
+    """A router drops what a key may not do, without a word."""
+    if holder is None:
+        return ""
+    return (
+        f"; or the key of {holder.name} was revoked, has expired or may not do this: `mapweave keys list` at "
+        "the server and the server's log say so"
     )

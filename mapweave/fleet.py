@@ -38,10 +38,11 @@ from mapweave.hybridmap.portal import PortalDone
 from mapweave.identities.key_file import read_key_file
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.credentials import Role
+from mapweave.wire.credentials import Credentials
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
 
 TRIES = 3
@@ -62,13 +63,22 @@ def connect(
     return Fleet(endpoint, fleet, by, keys)
 
 
-def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0) -> MissionReport:
+def send_order(
+    bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0, sender: str = ""
+) -> MissionReport:
     """Give a robot an order directly; returns what has become of it.
+
+    Args:
+        bus: the connection.
+        keys: of the fleet.
+        order: the mission.
+        timeout: longest wait, s.
+        sender: holder of the key with which the bus is connected; empty without one.
 
     Raises:
         NotConnected: the robot does not answer, or does not take it.
     """
-    replies = bus.ask(keys.mission(order.robot), encode(order), timeout)
+    replies = bus.ask(sent_by(keys.mission(order.robot), sender), encode(order), timeout)
     if not replies:
         raise NotConnected(
             f"robot {order.robot} does not answer: is its agent running? `mapweave status` lists the robots"
@@ -78,14 +88,14 @@ def send_order(bus: Bus, keys: Keys, order: MissionOrder, timeout: float = 10.0)
     return decode(replies[0].payload, MissionReport)
 
 
-def send_portal_done(bus: Bus, keys: Keys, done: PortalDone, timeout: float = 10.0) -> str:
+def send_portal_done(bus: Bus, keys: Keys, done: PortalDone, timeout: float = 10.0, sender: str = "") -> str:
     """Tell a robot directly that it was taken through a portal; returns what it does, in words.
 
     Raises:
         NotConnected: it does not answer.
         InvalidValue: it does not wait at a portal.
     """
-    replies = bus.ask(keys.portal(done.robot), encode(done), timeout)
+    replies = bus.ask(sent_by(keys.portal(done.robot), sender), encode(done), timeout)
     if not replies:
         raise NotConnected(
             f"robot {done.robot} does not answer: is its agent running? `mapweave status` lists the robots"
@@ -101,6 +111,23 @@ def login() -> str:
         return getpass.getuser()
     except (OSError, KeyError):  # no user of that number
         return "a person"
+
+
+def author(holder: Credentials | None, by: str) -> str:
+    """Who commands and corrects, for records.
+
+    Args:
+        holder: of the key with which one is connected, if there is one: the server records this name.
+        by: the name that the person gives; empty: the login name.
+
+    Raises:
+        InvalidValue: it is not the holder's.
+    """
+    if holder is None:
+        return by or login()
+    if by not in ("", holder.name):
+        raise InvalidValue(f"with this key you are {holder.name}, not {by}: leave the name out")
+    return holder.name
 
 
 class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
@@ -123,7 +150,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         Args:
             connect: Zenoh endpoint of the router, or several, of which the first in reach is taken.
             fleet: its name.
-            by: gives the missions; the login name by default.
+            by: gives the missions; the login name by default, with a key the name of its holder.
             keys: key file of an operator or viewer, where the router asks for one.
             bus: a connection to use instead; it stays the caller's.
 
@@ -131,14 +158,12 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             NotConnected: there is no router.
         """
         checked = Keys(check_name(fleet))
-        self._by = (by or login())[:64]
+        self._key_holder = read_key_file(Path(keys)).credentials if keys else None
+        self._by = author(self._key_holder, by)[:64]
         self._own: ZenohBus | None = None
-        self._role: Role | None = None
         if bus is None:
-            credentials = read_key_file(Path(keys)).credentials if keys else None
-            self._role = None if credentials is None else credentials.role
             endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-            bus = self._own = reach(BusSettings(endpoints=endpoints, credentials=credentials))
+            bus = self._own = reach(BusSettings(endpoints=endpoints, credentials=self._key_holder))
         super().__init__(bus, checked)
 
     def __enter__(self) -> Fleet:
@@ -170,7 +195,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             status = decode(reply.payload, AgentStatus)
             robots.append(RobotEntry(status.robot, True, 0.0, status))
         if not robots:
-            raise no_server(self._keys.fleet)
+            raise no_server(self._keys.fleet, self._key_holder)
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
@@ -236,7 +261,8 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             InvalidValue: it does not wait at a portal.
         """
         self._check_role()
-        return send_portal_done(self._bus, self._keys, PortalDone(check_name(robot), self._by))
+        done = PortalDone(check_name(robot), self._by)
+        return send_portal_done(self._bus, self._keys, done, sender=self._sender)
 
     def wait(
         self,
@@ -286,7 +312,8 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         for _ in range(TRIES):
             stamp_ns = max(time.time_ns(), after_ns + 1)
             request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via)
-            replies = self._bus.ask(self._keys.any_mission(), encode(request), 2.0 * ANSWERED)
+            key = sent_by(self._keys.any_mission(), self._sender)
+            replies = self._bus.ask(key, encode(request), 2.0 * ANSWERED)
             taken = [reply for reply in replies if not reply.error]
             if not taken and replies:
                 raise InvalidValue(replies[0].error.removeprefix("refused: "))
@@ -301,18 +328,13 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         assert report is not None, "it was tried"
         return self.wait(report, wait) if wait > 0.0 else report
 
-    def _check_role(self) -> None:
-        """The router drops what a role may not send; without a word, so that is said here."""
-        if self._role in (Role.VIEWER, Role.ROBOT):
-            raise InvalidValue(f"this is the key of a {self._role}: missions need an operator's")
-
     def _direct(
         self, robot: str, kind: MissionKind, node: NodeId | None, goal: str, via: tuple[NodeId, ...] = ()
     ) -> MissionReport:
         after_ns = 0
         for _ in range(TRIES):
             order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal, via=via)
-            report = send_order(self._bus, self._keys, order, ANSWERED)
+            report = send_order(self._bus, self._keys, order, ANSWERED, self._sender)
             if report.state is not MissionState.REPLACED:
                 break
             after_ns = self._newest(robot)

@@ -12,6 +12,7 @@ from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import sent_by
 
 ANSWER = 10.0
 """A server that merges answers questions about its map late, s."""
@@ -61,8 +62,9 @@ class FleetAnnotations(FleetQuestions):
         return decode(self._question(self._keys.any_resolve(), encode(request), ANSWER), ResolveAnswer)
 
     def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
+        self._check_role()
         annotation = annotation_of_words(
             name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
         )
-        said = decode_record(self._question(self._keys.any_annotate(), encode(annotation), ANSWER))["said"]
-        return str(said)
+        key = sent_by(self._keys.any_annotate(), self._sender)
+        return str(decode_record(self._question(key, encode(annotation), ANSWER))["said"])

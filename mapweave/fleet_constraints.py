@@ -23,6 +23,7 @@ from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import sent_by
 
 CHECKING = 20.0
 """How long a server may take to check a manual constraint against a large map, s."""
@@ -113,7 +114,8 @@ class FleetConstraints(FleetQuestions):
 
     def constrain(self, about: Subject, holds: bool, because: str = "", *, check: bool = False) -> str:
         """Set a manual constraint of any kind, or take it back; see `link`."""
+        self._check_role()
         constraint = ManualConstraint(about, holds, self._by, time.time_ns(), because)
         request = encode(ConstraintRequest(constraint, check))
-        answer = self._question(self._keys.any_constrain(), request, CHECKING)
+        answer = self._question(sent_by(self._keys.any_constrain(), self._sender), request, CHECKING)
         return str(decode_record(answer)["said"])

@@ -38,6 +38,7 @@ class FleetPlans(FleetQuestions):
             InvalidValue: it is no PNG file, or too large.
             NotConnected: no map server answers.
         """
+        self._check_role()
         sha256, key = hashlib.sha256(png).hexdigest(), self._keys.any_put_plan_image()
         for offset in range(0, len(png), PIECE):
             piece = PlanPiece(sha256, len(png), offset, png[offset : offset + PIECE])

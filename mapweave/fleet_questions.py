@@ -5,6 +5,7 @@ from __future__ import annotations
 from mapweave.connection import no_server
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.wire.bus import Bus, Reply
+from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.keys import Keys
 from mapweave.wire.patience import ask_patiently
 
@@ -15,6 +16,7 @@ class FleetQuestions:
     _bus: Bus
     _keys: Keys
     _by: str
+    _key_holder: Credentials | None
 
     def _question(self, key: str, payload: bytes, timeout: float) -> bytes:
         """The answer of a map server; one that is busy is asked again at its time.
@@ -28,9 +30,24 @@ class FleetQuestions:
             if not reply.error:
                 return reply.payload
         if not replies:
-            raise no_server(self._keys.fleet)
+            raise no_server(self._keys.fleet, self._key_holder)
         reason = replies[0].error.removeprefix("refused: ")
         raise NotConnected(f"the map server is {reason}") if replies[0].retry_after else InvalidValue(reason)
+
+    @property
+    def _sender(self) -> str:
+        """The name under which commands are sent; empty without a key."""
+        return "" if self._key_holder is None else self._key_holder.name
+
+    def _check_role(self) -> None:
+        """The router drops what a role may not send, without a word, so that is said here.
+
+        Raises:
+            InvalidValue: missions and corrections are not of this role.
+        """
+        role = None if self._key_holder is None else self._key_holder.role
+        if role in (Role.VIEWER, Role.ROBOT):
+            raise InvalidValue(f"this is the key of a {role}: missions and corrections need an operator's")
 
     def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
         """Answers of all who answer and do not refuse."""

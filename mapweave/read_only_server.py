@@ -115,7 +115,7 @@ class ReadOnlyServer:
         """What people say about the map."""
         return self._annotations
 
-    def annotate(self, annotation: Annotation) -> str:
+    def annotate(self, annotation: Annotation, check: bool = False) -> str:
         """Refuse an annotation.
 
         Raises:
@@ -138,7 +138,17 @@ class ReadOnlyServer:
             raise InvalidValue(f"the image of plan {name} is not in {self._opened.path.name}")
         return self._opened.content.images[image.sha256]
 
-    def put_plan_image(self, data: bytes) -> PlanImage:
+    def kept_image(self, sha256: str) -> bytes:
+        """The PNG file of an image of the map file.
+
+        Raises:
+            InvalidValue: it is not in the file.
+        """
+        if sha256 not in self._opened.content.images:
+            raise InvalidValue(f"the image {sha256[:12]} is not in {self._opened.path.name}")
+        return self._opened.content.images[sha256]
+
+    def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
         """Refuse an image.
 
         Raises:

@@ -9,6 +9,7 @@ from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
+from mapweave.mapserver.quotas import QuotaSettings
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.settings_file import build, read_toml
 
@@ -39,6 +40,7 @@ class Settings:
         robot: driver, camera and geometry of an agent's robot.
         agent: of a robot's program.
         admission_control: how a map server shares out the questions that take long.
+        quotas: what a map server takes of one robot at most.
         merge: how maps are merged.
     """
 
@@ -46,6 +48,7 @@ class Settings:
     robot: RobotSettings = field(default_factory=RobotSettings)
     agent: AgentSettings = field(default_factory=AgentSettings)
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
+    quotas: QuotaSettings = field(default_factory=QuotaSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
 
 

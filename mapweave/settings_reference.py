@@ -17,7 +17,7 @@ from mapweave.settings import Settings
 
 ROLES = (
     ("a robot: `mapweave agent`, `replay`", "`[network]`, `[robot]`, `[agent]`"),
-    ("the server: `mapweave server`", "`[network]`, `[admission_control]`, `[merge]`"),
+    ("the server: `mapweave server`", "`[network]`, `[admission_control]`, `[merge]`, `[quotas]`"),
     ("people who ask a server: `mapweave relocalize`, `map`", "`[network]`"),
     ("people with map files: `mapweave map`", "`[merge]`"),
     ("simulation and recordings: `mapweave sim`, `evaluate`", "`[agent]`, `[merge]`"),

@@ -5,6 +5,7 @@ Rich takes a file for a terminal of 80 columns, wraps lines there, and reads `[w
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
@@ -14,6 +15,7 @@ from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
 PLAIN_WIDTH = 10_000
 """Characters of a line that is not on a terminal: none is wrapped."""
@@ -29,6 +31,11 @@ def plain_or_terminal(stderr: bool = True, quiet: bool = False) -> Console:
     """A console that wraps nothing where there is no terminal."""
     stream = sys.stderr if stderr else sys.stdout
     return Console(file=stream, quiet=quiet, width=None if stream.isatty() else PLAIN_WIDTH)
+
+
+def log_with_time() -> None:
+    """Let warnings of any part be lines of the log, with the time like all others."""
+    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
 
 
 def stamped(line: str) -> str:
@@ -74,11 +81,14 @@ class Bar:
         self._task = TaskID(0)
         self._detail = ""
         if console.is_terminal:
+            # Of a line that is too long the detail is cut, not the numbers.
+            whole, rest = Column(no_wrap=True), Column(no_wrap=True, overflow="ellipsis", ratio=1)
             columns = (
-                TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(),
-                TimeElapsedColumn(), TextColumn("{task.fields[detail]}", markup=False),
+                TextColumn("{task.description}", table_column=whole), BarColumn(20, table_column=whole),
+                MofNCompleteColumn(table_column=whole), TimeElapsedColumn(table_column=whole),
+                TextColumn("{task.fields[detail]}", markup=False, table_column=rest),
             )  # fmt: skip
-            self._bar = Progress(*columns, console=console, transient=transient)
+            self._bar = Progress(*columns, console=console, transient=transient, expand=True)
             self._task = self._bar.add_task(words, total=total, detail="")
 
     def __enter__(self) -> Bar:

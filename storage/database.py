@@ -10,6 +10,9 @@ from pathlib import Path
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_reader import reading
 
+BUSY = 1.0
+"""How long to wait for a file that another process is about to close, s."""
+
 
 class Database:
     """One SQLite file in WAL mode, each commit on the disk before it returns (synchronous=FULL).
@@ -56,7 +59,7 @@ class Database:
             else:
                 # Threads take turns: a shared Database is used under the caller's lock.
                 self.connection = sqlite3.connect(
-                    path, timeout=5.0, isolation_level=None, check_same_thread=False
+                    path, timeout=BUSY, isolation_level=None, check_same_thread=False
                 )
         self._closing.callback(self.connection.close)
         # Text with a flipped bit may be no UTF-8; its meaning is checked by the reader.
@@ -88,7 +91,9 @@ class Database:
             yield
         except sqlite3.Error as error:
             if "locked" in str(error):
-                raise InvalidFile(f"{self.path}: {self.what} is in use by another process") from None
+                raise InvalidFile(
+                    f"{self.path}: {self.what} is in use by another process; stop it first"
+                ) from None
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF
             if code == sqlite3.SQLITE_CORRUPT:
                 raise self._damaged(str(error)) from None

@@ -39,7 +39,10 @@ def reading(path: Path, what: str = "file") -> Iterator[sqlite3.Connection]:
                 uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
             else:
                 if _in_use(path):
-                    raise InvalidFile(f"{path}: {what} is in use by another process")
+                    raise InvalidFile(
+                        f"{path}: {what} is in use by another process; stop it, or ask the running server, "
+                        "`mapweave map fetch FILE` for example"
+                    )
                 copy = Path(folder) / "copy"
                 shutil.copyfile(path, copy)
                 shutil.copyfile(log, copy.with_name("copy-wal"))

@@ -44,7 +44,24 @@ def read_nav2_map(path: Path) -> Nav2Map:
     Raises:
         InvalidFile: it cannot be read, or a field is missing or wrong; one line says which.
     """
-    fields = _fields(path)
+    try:
+        data = read_whole(path)
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+    return parse_nav2_map(data, path)
+
+
+def parse_nav2_map(data: bytes, path: Path) -> Nav2Map:
+    """The content of a map.yaml.
+
+    Args:
+        data: the file.
+        path: of the file; the image is beside it.
+
+    Raises:
+        InvalidFile: it is no YAML, or a field is missing or wrong; one line says which.
+    """
+    fields = _fields(path, data)
     image = fields.get("image")
     if not isinstance(image, str) or not image.strip():
         raise InvalidFile(f"{path}: has no `image:`, the name of the image file")
@@ -67,15 +84,11 @@ def read_nav2_map(path: Path) -> Nav2Map:
     return Nav2Map(place, resolution, Pose2(*map(float, origin)), bool(negate), occupied, free)
 
 
-def _fields(path: Path) -> dict[str, Any]:
+def _fields(path: Path, data: bytes) -> dict[str, Any]:
     # It is imported here: recordings bring it, and most programs read none.
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
-    try:
-        data = read_whole(path)
-    except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
     if len(data) > MAX_BYTES:
         raise InvalidFile(f"{path}: is no map.yaml: it has {len(data)} bytes")
     try:

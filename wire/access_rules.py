@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from mapweave.wire.credentials import Access, Role
 from mapweave.wire.keys import Keys
+from mapweave.wire.senders import sent_by
 
 ASKS = (
     "relocalize", "route", "known", "reserve", "mission", "missions", "robots", "map", "explain", "constrain",
@@ -20,9 +21,21 @@ ASKS = (
 """Every question to a server, by the last part of its key."""
 COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})
 """Those that change something."""
+SIGNED = frozenset({"constrain", "annotate", "mission"})
+"""Those whose sender is recorded: people ask them under keys that end with their name alone."""
 WATCHES = ("liveliness_query", "declare_liveliness_subscriber")
-OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve", "status"})
-"""Those of robots."""
+OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve"})
+"""Those of robots, each in its own name."""
+
+
+def may_ask(role: Role) -> frozenset[str]:
+    """The questions to a server that a role may ask, over any transport."""
+    match role:
+        case Role.ROBOT:
+            return OF_ROBOTS | {"status"}
+        case Role.VIEWER:
+            return frozenset(ASKS) - COMMANDS
+    return frozenset(ASKS)
 
 
 def access_control(keys: Keys, access: Access, certified: bool) -> dict[str, object]:
@@ -62,13 +75,17 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
         return _writes([f"{keys.root}/**"]) + _reads([f"{keys.root}/**"]) + _asks([f"{keys.root}/**"])
     if role is Role.ROBOT:
         return _robot(keys, name)
-    asks = [what for what in ASKS if role is Role.OPERATOR or what not in COMMANDS]
-    questions = [f"{keys.root}/server/*/{what}" for what in asks]
+    questions = [
+        sent_by(f"{keys.root}/server/*/{what}", name if what in SIGNED else "")
+        for what in ASKS
+        if what in may_ask(role)
+    ]
     questions += [keys.agent_statuses(), f"{keys.root}/server/*/ack/*"]
     if role is Role.OPERATOR:
-        questions += [f"{keys.root}/agent/*/{what}" for what in ("mission", "drive", "portal")]
+        questions += [sent_by(f"{keys.root}/agent/*/{what}", name) for what in ("mission", "portal")]
+        questions.append(f"{keys.root}/agent/*/drive")
     reads = [
-        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), f"{keys.root}/server/*/alive",
+        keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), keys.servers_alive(),
         f"{keys.root}/server/*/poses/*",
     ]  # fmt: skip
     return [*_reads(reads), *_asks(questions)]
@@ -76,14 +93,15 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
 
 def _robot(keys: Keys, name: str) -> list[_Rule]:
     agent, base = f"{keys.root}/agent/{name}", f"{keys.root}/robot/{name}"
+    questions = [sent_by(f"{keys.root}/server/*/{what}", name) for what in sorted(OF_ROBOTS)]
     addressed = [f"{keys.root}/server/*/{what}/{name}" for what in ("ack", "poses")]
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
-                  f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/drive",
-                  f"{agent}/portal",
+                  f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/mission/*",
+                  f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive",
                   f"{base}/describe", f"{base}/step"]),
-        *_reads([*addressed, f"{keys.root}/server/*/alive", f"{base}/driver/*", f"{agent}/alive/*"]),
-        *_asks([*addressed, *(f"{keys.root}/server/*/{what}" for what in sorted(OF_ROBOTS)),
+        *_reads([*addressed, keys.servers_alive(), f"{base}/driver/*", f"{agent}/alive/*"]),
+        *_asks([*addressed, *questions, f"{keys.root}/server/*/status",
                 f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),
     ]  # fmt: skip
 

@@ -3,23 +3,27 @@
 Transports must never wait for a handler: Zenoh stalls a whole session when a callback falls behind. So a
 callback only puts a task into this queue. The queue is bounded, and nothing is dropped silently: a message
 that finds it full is counted and logged (replication repairs it), a question is refused so that its asker
-knows, and liveliness news always find room, because they are not repeated.
+knows, and liveliness news always find room, because they are not repeated. Robots take turns (`FairQueue`):
+one that floods a server waits for itself.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections import deque
 from collections.abc import Callable
 
 from mapweave.hybridmap.errors import Busy, MapweaveError
 from mapweave.wire.bus import Request, Sample
+from mapweave.wire.fair_queue import FairQueue
+from mapweave.wire.keys import robot_of
 
 log = logging.getLogger(__name__)
 
 DEFAULT_LIMIT = 16384
 """Tasks that may wait: half a minute of a hundred robots at five messages a second."""
+MOST_BYTES = 2**26
+"""Of messages and questions that may wait: as many changes of 4 kB."""
 FULL_PAUSE = 1.0
 """After what time a question that found the queue full may be asked again, s."""
 
@@ -41,8 +45,7 @@ class Dispatcher:
         """
         self.lost = 0
         self.refused = 0
-        self._limit = limit
-        self._tasks: deque[Callable[[], None]] = deque()
+        self._tasks: FairQueue[Callable[[], None]] = FairQueue(limit, MOST_BYTES)
         self._changed = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -55,7 +58,7 @@ class Dispatcher:
             if wanted():
                 _guarded(lambda: handler(sample), sample.key)
 
-        if not self._put(task, bounded=True):
+        if not self._put(task, sample.key, len(sample.payload)):
             self.lost += 1
             # Each power of two: a flood must not become a flood of log lines.
             if self.lost & (self.lost - 1) == 0:
@@ -80,7 +83,7 @@ class Dispatcher:
                 log.exception("a handler of %s failed", request.key)
                 request.refuse(f"internal error: {type(error).__name__}")
 
-        if not self._put(task, bounded=True):
+        if not self._put(task, request.key, len(request.payload)):
             self.refused += 1
             if self.refused & (self.refused - 1) == 0:
                 log.warning("slow handlers: %d questions refused so far", self.refused)
@@ -96,7 +99,7 @@ class Dispatcher:
             if wanted():
                 _guarded(lambda: handler(key, alive), key)
 
-        self._put(task, bounded=False)
+        self._put(task, key, bounded=False)
 
     def close(self) -> None:
         """Finish the running handler, forget what waits. Twice is no error.
@@ -110,13 +113,12 @@ class Dispatcher:
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
-    def _put(self, task: Callable[[], None], *, bounded: bool) -> bool:
+    def _put(self, task: Callable[[], None], key: str, size: int = 0, *, bounded: bool = True) -> bool:
         with self._changed:
             if self._closed:
                 return True
-            if bounded and len(self._tasks) >= self._limit:
+            if not self._tasks.put(robot_of(key), task, size, bounded=bounded):
                 return False
-            self._tasks.append(task)
             self._changed.notify()
             return True
 
@@ -127,7 +129,7 @@ class Dispatcher:
                     self._changed.wait()
                 if self._closed:
                     return
-                task = self._tasks.popleft()
+                _, task = self._tasks.pop()
             task()
 
 

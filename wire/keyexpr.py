@@ -44,6 +44,18 @@ def intersects(a: str, b: str) -> bool:
     return _meet(tuple(a.split("/")), tuple(b.split("/")))
 
 
+def answered(asked: str, served: str) -> str:
+    """The key under which a service answers: one that the question's pattern and its own both match.
+
+    A question for `server/*/constrain/anna` at the service `server/s0/constrain/*` is answered under
+    `server/s0/constrain/anna`. Where both leave a chunk open it is a pattern.
+    """
+    if is_key(asked) or "**" in asked or "**" in served:
+        return asked if is_key(asked) else served
+    pairs = zip(asked.split("/"), served.split("/"), strict=True)
+    return "/".join(there if here == "*" else here for here, there in pairs)
+
+
 def _meet(a: tuple[str, ...], b: tuple[str, ...]) -> bool:
     if not a:
         return all(chunk == "**" for chunk in b)

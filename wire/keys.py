@@ -15,7 +15,10 @@
                                                       plans, plan_image and put_plan_image
     mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
+    mapweave/1/<fleet>/server/<server>/relocalize/<agent>  the same of a robot; also route, known, reserve
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
+    mapweave/1/<fleet>/server/<server>/constrain/<who>  the same of a person with a key; also annotate and
+                                                      missions, see mapweave.wire.senders
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot base; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of the driver of that base
 
@@ -27,7 +30,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import MapId, check_name
+from mapweave.hybridmap.node import NAME, MapId, check_name
 
 VERSION = "1"
 MAX_EPOCH = 2**53
@@ -291,6 +294,12 @@ class Keys:
         """Under which a server is alive."""
         return self._of_server("alive", server)
 
+    def servers_alive(self) -> str:
+        """Likewise of every server."""
+        return f"{self.root}/server/*/alive"
+
+    # A robot asks in its own name, which access rules check: its questions count for its own quota.
+
     # Keys of a robot base.
 
     def robot_describe(self, robot: str) -> str:
@@ -370,6 +379,15 @@ class Keys:
         if len(given) != len(wanted) or any(w not in ("*", g) for w, g in zip(wanted, given, strict=True)):
             raise InvalidMessage(f"key {key[:256]!r} is not of the form {self.root}/{form}")
         return [g for w, g in zip(wanted, given, strict=True) if w == "*"]
+
+
+def robot_of(key: str) -> str:
+    """In whose name a message or a question comes: a robot's, or a person's with a key; else empty."""
+    match key.split("/")[3:]:
+        case ["agent" | "robot", name, *_] | ["server", _, _, name] if NAME.fullmatch(name):
+            return name
+        case _:
+            return ""
 
 
 def _name(chunk: str, key: str) -> str:

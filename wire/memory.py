@@ -13,7 +13,7 @@ import numpy as np
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire.bus import Closing, Reply, Request, Sample
 from mapweave.wire.dispatch import Dispatcher
-from mapweave.wire.keyexpr import check_key, check_pattern, intersects, is_key
+from mapweave.wire.keyexpr import answered, check_key, check_pattern, intersects
 from mapweave.wire.memory_entities import (
     Collector,
     Declared,
@@ -136,7 +136,7 @@ class MemoryHub:
             for bus in self._buses:
                 for service in list(bus._services):
                     if not bus._cut and intersects(service.key, key):
-                        asked = key if is_key(key) else service.key
+                        asked = answered(key, service.key)
                         service.deliver(bus._opened(asked, payload, asker, collector))
 
 

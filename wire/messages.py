@@ -58,6 +58,7 @@ class KeptHistory:
         contradicted: links by hand that are reported as contradicted.
         frames: pins that are reported as not holding their component's frame, with the node of the older pin
             that does; a pin whose node is not in the merged map with its own.
+        implausible: maps that are reported as implausible.
     """
 
     events: tuple[MapEvent, ...] = ()
@@ -66,6 +67,7 @@ class KeptHistory:
     set_apart: frozenset[MapId] = frozenset()
     contradicted: frozenset[tuple[NodeId, NodeId]] = frozenset()
     frames: frozenset[tuple[NodeId, NodeId]] = frozenset()
+    implausible: frozenset[MapId] = frozenset()
 
 
 VIEW = Limit("view", MAX_LANDMARKS_BYTES + 256)

@@ -13,7 +13,7 @@ import zenoh
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.dispatch import Dispatcher
-from mapweave.wire.keyexpr import is_key
+from mapweave.wire.keyexpr import answered
 from mapweave.wire.refusal import decode_refusal, encode_refusal
 
 log = logging.getLogger(__name__)
@@ -129,9 +129,8 @@ class Service(Declared):
         return session.declare_queryable(self.key, self._receive)
 
     def _receive(self, query: zenoh.Query) -> None:
-        asked = str(query.key_expr)
-        # A reply goes out on one key that the question's pattern matches: that of the service.
-        key = asked if is_key(asked) else self.key
+        # A reply goes out on one key that the question's pattern matches.
+        key = answered(str(query.key_expr), self.key)
         self._owner.dispatcher.question(self._handler, ZenohRequest(self._owner, key, query), self.wanted)
 
 

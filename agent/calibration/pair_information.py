@@ -8,7 +8,7 @@ Marchionni and Oriolo (Simultaneous calibration of odometry and sensor parameter
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -32,6 +32,26 @@ ITERATIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
+class FloorMatches:
+    """Points that may lie on the floor, in both images of a pair.
+
+    Attributes:
+        before: (K, 2) normalised coordinates in the first image.
+        after: (K, 2) the same in the second.
+        sigmas: (K,) standard deviations of them along the line on which they can lie.
+    """
+
+    before: Array
+    after: Array
+    sigmas: Array
+
+    @classmethod
+    def none(cls) -> FloorMatches:
+        """No points."""
+        return cls(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
 class ImagePair:
     """Points that were followed from one image to another.
 
@@ -40,12 +60,31 @@ class ImagePair:
         last_s: stamp of the second, s.
         before: (N, 2) normalised coordinates of the ideal image in the first image: (pixel - c) / f.
         after: (N, 2) the same in the second.
+        floor: points besides that tell the floor and nothing else.
     """
 
     first_s: float
     last_s: float
     before: Array
     after: Array
+    floor: FloorMatches = field(default_factory=FloorMatches.none)
+
+
+@dataclass(frozen=True, eq=False)
+class FloorRatios:
+    """How far points below the horizon are, by the depth of the floor there.
+
+    Attributes:
+        logs: (K,) logarithms of depth over the floor's, negated. Most of what is seen there is floor, so the
+            mode is the logarithm of true over assumed way.
+        sigmas: (K,) their standard deviations by the matches.
+        flatness: (K,) by how much they change with the slope of the floor, 1/rad: cotangents of the angles
+            below the horizon.
+    """
+
+    logs: Array
+    sigmas: Array
+    flatness: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +98,7 @@ class PairInformation:
         tracks: how many agree with each other.
         inverse_depths: median and standard deviation, 1/m.
         scatter: standard deviation of what is left across the lines of unknown depth, by its median.
-        floor_ratios: (K,) see `floor_ratios`, at the motion `at`.
-        floor_sigmas: (K,) theirs.
+        floor: at the motion `at`.
     """
 
     at: CameraMotions
@@ -69,8 +107,7 @@ class PairInformation:
     tracks: int
     inverse_depths: tuple[float, float]
     scatter: float
-    floor_ratios: Array
-    floor_sigmas: Array
+    floor: FloorRatios
 
 
 def reduce_pair(
@@ -95,8 +132,8 @@ def reduce_pair(
     prior = np.linalg.inv(noise)
     at = predicted[None]
     mean, spread = depth
-    field = _field(pair.before)
-    columns = 6 + field.shape[1]
+    shapes = _field(pair.before)
+    columns = 6 + shapes.shape[1]
     for iteration in range(ITERATIONS):
         step_to_at = at.since(predicted[None])[0]
         turned = x @ at.rotation[0].T
@@ -108,7 +145,7 @@ def reduce_pair(
         slope = _projected(at.translation[0], seen, z)
         residual = pair.after - seen - slope * (mean - rho)[:, None]
         jacobian = np.concatenate(
-            [_jacobian(seen, z, rho, slope, mean), slope[:, :, None] * field[:, None]], axis=2
+            [_jacobian(seen, z, rho, slope, mean), slope[:, :, None] * shapes[:, None]], axis=2
         )
         # (sigma^2 I + spread^2 g g')^-1 by Sherman and Morrison.
         gain = 1.0 / ((sigma / spread) ** 2 + (slope**2).sum(1))
@@ -128,29 +165,40 @@ def reduce_pair(
     typical = (float(np.median(depths)), float(depths.std())) if agreeing.sum() > 5 else depth
     across = np.abs(residual[:, 0] * slope[:, 1] - residual[:, 1] * slope[:, 0])
     scatter = 1.4826 * float(np.median(across / np.maximum(np.linalg.norm(slope, axis=1), 1e-12)))
-    ratios, sigmas = floor_ratios(pair, at[0], floor_sigma)
-    return PairInformation(at[0], matrix, vector, int(agreeing.sum()), typical, scatter, ratios, sigmas)
+    floor = floor_ratios(pair, at[0], floor_sigma)
+    return PairInformation(at[0], matrix, vector, int(agreeing.sum()), typical, scatter, floor)
 
 
-def floor_ratios(pair: ImagePair, at: CameraMotions, sigma: float) -> tuple[Array, Array]:
-    """(K,) logarithms of depths below the horizon over those of the floor, negated, and their (K,) sigmas.
+def with_floor(information: PairInformation, pair: ImagePair, floor_sigma: float) -> PairInformation:
+    """What a reduced pair says with the points of its floor."""
+    return replace(information, floor=floor_ratios(pair, information.at, floor_sigma))
 
-    Most of what is seen there is floor, so the mode is the logarithm of true over assumed way.
+
+def floor_ratios(pair: ImagePair, at: CameraMotions, track_sigma: float) -> FloorRatios:
+    """Depths of tracks and matches below the horizon.
+
+    Args:
+        pair: the points.
+        at: one motion.
+        track_sigma: standard deviation of a track.
     """
-    x = np.column_stack([pair.before, np.ones(len(pair.before))])
+    before = np.concatenate([pair.before, pair.floor.before])
+    after = np.concatenate([pair.after, pair.floor.after])
+    sigma = np.concatenate([np.full(len(pair.before), track_sigma), pair.floor.sigmas])
+    x = np.column_stack([before, np.ones(len(before))])
     turned = x @ at.rotation.T
     # What is typical in this scene must not draw the floor to it.
-    inverse_depth = _inverse_depths(turned, at.translation, pair.after, sigma, (0.0, NO_PRIOR))
+    inverse_depth = _inverse_depths(turned, at.translation, after, track_sigma, (0.0, NO_PRIOR))
     floor_depth = x @ at.floor
-    steep = floor_depth > FLOOR_STEEPNESS * np.linalg.norm(at.floor)
+    steepness = floor_depth / np.linalg.norm(at.floor)
+    steep = steepness > FLOOR_STEEPNESS
     floor_depth = np.where(steep, floor_depth, 1.0)
     y = turned + floor_depth[:, None] * at.translation
     z = np.maximum(y[:, 2], 0.05)
     parallax = np.linalg.norm(_projected(at.translation, y[:, :2] / z[:, None], z), axis=1) * floor_depth
     precise = steep & (sigma < LEAST_FLOOR_SHARE * parallax)
-    return np.log(np.clip(inverse_depth[precise] / floor_depth[precise], 0.05, 20.0)), sigma / parallax[
-        precise
-    ]
+    logs = np.log(np.clip(inverse_depth[precise] / floor_depth[precise], 0.05, 20.0))
+    return FloorRatios(logs, sigma[precise] / parallax[precise], 1.0 / steepness[precise])
 
 
 def _projected(direction: Array, seen: Array, z: Array) -> Array:

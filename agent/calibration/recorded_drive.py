@@ -9,7 +9,8 @@ import numpy as np
 
 from mapweave.agent.calibration.camera_motions import WheelTrack, predict
 from mapweave.agent.calibration.correction import geometry_of
-from mapweave.agent.calibration.estimator import Estimate, Estimator
+from mapweave.agent.calibration.estimate import Estimate
+from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.image_pairs import ImagePairs, sigma_of
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.observation import Observation, RobotDescription

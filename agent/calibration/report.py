@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapweave.agent.calibration.estimator import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate
 from mapweave.agent.calibration.parameter_sigmas import useful
 from mapweave.agent.drive_geometry import Parameter
 from mapweave.hybridmap.pose import Array

@@ -94,6 +94,8 @@ class Capture:
 
     def _open(self) -> cv2.VideoCapture:
         settings, source = self._settings, self._settings.source
+        # OpenCV writes lines of its own about devices that are no cameras, beside the error here.
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         number = re.fullmatch(r"(?:/dev/video)?(\d+)", source)
         self._is_device = number is not None
         self._is_file = number is None and "://" not in source

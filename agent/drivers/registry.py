@@ -91,7 +91,7 @@ def find_driver(name: str) -> Driver:
     known = drivers()
     if name not in known:
         close = difflib.get_close_matches(name, known, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
+        hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}."
         raise SettingsError(f"no driver {name!r}; {hint} Your own is FILE.py:CLASS")
     return _driver(_imported(known[name]), name)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.global_localization.refuted_places import RefutedPlaces
 from mapweave.agent.global_localization.view_agreement import ViewAgreement
 from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.agent.mission import WhereAmI
@@ -108,11 +109,13 @@ class FleetMap:
     """The fleet's merged map as a source: a server, which knows whether another room looks the same.
 
     Attributes:
+        refuted: its places that the robot's own view did not bear out.
         near: the robot knows that it is on the floor of this node; None if it does not.
     """
 
     def __init__(self, motion: MotionPrimitives) -> None:
         """Take the motion primitives, which ask and stand still until the answer comes."""
+        self.refuted = RefutedPlaces(motion)
         self.near: NodeId | None = None
         self._motion = motion
         self._silent_until = 0.0
@@ -135,6 +138,8 @@ class FleetMap:
         place = self._agreement.take(content, motion.odom_from_robot, motion.way, motion.turned)
         if place is None:
             return Candidates((), ambiguous, content.reason)
+        if self.refuted.holds(place.node):
+            return Candidates((), ambiguous, f"again node {place.node}, of which nothing was in view")
         reason = content.reason
         if content.certainty is Certainty.UNKNOWN:
             reason = f"{place.inliers} landmarks of {place.node} agree, and so does an earlier view"

@@ -75,12 +75,18 @@ class NodeDetector:
         self._settings = settings
         self._rng = rng
 
-    def find(self, image: NDArray[np.uint8], wanted: Iterable[Expected]) -> tuple[int, NodeLocalizer] | None:
+    def find(
+        self,
+        image: NDArray[np.uint8],
+        wanted: Iterable[Expected],
+        settings: RecognitionSettings = EXPECTED,
+    ) -> tuple[int, NodeLocalizer] | None:
         """Search for nodes, in their order.
 
         Args:
             image: (H, W) grey.
             wanted: nodes that may be in view.
+            settings: what a recognition takes.
 
         Returns:
             Leg of the first that is found, and what follows its landmarks from this image on; or None.
@@ -88,13 +94,13 @@ class NodeDetector:
         features = self._sift.extract(image)
         view = features.view(self._description.camera)
         for candidate in wanted:
-            recognition = recognise(candidate.node, view, EXPECTED, self._rng)
+            recognition = recognise(candidate.node, view, settings, self._rng)
             if recognition is None or not self._plausible(recognition.node_from_robot.mean, candidate):
                 continue
             if recognition.inliers > MORE * candidate.tracked:
                 node, node_from_robot = (
                     candidate.node,
-                    refine_pose(candidate.node, view, recognition, EXPECTED.pose),
+                    refine_pose(candidate.node, view, recognition, settings.pose),
                 )
                 if node.landmarks.scale_share:
                     levelled = level(node, view, recognition)

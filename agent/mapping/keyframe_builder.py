@@ -97,7 +97,13 @@ class KeyframeBuilder:
 
     def recalibrate(self, description: RobotDescription) -> None:
         """Make nodes with another camera from now on; those made before keep theirs."""
-        self._description, self._camera = description, description.camera
+        clock = self._description.clock
+        self._description, self._camera = replace(description, clock=clock), description.camera
+
+    def forget_clock(self) -> None:
+        """The clock has jumped: times of nodes made from now on are not to be compared with other robots'."""
+        if self._description.clock:
+            self._description = replace(self._description, clock="")
 
     def take_changes(self) -> tuple[ChangeBody, ...]:
         """What was changed in the map since the last call, in order: it is to leave the robot."""

@@ -191,6 +191,10 @@ class Mapper:
         """Know the robot's geometry better from the next node on."""
         self._pending = description, lens
 
+    def forget_clock(self) -> None:
+        """The clock has jumped: see KeyframeBuilder."""
+        self._cartographer.forget_clock()
+
     def meet(self, request: EpisodeRequest, observation: Observation) -> None:
         """Do what a behaviour asks for, with the observation of the last step."""
         match request:

@@ -12,8 +12,10 @@ from mapweave.agent.clearance import obstacle_words
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.mission import Answer, GoTo, Question
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
+from mapweave.agent.navigation.answer_trial import AnswerTrial
 from mapweave.agent.navigation.blocked_edges import BlockedEdges
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
@@ -29,6 +31,7 @@ from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
+from mapweave.registration.recognition import RecognitionSettings
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
@@ -115,13 +118,14 @@ class Navigator:
         self._description = description
         self._lens = lens
         self._sift = sift
-        self._own_map = own_map
         self._settings = s = settings or AgentSettings()
         self._rng = np.random.default_rng(seed)
         self._local_planner = LocalPlanner(description, s.navigation)
         self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
         self._routes = RouteSource(self._motion, own_map, description)
         self._positioning = Positioning(description, lens, sift, own_map, self._motion, s, self._rng, near)
+        self._trial = AnswerTrial(self._motion, self._positioning.refuted)
+        self._detector = NodeDetector(description, lens, sift, self._rng, s)
         self._blocks = BlockedEdges(s.navigation)
         self._traverse_recorder = TraverseRecorder(description)
         self._refinement = LandmarkRefinement(own_map)
@@ -172,6 +176,8 @@ class Navigator:
             self._progressed_at += self._description.tick
         elif not self.arrived and self._motion.now - self._progressed_at > self._settings.navigation.patience:
             self._give_up(f"no nearer in {self._settings.navigation.patience:g} s: {self._trouble}")
+        elif not self.arrived and self._trial.ended:
+            self._give_up(self._trial.ended)
         command = Command() if standing else next(self._behaviour)
         fix = None if self._positioning.search or self.crossing.wait else self.fix
         if fix is not None:
@@ -249,6 +255,7 @@ class Navigator:
     def _start_from(self, fix: Fix | None) -> None:
         """Go on from where the robot was found, if it was."""
         self.detail, self.fix = self._positioning.detail, fix
+        self._trial.found(self._positioning.place)
         if fix is not None:
             self.tally = self.tally.found()
 
@@ -281,7 +288,8 @@ class Navigator:
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
         """Follow a route until it is driven, or blocked, or the robot is lost."""
-        follower = self._follower(route, fix)
+        follower = self._follower(route, self._compared(route, fix))
+        self._trial.took(route)
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
         self._following, self._touched = True, ""
         while True:
@@ -297,10 +305,12 @@ class Navigator:
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._failed_views = 0
+                self._trial.saw(follower.fix.node)
             if self._via and self._portal is None and follower.to_goal <= THERE:
                 del self._via[0]
                 self.passed += 1
                 self._following = False
+                self._trial = AnswerTrial(self._motion, self._positioning.refuted)
                 return
             if self._touched:
                 follower.progress = RouteProgress.BLOCKED
@@ -315,6 +325,7 @@ class Navigator:
                 # Nothing keeps it from its goal but its own precision: that blocks no other robot.
                 self.detail, self._parking_retried = "parking did not end: trying once more", True
             case RouteProgress.BLOCKED:
+                self._trial.blocked()
                 yield from self._report_block(*follower.blocked)
                 if self._parking_retried:
                     # Twice: localize again, so that parking begins from another heading.
@@ -325,6 +336,7 @@ class Navigator:
                     )
             case RouteProgress.UNSURE if (
                 self._goal_hidden
+                and self._trial.node is None
                 and not (self._via and self._portal is None)
                 and follower.fix.blind < self._settings.navigation.blind_distance
             ):
@@ -332,13 +344,31 @@ class Navigator:
                 self._reach()
             case RouteProgress.UNSURE:
                 # By landmarks seen a moment ago it is at the goal, yet it sees none of the goal's landmarks.
-                self._goal_hidden = follower.fix.blind < self._settings.navigation.blind_distance
+                blind, allowed = follower.fix.blind, self._settings.navigation.blind_distance
+                self._goal_hidden = blind < allowed
+                if self._trial.node is not None or not (self._trial.borne_out or self._goal_hidden):
+                    self._trial.refute(blind)
                 yield from self._relocalize()
+
+    def _compared(self, route: tuple[RouteLeg, ...], fix: Fix) -> Fix:
+        """The fix, or the robot's own if it sees the node by which the fleet has localized it.
+
+        The robot still stands where it asked. What it recognises itself comes before any answer.
+        """
+        node = next((leg.node for leg in route if leg.node.id == fix.node), None)
+        image = self._motion.observation.image
+        if self._trial.node is None or node is None or image is None:
+            return fix
+        # More is asked than of an expected node: any pose will do.
+        anywhere = Expected(0, node, fix.node_from_robot.mean, math.inf)
+        seen = self._detector.find(image, [anywhere], RecognitionSettings())
+        return fix if seen is None else Fix.of(seen[1])
 
     def _reach(self) -> None:
         """The robot is where the route ends: at the goal, or at a portal on the way there."""
         self.tally = self.tally.passed([0.0])
         if self._portal is not None:
+            self._trial = AnswerTrial(self._motion, self._positioning.refuted)
             self.stage = Stage.PORTAL
             self.crossing.begin(self._portal)
 

@@ -30,6 +30,8 @@ class Positioning:
 
     Attributes:
         search: the search that goes on; None without one.
+        place: that the last search has found; None if it found none.
+        refuted: places of the fleet's map that the robot's own view did not bear out.
         detail: of the last search, in words.
     """
 
@@ -46,11 +48,13 @@ class Positioning:
     ) -> None:
         """Take the means; see mapweave.agent.navigation.navigator.Navigator."""
         self.search: GlobalLocalization | None = None
+        self.place: Candidate | None = None
         self._found_by = ""
         self._motion = motion
         self._description, self._lens, self._settings = description, lens, settings
         self._own, self._fleet = OwnMap(own_map, rng), FleetMap(motion)
         self._fleet.near = near
+        self.refuted = self._fleet.refuted
         self._localization, self._beyond = (
             GlobalLocalization(description, sift, motion, self._own, policy, self._fleet)
             for policy in (TO_NAVIGATE, BEYOND_PORTAL)
@@ -97,7 +101,7 @@ class Positioning:
 
     def _fix(self, place: Candidate | None) -> Fix | None:
         """The fix at the place that was found, if one was."""
-        self._found_by, self.search = self.detail, None
+        self._found_by, self.search, self.place = self.detail, None, place
         if place is None:
             return None
         if (recognized := place.recognized) is None:

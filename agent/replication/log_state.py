@@ -71,6 +71,9 @@ class LogState:
                 news.append(f"{server} refuses {self.map} {refusal.sequence}: {refusal.reason}")
             if refusal.sequence == 0:
                 self.failure = f"{server}: {refusal.reason}"
+        if self.failure.startswith(f"{server}: ") and all(refusal.sequence for refusal in ack.refusals):
+            # It takes the log again, for example since it has room for it.
+            self.failure = ""
         if ack.watermark > self.newest and not self.failure:
             # This disk was put back to an older state. New changes would take numbers that the server has
             # seen, and it would drop them as doubles.

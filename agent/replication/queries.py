@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
 from mapweave.hybridmap.errors import InvalidMessage
@@ -19,6 +20,7 @@ from mapweave.hybridmap.query import (
 )
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode, encode_view
+from mapweave.wire.senders import sent_by
 
 FARTHEST = 100.0
 """m; no robot sees a node, or drives from one node to the next, from further away. Nodes of recordings from
@@ -37,15 +39,16 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
         InvalidValue: no message can hold it.
     """
     if isinstance(question, WhereAmI):
-        return keys.any_relocalize(), encode_view(replace(question.view, near=question.near))
+        view = replace(question.view, near=question.near)
+        return sent_by(keys.any_relocalize(), robot), encode_view(view)
     if isinstance(question, WhatIsKnown):
         around = KnownRequest(question.map, question.x, question.y, question.reach)
-        return keys.any_known(), encode(around)
+        return sent_by(keys.any_known(), robot), encode(around)
     if isinstance(question, MayIDrive):
         reserve = ReserveRequest(robot, question.start, question.start_from_robot, question.route)
-        return keys.any_reserve(), encode(reserve)
+        return sent_by(keys.any_reserve(), robot), encode(reserve)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
-    return keys.any_route(), encode(request)
+    return sent_by(keys.any_route(), robot), encode(request)
 
 
 def decode_answer(
@@ -71,6 +74,13 @@ def decode_answer(
     end = question.goal if route.portal is None else route.portal.entry
     if route.legs and route.legs[-1].node.id != end:
         raise InvalidMessage(f"route: it ends at node {route.legs[-1].node.id}, not at {end}")
+    nodes = [leg.node.id for leg in route.legs]
+    if twice := next((node for k, node in enumerate(nodes) if node in nodes[:k]), None):
+        raise InvalidMessage(f"route: it leads in a circle, to node {twice} twice")
+    blocked = {frozenset(pair) for pair in question.blocked}
+    for a, b in pairwise(nodes):
+        if frozenset((a, b)) in blocked:
+            raise InvalidMessage(f"route: it leads from {a} to {b}, where the robot did not get through")
     return route
 
 

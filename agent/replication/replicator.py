@@ -67,7 +67,7 @@ class ReplicationStatus:
 
 
 SETTLED_BEACONS = 20
-"""Of so many beacons, an older map that is complete sends one; a server that is new learns of it so."""
+"""Of so many beacons, a map that servers have sends one: a server that is new, or has lost it, learns so."""
 
 
 class Replicator:
@@ -116,12 +116,13 @@ class Replicator:
         self._beacons = 0
         for m in self._logs:
             journal.prune(m, self._servers)
-        self._work: queue.SimpleQueue[list[Draft] | Sample | Request | None] = queue.SimpleQueue()
+        self._work: queue.SimpleQueue[list[Draft] | Sample | Request | bool | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
         self._thread.start()
         self._declared = [
             bus.subscribe(keys.acks(map_id.agent), self._work.put),
             bus.serve(keys.logs(map_id.agent), self._work.put),
+            bus.watch(keys.servers_alive(), self._see_server),
         ]
 
     @property
@@ -205,6 +206,9 @@ class Replicator:
                         self._pending += item
                     elif isinstance(item, Sample):
                         self._take_ack(item)
+                    elif isinstance(item, bool):
+                        # A server that has come may have lost its store, or be new.
+                        self._beacons, next_beacon = 0, min(next_beacon, time.monotonic())
                     else:
                         questions.append(item)
                     item = self._work.get_nowait()
@@ -220,6 +224,11 @@ class Replicator:
                 next_beacon = now + self._settings.beacon_interval
         if self._pending:
             log.error("%s: %d changes never reached the disk", self._map, len(self._pending))
+
+    def _see_server(self, key: str, alive: bool) -> None:
+        del key
+        if alive:
+            self._work.put(True)
 
     def _next_turn(self, next_beacon: float) -> float:
         return min(next_beacon, self._retry_at) if self._pending else next_beacon
@@ -255,7 +264,7 @@ class Replicator:
         everyone = self._beacons % SETTLED_BEACONS == 0
         self._beacons += 1
         for state in self._logs.values():
-            if everyone or state is self._current or state.unsettled(self._servers):
+            if everyone or state.unsettled(self._servers):
                 self._bus.publish(self._keys.head(state.map), state.head().encode())
 
     def _take_ack(self, sample: Sample) -> None:

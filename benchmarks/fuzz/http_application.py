@@ -24,7 +24,7 @@ class HttpApplication:
         bus = MemoryBus(MemoryHub())
         server = MapServer(bus, Keys("demo"), folder / "s0.sqlite", "s0", schedule=LockstepSchedule())
         server.__enter__()
-        self._app = SameSite(Questions(server, 2.0, True).app, "127.0.0.1")
+        self._app = SameSite(Questions(server, 2.0).app, "127.0.0.1")
 
     async def answer(self, data: bytes) -> int:
         """Ask, and return the status.
@@ -48,11 +48,14 @@ class HttpApplication:
                 status = message["status"]
 
         text = path.decode("latin-1")
+        kind = b"application/json" if text in ("/constraints", "/annotations", "/login") else b"image/png"
         scope = {
             "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1",
             "method": method.decode("latin-1").upper(), "scheme": "http", "path": text,
             "raw_path": quote(text).encode(), "query_string": query, "root_path": "",
-            "headers": [(b"host", b"127.0.0.1"), (b"content-length", str(len(body)).encode())],
+            "headers": [
+                (b"host", b"127.0.0.1"), (b"content-length", b"%d" % len(body)), (b"content-type", kind),
+            ],
             "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 80),
         }  # fmt: skip
         await self._app(scope, receive, send)

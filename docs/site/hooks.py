@@ -11,14 +11,15 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"\[([^\]]*)\]\(([^)#:]+)(#[^)]*)?\)")
-PAGES = {".md", ".png", ".svg"}
+PAGES = {".md", ".png", ".gif", ".svg"}
 
 
 def on_pre_build(config: Any) -> None:
     """Draw the pictures of the tutorials."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pictures = ROOT / "docs" / "site" / "pictures.py"
-    subprocess.run([sys.executable, str(pictures)], check=True, cwd=ROOT, env=environment)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    for program in ("pictures", "film", "diagrams"):
+        script = ROOT / "docs" / "site" / f"{program}.py"
+        subprocess.run([sys.executable, str(script)], check=True, cwd=ROOT, env=environment)
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:

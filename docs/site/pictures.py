@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import page_picture
 
 from mapweave.drawing.link_picture import draw_link
 from mapweave.drawing.map_picture import MapPicture, draw_map
@@ -62,6 +63,7 @@ def main() -> None:
         draw_map(MapPicture(title, poses, edges, landmarks=landmarks(merged)), FOLDER / f"{name}.png")
     link = next(link for link in both.links if not link.within)
     draw_link(explain_nodes(both, link.a, link.b), FOLDER / "link.png")
+    page_picture.main()
 
 
 if __name__ == "__main__":

@@ -11,9 +11,12 @@ import msgspec
 from mapweave.hybridmap.annotation import MAX_NAME, Annotation, Annotations
 from mapweave.hybridmap.constraint_subject import Ends, read_ends
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
-from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.floor_plans import placed_plan
+from mapweave.mapserver.http.json_values import json_values, time_of
+from mapweave.merge.pose_graph.merged_map import MergedMap
 
 FORM = 'send JSON: {"name": "kitchen", "body": {"kind": "place", "node": "r0.1.17"}}'
 
@@ -22,6 +25,7 @@ class _Posted(msgspec.Struct, forbid_unknown_fields=True):
     name: str
     body: dict[str, Any]
     removed: bool = False
+    check: bool = False
     who: str = ""
     because: str = ""
 
@@ -32,8 +36,11 @@ class Annotating(Protocol):
     def annotations(self) -> Annotations:
         """What people say about the map."""
 
-    def annotate(self, annotation: Annotation) -> str:
-        """Add an annotation."""
+    def annotate(self, annotation: Annotation, check: bool = False) -> str:
+        """Add an annotation, or only check it."""
+
+    def merged(self) -> MergedMap:
+        """The newest merged map."""
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words."""
@@ -46,19 +53,25 @@ def annotations_json(server: Annotating) -> Mapping[str, Any]:
     values = json_values(record)["made"]
     return {
         "annotations": [
-            {**value, "in_force": id(entry) in holding}
+            {
+                **value,
+                "in_force": id(entry) in holding,
+                "time": time_of(entry.stamp_ns),
+                "words": entry.words,
+            }
             for entry, value in zip(record.made, values, strict=True)
         ]
     }
 
 
-def annotate(server: Annotating, data: bytes, by: str) -> Mapping[str, Any]:
+def annotate(server: Annotating, data: bytes, by: str, who: str = "") -> Mapping[str, Any]:
     """Add the annotation of a request.
 
     Args:
         server: keeps the record.
         data: JSON; the body's nodes may be words, see `body_of_words`.
         by: who says so, if the request does not tell.
+        who: has logged in; then the request is not asked.
 
     Raises:
         InvalidValue: it is none, or says nothing new.
@@ -69,9 +82,13 @@ def annotate(server: Annotating, data: bytes, by: str) -> Mapping[str, Any]:
         raise InvalidValue(f"{error}; {FORM}") from None
     annotation = annotation_of_words(
         posted.name[: MAX_NAME + 1], posted.body, posted.removed, server.annotations, server.resolve,
-        posted.who or by, posted.because, time.time_ns(),
+        who or posted.who or by, posted.because, time.time_ns(),
     )  # fmt: skip
-    return {"said": server.annotate(annotation), "annotation": json_values(annotation)}
+    answer = {"said": server.annotate(annotation, posted.check), "annotation": json_values(annotation)}
+    if posted.check and not posted.removed and isinstance(annotation.body, FloorPlan):
+        placed = placed_plan(annotation.name, annotation.body, server.merged())
+        answer["plan"] = json_values(placed)
+    return answer
 
 
 def ends_of_words(server: Annotating, words: tuple[str, str]) -> Ends:

@@ -36,22 +36,32 @@ def read_photo(content_type: str, body: bytes, query: dict[str, str]) -> Photo:
     Raises:
         InvalidValue: it is no such form.
     """
-    if len(content_type) > LONGEST_HEADER:
-        raise InvalidValue("Content-Type is too long")
-    kind, options = parse_options_header(content_type)
-    if kind != b"multipart/form-data":
-        return Photo(body, query)
-    boundary = options.get(b"boundary", b"")
-    if not boundary:
-        raise InvalidValue("the form has no boundary")
-    parts = _parts(body, boundary)
-    image = parts.pop("image", None)
-    if image is None:
-        raise InvalidValue("the form has no part named image")
+    parts = form_parts(content_type, body)
+    image = parts.pop("image")
     optics: dict[str, Any] = camera_values(parts.pop("camera")) if "camera" in parts else {}
     for name, value in parts.items():
         optics[name] = _text(name, value)
     return Photo(image, {**optics, **query})
+
+
+def form_parts(content_type: str, body: bytes) -> dict[str, bytes]:
+    """The parts of a form by name, among them `image`. A body that is no form is the image itself.
+
+    Raises:
+        InvalidValue: it is no such form.
+    """
+    if len(content_type) > LONGEST_HEADER:
+        raise InvalidValue("Content-Type is too long")
+    kind, options = parse_options_header(content_type)
+    if kind != b"multipart/form-data":
+        return {"image": body}
+    boundary = options.get(b"boundary", b"")
+    if not boundary:
+        raise InvalidValue("the form has no boundary")
+    parts = _parts(body, boundary)
+    if "image" not in parts:
+        raise InvalidValue("the form has no part named image")
+    return parts
 
 
 def camera_values(data: bytes) -> dict[str, Any]:

@@ -11,11 +11,12 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Protocol
 
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from mapweave.hybridmap.agent_status import FleetStatus
@@ -23,6 +24,8 @@ from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.live_map import LiveMap, Pair
+from mapweave.mapserver.http.login import Access, Person
+from mapweave.mapserver.http.reply import refusal
 from mapweave.mapserver.http.serving import json_bytes
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -66,14 +69,14 @@ class Shown(Protocol):
 class Live:
     """Looks at the server as long as there are viewers."""
 
-    def __init__(self, server: Shown, may_command: Callable[[str], bool]) -> None:
+    def __init__(self, server: Shown, access: Access) -> None:
         """Begin with no viewer.
 
         Args:
             server: what viewers see.
-            may_command: whether a viewer at some address may change things.
+            access: who may see it.
         """
-        self._server, self._may_command = server, may_command
+        self._server, self._access = server, access
         self._turn = threading.Lock()
         self._map = LiveMap()
         self._shown: MergedMap | None = None
@@ -88,7 +91,12 @@ class Live:
         self._rating: asyncio.Task[None] | None = None
 
     async def serve(self, viewer: WebSocket) -> None:
-        """Show a viewer everything until it goes."""
+        """Show a viewer everything until it goes, or is let in no more."""
+        try:
+            person = self._access.check(viewer, "robots")
+        except HTTPException as error:
+            await viewer.send_denial_response(refusal(error.status_code, error.detail, error.headers))
+            return
         await viewer.accept()
         if self._viewers >= MOST_VIEWERS:
             await viewer.close(1013, f"{MOST_VIEWERS} watch already")
@@ -97,7 +105,7 @@ class Live:
         if self._looking is None or self._looking.done():
             self._looking = asyncio.create_task(self._look_on())
         hearing = asyncio.create_task(_until_gone(viewer))
-        showing = asyncio.create_task(self._show(viewer))
+        showing = asyncio.create_task(self._show(viewer, person))
         try:
             await asyncio.wait({hearing, showing}, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -106,14 +114,15 @@ class Live:
                 task.cancel()
             await asyncio.gather(hearing, showing, return_exceptions=True)
 
-    async def _show(self, viewer: WebSocket) -> None:
-        host = "" if viewer.client is None else viewer.client.host
-        commands = not self._server.read_only and self._may_command(host)
-        hello = {"kind": "hello", "read_only": self._server.read_only, "commands": commands}
+    async def _show(self, viewer: WebSocket, person: Person) -> None:
+        hello = {"kind": "hello", **self._access.described(person, self._server.read_only)}
         await viewer.send_text(json_bytes(hello).decode())
         version, events, state = 0, 0, ""
         while True:
             looked = self._looked
+            if not self._access.holds(person):
+                await viewer.close(1008, "this login has ended")
+                return
             if self._map.version > version:
                 text, version = await run_in_threadpool(self._map_since, version)
                 await viewer.send_text(text)

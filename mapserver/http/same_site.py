@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ipaddress
 import socket
+from collections.abc import Iterable
 from http import HTTPStatus
 
 from starlette.datastructures import Headers
@@ -23,22 +24,23 @@ from mapweave.mapserver.http.serving import json_bytes
 class SameSite:
     """An application that refuses what pages of other sites ask."""
 
-    def __init__(self, app: ASGIApp, listens_at: str) -> None:
+    def __init__(self, app: ASGIApp, listens_at: str, hosts: Iterable[str] = ()) -> None:
         """Wrap an application.
 
         Args:
             app: answers everything else.
             listens_at: host at which the server listens.
+            hosts: further names of the server.
         """
         self._app = app
-        self._names = own_names(listens_at)
+        self._names = own_names(listens_at) | {host.lower() for host in hosts}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer, or refuse."""
         headers = Headers(scope=scope)
-        answer = self._app
+        answer, encrypted = self._app, scope["scheme"] in ("https", "wss")
         try:
-            check_site(headers.get("Host"), headers.get("Origin"), self._names)
+            check_site(headers.get("Host"), headers.get("Origin"), self._names, encrypted)
         except InvalidValue as error:
             content = json_bytes({"error": str(error)})
             answer = Response(content, HTTPStatus.FORBIDDEN, media_type="application/json")
@@ -55,13 +57,14 @@ def own_names(listens_at: str) -> frozenset[str]:
     return frozenset({"localhost", name, f"{name.partition('.')[0]}.local", listens_at.lower()})
 
 
-def check_site(host: str | None, origin: str | None, names: frozenset[str]) -> None:
+def check_site(host: str | None, origin: str | None, names: frozenset[str], encrypted: bool = False) -> None:
     """Refuse requests that another site's page sends.
 
     Args:
         host: the header `Host`.
         origin: the header `Origin`; browsers send it with what a script or a form of a page asks.
         names: of this machine.
+        encrypted: whether the request came by HTTPS; an unencrypted page of the same name may be another's.
 
     Raises:
         InvalidValue: another site's, in words.
@@ -70,7 +73,8 @@ def check_site(host: str | None, origin: str | None, names: frozenset[str]) -> N
         raise InvalidValue(
             f"this server is not {(host or 'named')[:80]!r}: use its address or this machine's name"
         )
-    if origin is not None and origin.lower() not in (f"http://{host.lower()}", f"https://{host.lower()}"):
+    schemes = ("https",) if encrypted else ("http", "https")
+    if origin is not None and origin.lower() not in {f"{scheme}://{host.lower()}" for scheme in schemes}:
         raise InvalidValue(f"pages of {origin[:80]!r} may not ask here")
 
 

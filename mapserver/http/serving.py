@@ -11,6 +11,7 @@ import asyncio
 import errno
 import logging
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Mapping
@@ -47,10 +48,12 @@ HEADERS = {
     "Connection": "close",
     "Cache-Control": "no-store",
     "Content-Security-Policy": POLICY,
+    "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
     "Server": "Mapweave",
     "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
 }
 
 
@@ -111,6 +114,8 @@ class Connection(H11Protocol):
 
     def eof_received(self) -> bool:  # type: ignore[override]
         """A peer that has sent a whole request may still wait for the answer."""
+        if not self.transport.can_write_eof():
+            return False  # TLS knows no half of a connection
         return self.cycle is not None and not self.cycle.more_body and not self.cycle.response_complete
 
     def handle_events(self) -> None:
@@ -143,7 +148,8 @@ class Connection(H11Protocol):
             return
         self._refused = True
         self.transport.write(b"".join(part for part in parts if part))
-        self.transport.write_eof()
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
         self._head.cancel()
         self._head = self.loop.call_later(LINGER, self.transport.abort)
 
@@ -159,6 +165,19 @@ class Connection(H11Protocol):
             self._stall.cancel()
 
 
+class _Loop(asyncio.SelectorEventLoop):
+    """A TLS handshake has the time limit of a head; by itself asyncio waits for 60 s."""
+
+    def __init__(self, handshake: float) -> None:
+        super().__init__()
+        self._handshake = handshake
+
+    async def create_server(self, *arguments: Any, **named: Any) -> asyncio.Server:
+        if named.get("ssl") is not None:
+            named.update(ssl_handshake_timeout=self._handshake, ssl_shutdown_timeout=LINGER)
+        return await super().create_server(*arguments, **named)
+
+
 class _Server(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End every connection, also those of peers that take nothing."""
@@ -172,7 +191,12 @@ class HttpThread:
     """Serves an application from the start until closed. A context manager."""
 
     def __init__(
-        self, app: ASGIApp, address: tuple[str, int], limits: Limits | None = None, name: str = "http"
+        self,
+        app: ASGIApp,
+        address: tuple[str, int],
+        limits: Limits | None = None,
+        name: str = "http",
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         """Open the port and serve.
 
@@ -181,6 +205,7 @@ class HttpThread:
             address: host and port; port 0 takes any.
             limits: of connections.
             name: of the thread.
+            tls: serves HTTPS.
 
         Raises:
             NotConnected: the port cannot be used, with the reason alone.
@@ -209,17 +234,24 @@ class HttpThread:
             headers=list(HEADERS.items()),
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             timeout_graceful_shutdown=1,
+            # A proxy on this machine names the client for which it asks.
+            forwarded_allow_ips="127.0.0.1,::1",
         )
+        config.load()
+        config.ssl = tls
         self._server = _Server(config)
-        self._thread = threading.Thread(
-            target=self._server.run, args=([self._socket],), name=name, daemon=True
-        )
+        self._head = limits.head
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
         end = time.monotonic() + START
         while not self._server.started and self._thread.is_alive() and time.monotonic() < end:
             time.sleep(0.005)
         if not self._server.started:
             raise NotConnected("the server's thread did not start")
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: _Loop(self._head)) as runner:
+            runner.run(self._server.serve(sockets=[self._socket]))
 
     @property
     def connections(self) -> int:

@@ -1,5 +1,6 @@
 """The map server for people: a photograph in, JSON out, explanations of merges and routes, and pages.
 
+    POST /login       a token -> a session, for browsers; /logout ends it, GET /session says whose it is
     GET /             the page: the merged map live, robots, and where a photograph was taken
     GET /why          the same page, with an explanation: ?a=r0.1.17&b=r1.1.5
     WebSocket /live   what the page draws, see live.py
@@ -15,6 +16,7 @@
     POST /annotations JSON: adds an annotation, or withdraws one
     GET /plans        floor plans, and where they lie under the merged map, JSON; /plans/NAME.png is the image
     POST /plans       an image: keeps it for a plan that an annotation adds; JSON: its name and size
+                      (/plan-images/NAME.png is the image again)
     GET /constraints  what people have linked, unmerged and retired, JSON
     POST /robots/ROBOT/go?goal=GOAL, .../explore, .../stop   a mission; .../portal-done   it is through, JSON
     POST /stop        stops every robot, JSON
@@ -29,10 +31,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
+import ssl
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -44,7 +47,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp
 
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
@@ -53,38 +56,37 @@ from mapweave.hybridmap.map_event import History
 from mapweave.hybridmap.mission_order import MissionKind, Missions
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ExplainRequest
+from mapweave.identities.logins import Logins
 from mapweave.mapserver.http.annotations import annotate, annotations_json, ends_of_words
 from mapweave.mapserver.http.answering import Answering
+from mapweave.mapserver.http.body import FORM, IMAGE, JSON, read_body
 from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.live import Live
+from mapweave.mapserver.http.login import PERSON, PUBLIC, Access
 from mapweave.mapserver.http.node_details import node_details
-from mapweave.mapserver.http.plans import plan_routes
+from mapweave.mapserver.http.plans import plan_answers
+from mapweave.mapserver.http.reply import PATIENCE, Reply, busy, refusal
 from mapweave.mapserver.http.same_site import SameSite, is_loopback
-from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
+from mapweave.mapserver.http.serving import HttpThread, Limits
 
 log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).with_name("static")
 PAGES = ("/", "/why")
-MOST_BYTES = 16 * 2**20
-"""Longest body, 16 MiB."""
-PATIENCE = 10.0
-"""Time limit for a body, and for an answer, s."""
 MOST_AT_ONCE = 32
 """Questions that are served at once; the next one is refused."""
-WHOLE = "mapweave.whole"
-"""Set in the scope of a request whose body is complete."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
 OF_ROBOTS = tuple(f"/robots/ROBOT/{word}" for word in ("explore", "stop", "portal-done"))
 METHODS = {
     **dict.fromkeys(
-        (*PAGES, "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"), "GET"
+        (*PAGES, "/session", "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"),
+        "GET",
     ),
-    **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png"), "GET"),
+    **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
-    **dict.fromkeys(("/relocalize", MISSION, *OF_ROBOTS, "/stop"), "POST"),
+    **dict.fromkeys(("/relocalize", MISSION, *OF_ROBOTS, "/stop", "/login", "/logout"), "POST"),
 }
 BY = "http"
 """Gives a mission, if the request does not say."""
@@ -115,7 +117,8 @@ class Web(HttpThread):
         server: Answering,
         patience: float = PATIENCE,
         limits: Limits | None = None,
-        commands: bool = False,
+        logins: Logins | None = None,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         """Open the port and serve on a thread of its own.
 
@@ -124,59 +127,41 @@ class Web(HttpThread):
             server: answers.
             patience: time limit for a body, and for an answer, s.
             limits: of connections.
-            commands: whether other machines may move robots and correct the map, too.
+            logins: of the fleet's members; None: this machine alone is served.
+            tls: serves HTTPS.
 
         Raises:
+            SettingsError: other machines would be served without a login, or unencrypted.
             NotConnected: the port cannot be used, for example since it is taken.
         """
-        app = SameSite(Questions(server, patience, commands).app, address[0])
+        check_reach(address, logins is not None, tls is not None)
+        hosts = () if logins is None else logins.hosts
+        app = SameSite(Questions(server, patience, logins).app, address[0], hosts)
         try:
-            super().__init__(app, address, limits)
+            super().__init__(app, address, limits, tls=tls)
         except NotConnected as error:
             raise NotConnected(f"cannot listen at http {address[0]}:{address[1]}: {error}") from None
 
 
-class Reply(Response):
-    """One JSON object on a line.
+def check_reach(address: tuple[str, int], logins: bool, tls: bool) -> None:
+    """Refuse to serve other machines without a login, or with tokens that can be read on their way.
 
-    A refusal is sent at once, and what the peer is still sending is read to its end and thrown away: a
-    connection that is reset loses the answer too.
+    Raises:
+        SettingsError: what to do instead.
     """
-
-    def __init__(
-        self, content: Mapping[str, Any], status: int = 200, headers: Mapping[str, str] | None = None
-    ) -> None:
-        """Encode it."""
-        super().__init__(json_bytes(content), status, dict(headers or {}), "application/json")
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it."""
-        start = {"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers}
-        await send(start)
-        await send({"type": "http.response.body", "body": bytes(self.body), "more_body": True})
-        if self.status_code >= HTTPStatus.BAD_REQUEST and scope["method"] == "POST" and WHOLE not in scope:
-            await _hear_out(scope, receive)
-        await send({"type": "http.response.body", "body": b"", "more_body": False})
-
-
-async def _hear_out(scope: Scope, receive: Receive) -> None:
-    # Reading from a peer that waits for "100 Continue" would send it.
-    if any(name == b"expect" for name, _ in scope["headers"]):
+    where = f"http {address[0]}:{address[1]}"
+    if address[0] == "localhost" or is_loopback(address[0]):
         return
-    try:
-        async with asyncio.timeout(PATIENCE):
-            while True:
-                async with asyncio.timeout(LINGER):
-                    message = await receive()
-                if not message.get("more_body", False):
-                    return
-    except TimeoutError:
-        return
-
-
-def refusal(status: int, error: str) -> Reply:
-    """Why there is no answer, on one line."""
-    return Reply({"error": " ".join(error.split())}, status)
+    if not logins:
+        raise SettingsError(
+            f"{where}: without keys people are served on this machine alone: make keys with "
+            "`mapweave keys init`, and give them with --keys, or give the port alone"
+        )
+    if not tls:
+        raise SettingsError(
+            f"{where}: keys of the lab profile serve no HTTPS, and no token may travel unencrypted: use the "
+            "production profile, or give the port alone, for a proxy on this machine that serves HTTPS"
+        )
 
 
 class Questions:
@@ -186,47 +171,67 @@ class Questions:
         app: the application.
     """
 
-    def __init__(self, server: Answering, patience: float, commands: bool) -> None:
-        """Make the application."""
+    def __init__(self, server: Answering, patience: float, logins: Logins | None = None) -> None:
+        """Make the application.
+
+        Args:
+            server: answers.
+            patience: time limit for a body, and for an answer, s.
+            logins: of the fleet's members; None on a fleet without keys.
+        """
         self._server = server
-        self._commands = commands
+        self._access = access = Access(logins, patience)
         self._patience = patience
         self._open = 0
-        answering: dict[str, Answer] = {
-            "/status": self._status, "/history": self._history, "/explain": self._explain,
-            "/route": self._explain, "/robots": self._robots, "/missions": self._missions, "/map": self._map,
-            "/nodes/{node}": self._node,
-        }  # fmt: skip
+        # The question is the router's word for it, by which roles decide.
+        answering: list[tuple[str, str, str, Answer]] = [
+            ("GET", "/status", "status", self._status),
+            ("GET", "/history", "history", self._history),
+            ("GET", "/explain", "explain", self._explain),
+            ("GET", "/route", "explain", self._explain),
+            ("GET", "/robots", "robots", self._robots),
+            ("GET", "/missions", "missions", self._missions),
+            ("GET", "/map", "map", self._map),
+            ("GET", "/nodes/{node}", "map", self._node),
+            ("GET", "/annotations", "annotations", self._annotations),
+            ("POST", "/annotations", "annotate", self._annotate),
+            *plan_answers(server, lambda request: read_body(request, (*IMAGE, FORM), patience)),
+            ("POST", "/relocalize", "relocalize", self._relocalize),
+            ("POST", "/robots/{robot}/{kind}", "mission", self._give),
+            ("POST", "/stop", "mission", self._stop),
+            ("GET", "/constraints", "constraints", self._constraints),
+            ("POST", "/constraints", "constrain", self._constrain),
+        ]
         routes = [
             *(Route(path, _page("index.html")) for path in PAGES),
-            WebSocketRoute("/live", Live(server, self._may_command).serve),
-            *(Route(path, self._answering(answer)) for path, answer in answering.items()),
-            Route("/annotations", self._answering(self._annotations), methods=["GET", "POST"]),
-            *plan_routes(server, self._answering, self._command_body),
-            Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
-            Route("/robots/{robot}/{kind}", self._answering(self._give), methods=["POST"]),
-            Route("/stop", self._answering(self._stop), methods=["POST"]),
-            Route("/constraints", self._answering(self._constraints), methods=["GET", "POST"]),
+            *access.routes(lambda: server.read_only, self._answering),
+            WebSocketRoute("/live", Live(server, access).serve),
+            *(
+                Route(path, self._answering(answer, question), methods=[method])
+                for method, path, question, answer in answering
+            ),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such})
         app.router.redirect_slashes = False
         self.app: ASGIApp = app
 
-    def _answering(self, answer: Answer) -> Callable[[Request], Awaitable[Response]]:
+    def _answering(self, answer: Answer, question: str) -> Callable[[Request], Awaitable[Response]]:
         """Answer a question, or refuse it with a reason."""
 
         async def endpoint(request: Request) -> Response:
             if self._open >= MOST_AT_ONCE:
-                return _busy(Busy(1.0))
+                return busy(Busy(1.0))
             self._open += 1
             try:
+                if question != PUBLIC:
+                    request.scope[PERSON] = self._access.check(request, question)
                 content = await answer(request)
                 return content if isinstance(content, Response) else Reply(content)
             except HTTPException as error:
-                return refusal(error.status_code, error.detail)
-            except Busy as busy:
-                return _busy(busy)
+                return refusal(error.status_code, error.detail, error.headers)
+            except Busy as error:
+                return busy(error)
             except InvalidValue as error:
                 return refusal(HTTPStatus.BAD_REQUEST, str(error))
             except MapweaveError as error:
@@ -256,11 +261,13 @@ class Questions:
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
 
-    async def _annotations(self, request: Request) -> Mapping[str, Any]:
-        if request.method != "POST":
-            return await run_in_threadpool(annotations_json, self._server)
-        body = await self._command_body(request, "JSON")
-        return await run_in_threadpool(annotate, self._server, body, request.query_params.get("by", BY))
+    async def _annotations(self, _: Request) -> Mapping[str, Any]:
+        return await run_in_threadpool(annotations_json, self._server)
+
+    async def _annotate(self, request: Request) -> Mapping[str, Any]:
+        body = await read_body(request, JSON, self._patience)
+        by = request.query_params.get("by", BY)
+        return await run_in_threadpool(annotate, self._server, body, by, request.scope[PERSON].name)
 
     async def _node(self, request: Request) -> Mapping[str, Any]:
         node = NodeId.parse(request.path_params["node"])
@@ -272,14 +279,13 @@ class Questions:
         return Response(data, headers=headers, media_type="application/octet-stream")
 
     async def _give(self, request: Request) -> Mapping[str, Any]:
-        self._check_commands(request)
         robot, kind = request.path_params["robot"], request.path_params["kind"]
         query = request.query_params
         if kind == "portal-done":
-            return {"said": await run_in_threadpool(self._server.portal_done, robot, query.get("by", BY))}
+            return {"said": await run_in_threadpool(self._server.portal_done, robot, _author(request))}
         if kind not in (MissionKind.GO, MissionKind.EXPLORE, MissionKind.STOP):
             raise HTTPException(HTTPStatus.NOT_FOUND, f"there is no mission {kind!r}: go, explore, stop")
-        goal, by, mission_id = query.get("goal", ""), query.get("by", BY), query.get("id", "")
+        goal, by, mission_id = query.get("goal", ""), _author(request), query.get("id", "")
         report = await run_in_threadpool(
             self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id,
             tuple(query.getlist("via")),
@@ -287,8 +293,7 @@ class Questions:
         return json_values(report)
 
     async def _stop(self, request: Request) -> Mapping[str, Any]:
-        self._check_commands(request)
-        by = request.query_params.get("by", BY)
+        by = _author(request)
 
         def stop() -> Mapping[str, Any]:
             names = [entry.robot for entry in self._server.robots().robots if entry.alive]
@@ -298,35 +303,22 @@ class Questions:
 
         return await run_in_threadpool(stop)
 
-    async def _constraints(self, request: Request) -> Mapping[str, Any]:
-        if request.method != "POST":
-            return await run_in_threadpool(
-                lambda: constraint_values(ManualConstraints(self._server.constraints().made))
-            )
-        body = await self._command_body(request, "JSON")
+    async def _constraints(self, _: Request) -> Mapping[str, Any]:
+        return await run_in_threadpool(
+            lambda: constraint_values(ManualConstraints(self._server.constraints().made))
+        )
+
+    async def _constrain(self, request: Request) -> Mapping[str, Any]:
+        body, who = await read_body(request, JSON, self._patience), request.scope[PERSON].name
 
         def constrain() -> Mapping[str, Any]:
             record = self._server.constraints().made
-            return {"said": self._server.constrain(read_request(body, BY, time.time_ns(), record))}
+            asked = read_request(body, BY, time.time_ns(), record)
+            if who:
+                asked = replace(asked, constraint=replace(asked.constraint, who=who))
+            return {"said": self._server.constrain(asked)}
 
         return await run_in_threadpool(constrain)
-
-    async def _command_body(self, request: Request, what: str = "a JPEG or PNG image") -> bytes:
-        self._check_commands(request)
-        return await self._body(request, what)
-
-    def _may_command(self, host: str) -> bool:
-        return self._commands or is_loopback(host)
-
-    def _check_commands(self, request: Request) -> None:
-        """There is no password: robots are moved and maps corrected from this machine, unless it is set."""
-        host = "" if request.client is None else request.client.host
-        if not self._may_command(host):
-            raise HTTPException(
-                HTTPStatus.FORBIDDEN,
-                "missions and corrections are taken from this machine alone: start the server with "
-                "--http-commands",
-            )
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
         ends: Ends | None = None
@@ -342,7 +334,7 @@ class Questions:
         return await run_in_threadpool(json_values, explanation)
 
     async def _relocalize(self, request: Request) -> Mapping[str, Any]:
-        body = await self._body(request)
+        body = await read_body(request, (*IMAGE, FORM), self._patience)
         content_type, query = request.headers.get("Content-Type", ""), dict(request.query_params)
         photo = await run_in_threadpool(read_photo, content_type, body, query)
         photo.check()
@@ -354,28 +346,10 @@ class Questions:
         async with asyncio.timeout(self._patience):
             return await asyncio.wrap_future(await run_in_threadpool(ask))
 
-    async def _body(self, request: Request, what: str = "a JPEG or PNG image") -> bytes:
-        """All of it, in the time that a body may take; refused before it is sent if it is too long."""
-        length = _length(request, what)
-        body = bytearray()
-        async with asyncio.timeout(self._patience):
-            async for piece in request.stream():
-                body += piece
-        request.scope[WHOLE] = True
-        if len(body) < length:
-            raise InvalidValue(f"only {len(body)} of {length} bytes came")
-        return bytes(body)
 
-
-def _length(request: Request, what: str) -> int:
-    text = request.headers.get("Content-Length", "")
-    if "Transfer-Encoding" in request.headers or not (text.isascii() and text.isdigit()):
-        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "give the length of the body with Content-Length")
-    if len(text) > 12 or int(text) > MOST_BYTES:
-        raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES >> 20} MiB are taken")
-    if int(text) == 0:
-        raise InvalidValue(f"send {what} as the body")
-    return int(text)
+def _author(request: Request) -> str:
+    """Who gives a mission: the person who has logged in, without keys the one that the request names."""
+    return request.scope[PERSON].name or request.query_params.get("by", BY)
 
 
 def _page(name: str) -> Callable[[Request], Awaitable[Response]]:
@@ -392,9 +366,3 @@ async def _no_such(request: Request, error: Exception) -> Response:
     if status == HTTPStatus.METHOD_NOT_ALLOWED and request.url.path in METHODS:
         return refusal(status, f"use {METHODS[request.url.path]} for {request.url.path}")
     return refusal(status, f"there are {', '.join(f'{method} {path}' for path, method in METHODS.items())}")
-
-
-def _busy(busy: Busy) -> Reply:
-    content = {"error": str(busy), "retry_after": round(busy.retry_after, 2)}
-    headers = {"Retry-After": str(math.ceil(busy.retry_after))}
-    return Reply(content, HTTPStatus.SERVICE_UNAVAILABLE, headers)

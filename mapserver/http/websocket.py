@@ -26,6 +26,12 @@ class WebSocketConnection(WSProtocol):
             (name, value) for name, value in self.default_headers if name != b"connection"
         ]
 
+    async def send(self, message: Any) -> None:
+        """Send what the application says; also a refusal has the headers of every answer."""
+        if message["type"] == "websocket.http.response.start":
+            message = {**message, "headers": [*message["headers"], *self.default_headers]}
+        await super().send(message)
+
     def pause_writing(self) -> None:
         """The peer is slower than what is sent."""
         super().pause_writing()

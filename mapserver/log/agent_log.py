@@ -21,12 +21,14 @@ class PullSettings:
         first_pause: after a pull that failed, s; doubled each time.
         longest_pause: between two pulls of one log, s.
         ahead: changes behind a gap that are kept in memory; more are pulled again.
+        ahead_bytes: of these, likewise.
     """
 
     grace: float = 0.05
     first_pause: float = 0.2
     longest_pause: float = 5.0
     ahead: int = 1024
+    ahead_bytes: int = 2**22
 
 
 @dataclass
@@ -45,6 +47,7 @@ class AgentLog:
         pulling: whether a pull is under way.
         pull_at: when the next one is due.
         chunk: changes to ask for at once; smaller after an answer that could not be read.
+        resting_until: nothing is pulled before.
     """
 
     map: MapId
@@ -58,12 +61,22 @@ class AgentLog:
     pulling: bool = False
     pull_at: float = NEVER
     chunk: int = MAX_ROWS
+    resting_until: float = -NEVER
     _pause: float = 0.0
+    _ahead_bytes: int = 0
 
     def offer(self, entry: Entry) -> None:
         """Keep a change until its turn comes, if there is room."""
-        if entry.sequence == self.watermark + 1 or len(self.ahead) < self.settings.ahead:
+        size = self._ahead_bytes + len(entry.message)
+        room = len(self.ahead) < self.settings.ahead and size <= self.settings.ahead_bytes
+        if room or entry.sequence == self.watermark + 1:
             self.ahead[entry.sequence] = entry
+            self._ahead_bytes = size
+
+    def forget_ahead(self) -> None:
+        """Drop the changes that wait for their turn; they will be pulled."""
+        self.ahead.clear()
+        self._ahead_bytes = 0
 
     def next_run(self) -> list[Entry]:
         """The changes that follow the watermark without a gap."""
@@ -77,32 +90,42 @@ class AgentLog:
         self.watermark = applied.watermark
         self.newest = max(self.newest, self.watermark)
         self.ahead = {sequence: e for sequence, e in self.ahead.items() if sequence > self.watermark}
+        self._ahead_bytes = sum(len(entry.message) for entry in self.ahead.values())
         self.refusals = (*self.refusals, *applied.refusals)[-MAX_REFUSALS:]
 
     def heard(self, now: float) -> None:
         """The agent is reachable: shorten the wait for the next attempt."""
         self._pause = min(self._pause, self.settings.first_pause)
-        if self.newest > self.watermark or self.damaged:
+        if not self.complete:
             self.pull_at = min(self.pull_at, now + self._pause)
 
-    def missing(self, now: float) -> LogRequest | None:
-        """What to pull now, if anything."""
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is missing, as far as is known."""
+        return self.newest <= self.watermark and not self.damaged
+
+    def plan(self, now: float) -> None:
+        """Note when to pull next, if that is not known yet."""
+        if self.complete:
+            self.pull_at = NEVER
+        elif self.pull_at == NEVER:
+            self.pull_at = now + max(self.settings.grace, self._pause)
+
+    def missing(self, now: float, most: int = MAX_ROWS) -> LogRequest | None:
+        """What to pull now, if anything: so many changes at most."""
         if self.pulling:
             return None
-        if self.newest <= self.watermark and not self.damaged:
-            self.pull_at = NEVER
-            return None
-        if self.pull_at == NEVER:
-            self.pull_at = now + max(self.settings.grace, self._pause)
+        self.plan(now)
         if self.pull_at > now:
             return None
         self.pulling = True
+        rows = min(self.chunk, most)
         if self.newest <= self.watermark:
             _, first, last = self.damaged[0]
-            return LogRequest(first, min(last, first + self.chunk - 1))
+            return LogRequest(first, min(last, first + rows - 1))
         first = self.watermark + 1
         end = min((sequence - 1 for sequence in self.ahead), default=self.newest)
-        return LogRequest(first, max(first, min(end, self.newest, first + self.chunk - 1)))
+        return LogRequest(first, max(first, min(end, self.newest, first + rows - 1)))
 
     def was_damaged(self, sequence: int) -> bool:
         """Whether a settled change was found damaged on the disk."""
@@ -120,6 +143,6 @@ class AgentLog:
 
     def commit_failed(self, now: float, wait: float) -> None:
         """The commit failed: drop the changes ahead, they will be pulled."""
-        self.ahead.clear()
+        self.forget_ahead()
         self._pause = wait
         self.pull_at = now + wait

@@ -34,6 +34,8 @@ ADVICE = (
     "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: robots send "
     "again what they keep"
 )
+MOST_REFUSED_KEPT = 100
+"""Refused changes of a map of which the bytes are kept; of further ones only the reason."""
 MAX_CONSTRAINTS = 10_000
 """Made by hand, one by one."""
 
@@ -196,6 +198,16 @@ class Store:
             return self.replay(map_id, changes[0].sequence - 1)
         return iter(changes)
 
+    def landmarks(self, node: NodeId) -> int | None:
+        """How many landmarks a node has; None if there is no such node."""
+        rows = self._read("SELECT landmarks FROM node WHERE agent = ? AND epoch = ? AND number = ?", node)
+        return int(rows[0][0]) if rows else None
+
+    def kept(self, agent: str) -> dict[MapId, tuple[int, int]]:
+        """Nodes and landmarks of each map of a robot."""
+        query = "SELECT epoch, count(*), sum(landmarks) FROM node WHERE agent = ? GROUP BY epoch"
+        return {MapId(agent, epoch): (nodes, total) for epoch, nodes, total in self._read(query, (agent,))}
+
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
         """The newest changes of a map that were refused, in order."""
         query = (
@@ -278,7 +290,9 @@ class Store:
         reason = entry.change if isinstance(entry.change, str) else self._objection(entry.change)
         if isinstance(entry.change, str) or reason:
             refusals.append(Refusal(entry.sequence, reason))
-            insert(rows, "refused", (*map_id, entry.sequence, reason, entry.message))
+            count = "SELECT count(*) FROM refused WHERE agent = ? AND epoch = ?"
+            many = rows.execute(count, map_id).fetchone()[0] >= MOST_REFUSED_KEPT
+            insert(rows, "refused", (*map_id, entry.sequence, reason, b"" if many else entry.message))
         else:
             changes.append(entry.change)
             self._insert(rows, entry, entry.change)
@@ -314,15 +328,10 @@ class Store:
         if isinstance(change.body, EdgePut) and len(change.body.edge.shared):
             edge = change.body.edge
             for end, highest in zip((edge.a, edge.b), edge.shared.max(axis=0), strict=True):
-                count = self._landmarks(end)
+                count = self.landmarks(end)
                 if count is not None and highest >= count:
                     return f"edge {edge.id} shares landmark {highest} of {end}, which has {count}"
         return ""
-
-    def _landmarks(self, node: NodeId) -> int | None:
-        query = "SELECT landmarks FROM node WHERE agent = ? AND epoch = ? AND number = ?"
-        rows = self._read(query, node)
-        return int(rows[0][0]) if rows else None
 
     def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
         with self._lock, self._database.guard():

@@ -13,11 +13,13 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.mapserver.merging.copies import Copies
 from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import NodeComparisons
 from mapweave.mapserver.merging.verification_cache import VerificationCache
+from mapweave.mapserver.plausibility import implausible, scattered
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
@@ -61,6 +63,9 @@ class Merger:
         self._pipeline = self._new_pipeline()
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
+        self._copies, self._copied = Copies(), dict[MapId, str]()
+        self._refused: dict[MapId, str] = {}
+        self._implausible: dict[MapId, str] = {}
         self._contradictions = WrongGeometrySearch(self.settings.consistency)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._stale: set[MapPair] = set()
@@ -173,6 +178,12 @@ class Merger:
         """Maps that another process has set apart: where it is this one or another, it is this one."""
         self._suspects = frozenset(maps)
 
+    def note_refusal(self, map_id: MapId, reason: str) -> None:
+        """Note that a change of a map was refused; the first reason is kept."""
+        if map_id not in self._refused:
+            self._refused[map_id] = reason
+            self._dirty = True
+
     def merged(self, use: Callable[[MergedMap], object] | None = None) -> MergedMap:
         """The merged map of all changes; merged again only if something has changed, and where it has.
 
@@ -189,6 +200,9 @@ class Merger:
             for pair, verdict in self._comparisons.changes():
                 self._touched |= {pair[0].map, pair[1].map}
                 self._stale.add((pair[0].map, pair[1].map))
+                self._copies.forget(pair)
+                if isinstance(verdict, Link):
+                    self._copies.compare(*(self.maps[node.map].nodes[node] for node in pair))
                 if verdict is None:
                     self._verdicts.drop(pair)
                 else:
@@ -197,12 +211,15 @@ class Merger:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
+                self._implausible[map_id] = implausible(self._kept[map_id])
             self._isolation.changed(self._changed)
+            self._copied = self._copies.maps(self._suspects)
             try:
                 self._find_wrong_geometry()
             except Exception:  # a defect with one map must not hold up the merge
                 log.exception("the search for maps with wrong geometry failed")
-            maps = [kept_id for kept_id in self._kept if kept_id not in self._isolation]
+            apart = self._set_apart()
+            maps = [kept_id for kept_id in self._kept if kept_id not in apart]
             try:
                 merged = self._made(self._pipeline, self._verdicts, maps, self._touched, use)
             except Exception as error:  # any error is of one map or a few, and not of all
@@ -226,10 +243,21 @@ class Merger:
     ) -> MergedMap:
         kept = {map_id: self._kept[map_id] for map_id in maps}
         merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins)
-        merged = replace(merged, set_apart=self._isolation.reasons, wrong=self._wrong)
+        odd = {which: reason for which, reason in self._implausible.items() if reason}
+        odd |= scattered(kept) | self._refused
+        merged = replace(
+            merged,
+            set_apart=self._set_apart(),
+            implausible={which: odd[which] for which in sorted(odd.keys() & kept.keys())},
+            wrong=self._wrong,
+        )
         if use is not None:
             use(merged)
         return merged
+
+    def _set_apart(self) -> dict[MapId, str]:
+        """Maps that are not merged, and why."""
+        return {**self._copied, **self._isolation.reasons}
 
     def _find_wrong_geometry(self) -> None:
         """Maps that contradict others that agree are not merged."""
@@ -237,7 +265,7 @@ class Merger:
         # What a retired area holds only the merge says; the robot's way by it is no less true.
         nodes = retired_nodes(self._kept, self._constraints, ())
         self._constraints = self._constraints.with_nodes(nodes)
-        before, left_out = self._wrong, {*self._constraints.retired, *self._isolation.reasons}
+        before, left_out = self._wrong, {*self._constraints.retired, *self._set_apart()}
         self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, left_out)
         self._stale = set()
         if before.keys() - self._wrong.keys():
@@ -317,11 +345,13 @@ class Merger:
         self._changed.add(map_id)
         self._dirty = True
         removed = hybrid_map.nodes.get(change.id) if isinstance(change, NodeRetired) else None
+        before = hybrid_map.nodes.get(change.node.id) if isinstance(change, NodePut) else None
         for edge in hybrid_map.dropped_by(change):
             self._comparisons.disconnect(edge)
         hybrid_map.apply(change)
         match change:
             case NodePut(node):
+                self._copies.came(node, before)
                 self._comparisons.forget(node.id)
                 self.places.observe(node)
             case NodeRetired(node_id):

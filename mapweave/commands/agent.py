@@ -104,8 +104,10 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.mission_order import MissionKind
     from mapweave.hybridmap.node import check_name
     from mapweave.processes.agent import AgentOptions, run_agent
+    from mapweave.terminal import log_with_time
     from mapweave.wire.keys import check_epoch
 
+    log_with_time()
     name = check_name(arguments.name)
     if arguments.epoch is not None:
         check_epoch(arguments.epoch)

@@ -13,7 +13,7 @@ from mapweave.commands.network import add_network, network_of, settings_of, stop
 from mapweave.commands.replay import add_recording, name_of, options_of
 
 if TYPE_CHECKING:
-    from mapweave.agent.calibration.estimator import Estimate
+    from mapweave.agent.calibration.estimate import Estimate
     from mapweave.agent.calibration.recorded_drive import DriveCalibration
     from mapweave.agent.observation import Observation, RobotDescription
 

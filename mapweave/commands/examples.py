@@ -6,8 +6,8 @@ import argparse
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "demo": ("mapweave demo --seed 3",),
-    "server": ("mapweave server --listen tcp/0.0.0.0:7447 --http 8080",),
-    "router": ("mapweave router --listen tcp/0.0.0.0:7447",),
+    "server": ("mapweave server --http 8080", "mapweave server --keys keys --http 0.0.0.0:8080"),
+    "router": ("mapweave router --keys keys",),
     "sim": ("mapweave sim run passing --one-process",),
     "sim list": ("mapweave sim list",),
     "sim run": ("mapweave sim run office --set world.rooms=5 --seed 7",),
@@ -42,8 +42,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "keys": ("mapweave keys list",),
     "keys init": ("mapweave keys init --fleet office --at 192.168.1.10",),
     "keys add": ("mapweave keys add r0 --role robot",),
+    "keys token": ("mapweave keys token anna --days 30",),
     "keys list": ("mapweave keys list --json",),
-    "keys revoke": ("mapweave keys revoke r0 --because stolen",),
+    "keys revoke": ("mapweave keys revoke r0 --because stolen", "mapweave keys revoke anna --tokens"),
     "keys bundle": ("mapweave keys bundle r0 -o r0.key",),
     "robots": ("mapweave robots",),
     "doctor": ("mapweave doctor --robot robot.toml", "mapweave doctor --robot robot.toml --offline --json"),

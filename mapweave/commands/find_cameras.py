@@ -35,8 +35,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.errors import DeviceError
     from mapweave.storage.atomic_file import write_whole
 
-    # Devices that are no cameras say so at length.
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     devices = sorted(Path("/dev").glob("video*"), key=lambda path: (len(path.name), path.name))
     sources = [*map(str, devices), *arguments.source]
     width, height, found, failed = arguments.width, arguments.height, 0, []

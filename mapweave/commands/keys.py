@@ -44,6 +44,12 @@ def add_to(commands: Any) -> None:
     add.add_argument("--days", type=float, default=365.0, help="for which it holds (default: 365)")
     add.set_defaults(run=_add)
 
+    token = _action(actions, "token", "a token with which a person or a script logs in over HTTP",
+                    "mapweave keys token anna")  # fmt: skip
+    token.add_argument("name", metavar="NAME", help="who has a key already, see `mapweave keys add`")
+    token.add_argument("--days", type=float, default=90.0, help="for which it holds (default: 90)")
+    token.set_defaults(run=_token)
+
     listing = _action(actions, "list", "who has a key, and until when", "mapweave keys list")
     listing.add_argument("--json", action="store_true", help="print one JSON object")
     listing.set_defaults(run=_list)
@@ -53,6 +59,7 @@ def add_to(commands: Any) -> None:
     )
     revoke.add_argument("name", metavar="NAME")
     revoke.add_argument("--because", default="", metavar="TEXT", help="why; the router's log says it")
+    revoke.add_argument("--tokens", action="store_true", help="only the tokens for HTTP; the key stays good")
     revoke.set_defaults(run=_revoke)
 
     bundle = _action(actions, "bundle", "the one file to copy to a robot or person",
@@ -88,27 +95,51 @@ def _init(arguments: argparse.Namespace) -> int:
 
 
 def _add(arguments: argparse.Namespace) -> int:
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.wire.credentials import Role
 
-    if not 0.0 < arguments.days <= 3650.0:
-        raise InvalidValue(f"--days {arguments.days:g}: give 1 to 3650")
+    _check_days(arguments.days)
     path = KeyFolder(arguments.keys).add(arguments.name, Role(arguments.role), arguments.days)
     print(f"{path}: copy this file to {arguments.name}, and to no other")
     return 0
+
+
+def _token(arguments: argparse.Namespace) -> int:
+    import sys
+
+    from mapweave.identities.key_folder import KeyFolder
+
+    _check_days(arguments.days)
+    token = KeyFolder(arguments.keys).token(arguments.name, arguments.days)
+    print(f"the token of {arguments.name}, which is shown this once:", file=sys.stderr)
+    print(token)
+    return 0
+
+
+def _check_days(days: float) -> None:
+    from mapweave.hybridmap.errors import InvalidValue
+
+    if not 0.0 < days <= 3650.0:
+        raise InvalidValue(f"--days {days:g}: give 1 to 3650")
 
 
 def _list(arguments: argparse.Namespace) -> int:
     import json
 
     from mapweave.identities.key_folder import KeyFolder
+    from mapweave.identities.tokens import read_tokens
 
     catalogue = KeyFolder(arguments.keys).catalogue
+    tokens = {
+        one.name: [token for token in read_tokens(arguments.keys) if token.name == one.name]
+        for one in catalogue.identities
+    }
     if arguments.json:
         rows = [
             {"name": one.name, "role": one.role, "state": one.state, "issued": one.issued,
-             "expires": one.expires} for one in catalogue.identities
+             "expires": one.expires,
+             "tokens": [{"issued": token.issued, "expires": token.expires} for token in tokens[one.name]]}
+            for one in catalogue.identities
         ]  # fmt: skip
         print(json.dumps({"fleet": catalogue.fleet, "profile": catalogue.profile, "identities": rows}))
         return 0
@@ -117,12 +148,24 @@ def _list(arguments: argparse.Namespace) -> int:
     for one in catalogue.identities:
         until = f", until {one.expires[:10]}" if one.expires and not one.revoked else ""
         print(f"{one.name:<{width}}  {one.role:<8}  {one.state}{until}")
+        for token in tokens[one.name]:
+            ends = "expired" if token.expired else f"until {token.expires[:10]}"
+            print(f"{'':<{width}}  token of {token.issued[:10]}, {ends}")
     return 0
 
 
 def _revoke(arguments: argparse.Namespace) -> int:
+    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.identities.key_folder import KeyFolder
+    from mapweave.identities.tokens import end_tokens
 
+    if arguments.tokens:
+        if KeyFolder(arguments.keys).find(arguments.name) is None or not end_tokens(
+            arguments.keys, arguments.name
+        ):
+            raise InvalidValue(f"{arguments.name} has no token; `mapweave keys list` shows who has")
+        print(f"the tokens of {arguments.name} are void, and who logged in with them is logged out")
+        return 0
     KeyFolder(arguments.keys).revoke(arguments.name, " ".join(arguments.because.split()))
     print(f"{arguments.name} is admitted no more; a running server takes note within seconds")
     return 0

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import getpass
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mapweave.commands.map_input import opened
-from mapweave.commands.network import add_network
+from mapweave.commands.network import add_network, key_holder, network_of, settings_of
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.constraint_subject import Subject
@@ -37,16 +36,17 @@ def constrain(arguments: argparse.Namespace, about: Subject) -> None:
     Raises:
         MapweaveError: the constraint has no effect, or there is no place to keep it.
     """
+    from mapweave.fleet import author
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.manual_constraint import ManualConstraint
 
     if arguments.out is not None and arguments.map is None:
         raise InvalidValue("--out goes with --map: a server keeps its own record")
-    constraint = ManualConstraint(
-        about, not arguments.undo, arguments.by or _login(), time.time_ns(), arguments.because
-    )
+    holder = None if arguments.map is not None else key_holder(network_of(arguments, settings_of(arguments)))
+    by = author(holder, arguments.by or "")
+    constraint = ManualConstraint(about, not arguments.undo, by, time.time_ns(), arguments.because)
     if arguments.map is None:
-        _send_to_server(arguments, constraint)
+        _send_to_server(arguments, constraint, "" if holder is None else holder.name)
     else:
         _rewrite(arguments, constraint)
         arguments.map = arguments.map if arguments.check else arguments.out or arguments.map
@@ -66,22 +66,15 @@ def constraints_of(arguments: argparse.Namespace) -> ManualConstraints:
     )
 
 
-def _login() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):  # no user of that number
-        return "a person"
-
-
-def _send_to_server(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
+def _send_to_server(arguments: argparse.Namespace, constraint: ManualConstraint, sender: str) -> None:
     from mapweave.commands.map_ends import ask
     from mapweave.hybridmap.manual_constraint import ConstraintRequest
-    from mapweave.wire.keys import Keys
     from mapweave.wire.log_messages import decode_record
     from mapweave.wire.messages import encode
+    from mapweave.wire.senders import sent_by
 
     request = ConstraintRequest(constraint, arguments.check)
-    for reply in ask(arguments, Keys.any_constrain, encode(request)):
+    for reply in ask(arguments, lambda keys: sent_by(keys.any_constrain(), sender), encode(request)):
         print(decode_record(reply.payload)["said"])
     if not arguments.check:
         _settled(arguments)
@@ -105,7 +98,6 @@ def _settled(arguments: argparse.Namespace) -> None:
 
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.commands.map_merge import merged_with_progress
-    from mapweave.commands.network import settings_of
     from mapweave.hybridmap.annotation import Annotations
     from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words

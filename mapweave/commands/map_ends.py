@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from mapweave.commands.network import network_of, reach, settings_of
+from mapweave.commands.network import key_holder, network_of, reach, settings_of
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.node import MapId, NodeId
@@ -117,7 +117,7 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
     finally:
         bus.close()
     if not replies:
-        raise no_server(network.fleet)
+        raise no_server(network.fleet, key_holder(network))
     good = [reply for reply in replies if not reply.error]
     if not good:
         raise NotConnected(f"the map server refused: {replies[0].error}")

@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING
 from mapweave.connection import SOON
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.identities.key_renewal import KeyRenewal
     from mapweave.settings import NetworkSettings, Settings
     from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.credentials import Credentials
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -85,11 +88,16 @@ def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
 
 def client_settings(network: NetworkSettings) -> BusSettings:
     """How a client connects."""
-    from mapweave.identities.key_file import read_key_file
     from mapweave.wire.bus_settings import BusSettings
 
-    credentials = read_key_file(Path(network.keys)).credentials if network.keys else None
-    return BusSettings(mode="client", endpoints=network.endpoints, credentials=credentials)
+    return BusSettings(mode="client", endpoints=network.endpoints, credentials=key_holder(network))
+
+
+def key_holder(network: NetworkSettings) -> Credentials | None:
+    """Whose key a client has; None without one."""
+    from mapweave.identities.key_file import read_key_file
+
+    return read_key_file(Path(network.keys)).credentials if network.keys else None
 
 
 def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings, KeyFolder | None]:
@@ -118,7 +126,11 @@ def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings,
 
 
 def key_renewal(
-    bus: ZenohBus, folder: KeyFolder | None, server: str, settings: BusSettings
+    bus: ZenohBus,
+    folder: KeyFolder | None,
+    server: str,
+    settings: BusSettings,
+    renewed: Callable[[Credentials], None] = lambda credentials: None,
 ) -> KeyRenewal | None:
     """What keeps a router's rules up to date, if it has keys; it says on stderr what it does."""
     from mapweave.identities.key_renewal import KeyRenewal
@@ -126,9 +138,11 @@ def key_renewal(
 
     if folder is None:
         return None
-    return KeyRenewal(
-        bus, folder, server, settings.listen, lambda line: print(stamped(line), file=sys.stderr, flush=True)
-    )
+
+    def say(line: str) -> None:
+        print(stamped(line), file=sys.stderr, flush=True)
+
+    return KeyRenewal(bus, folder, server, settings.listen, say, renewed)
 
 
 def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[ZenohBus, Keys]:

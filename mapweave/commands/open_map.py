@@ -22,24 +22,26 @@ def add_to(commands: Any) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help=SOURCES)
     parser.add_argument(
         "--http", metavar="[HOST:]PORT", default="8080",
-        help="where, on this machine alone unless HOST is given (default: 8080)",
+        help="where; with --keys people log in, and 0.0.0.0:8080 serves other machines, too (default: 8080)",
     )  # fmt: skip
+    parser.add_argument("--keys", type=Path, metavar="FOLDER", help="folder of `mapweave keys init`")
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML; [merge] says how it was merged")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until stopped."""
-    from mapweave.mapserver.http.web import Web, parse_address
+    from mapweave.commands.http_access import http_access
+    from mapweave.identities.key_folder import KeyFolder
     from mapweave.read_only_server import ReadOnlyServer
 
-    host, port = parse_address(arguments.http)
-    settings = settings_of(arguments).merge
+    folder, settings = None if arguments.keys is None else KeyFolder(arguments.keys), settings_of(arguments)
+    people = http_access(arguments.http, folder, settings.network.server)
     one = opened(arguments.file)
-    merged = merged_with_progress(one, settings)
+    merged = merged_with_progress(one, settings.merge)
     stop = stop_on_signals()
-    with ReadOnlyServer(one, merged, settings) as server, Web((host, port), server):
+    with ReadOnlyServer(one, merged, settings.merge) as server, people.serve(server):
         print(f"{arguments.file}: {merged.summary()}", flush=True)
-        print(f"open http://{host}:{port}/ to see it; Ctrl-C ends", flush=True)
+        print(f"open {people.url} to see it; Ctrl-C ends", flush=True)
         stop.wait()
     return 0

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_input import SOURCES, router_of
-from mapweave.commands.network import add_network, network_of, reach, settings_of
+from mapweave.commands.network import add_network, key_holder, network_of, reach, settings_of
 from mapweave.commands.plan import add_plan_option, plan_of, plan_place
 from mapweave.exit_status import DONE, NO
 
@@ -112,7 +112,7 @@ def _by_server(
     bus, keys = reach(network)
     try:
         if not bus.ask(keys.server_statuses(), b"", arguments.timeout):
-            raise no_server(network.fleet)  # said before the work
+            raise no_server(network.fleet, key_holder(network))  # said before the work
         payload = _ask(bus, network, keys.any_relocalize(), encode_view(view()), arguments.timeout)
         answer = decode(payload, RelocalizeAnswer)
         if arguments.draw is None or not answer.candidates:
@@ -148,7 +148,7 @@ def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, pati
             if not reply.error:
                 return reply.payload
         if not replies:
-            raise no_server(network.fleet)
+            raise no_server(network.fleet, key_holder(network))
         pause = replies[0].retry_after
         if not pause or time.monotonic() + pause > end:
             raise NotConnected(f"the map server refused: {replies[0].error}")

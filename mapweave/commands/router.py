@@ -30,9 +30,10 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Route until stopped."""
-    from mapweave.terminal import stamped
+    from mapweave.terminal import log_with_time, stamped
     from mapweave.wire.zenoh_bus import ZenohBus
 
+    log_with_time()
     network = network_of(arguments, settings_of(arguments))
     settings, keys = router_settings(network, network.server)
     stop = stop_on_signals()

@@ -51,12 +51,8 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument(
         "--http", metavar="[HOST:]PORT",
-        help="answer people over HTTP as well, on this machine alone unless HOST is given, "
-        "for example 8080 or 0.0.0.0:8080 (default: off)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--http-commands", action="store_true",
-        help="with --http: other machines may move robots, too; there is no password",
+        help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
+        "0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
@@ -70,12 +66,12 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
-    from mapweave.terminal import STAMP, stamped
+    from mapweave.terminal import log_with_time, stamped
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
-    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
+    log_with_time()
     for part in ("mapweave.mapserver", "mapweave.wire"):
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
@@ -85,15 +81,15 @@ def run(arguments: argparse.Namespace) -> int:
     keys = Keys(router.fleet)
     if arguments.demo and arguments.data is not None:
         raise SettingsError("--demo keeps nothing: leave out --data")
-    address, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
+    people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
     if http is not None:
-        from mapweave.mapserver.http.web import Web, parse_address
+        from mapweave.commands.http_access import http_access
 
-        address = parse_address(http)
+        people = http_access(http, folder, name)
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
-        how = ServerSettings(settings.admission_control, settings.merge)
+        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
             data = arguments.data or DATA
@@ -114,12 +110,13 @@ def run(arguments: argparse.Namespace) -> int:
             stack.enter_context(server)
             where = ", ".join(router.listen)
             print(stamped(f"map server {name} of fleet {keys.fleet} listens at {where}"), flush=True)
-            if address is not None:
-                stack.enter_context(Web(address, server, commands=arguments.http_commands))
-                print(stamped(f"for people: http://{':'.join(map(str, address))}/"), flush=True)
+            if people is not None:
+                stack.enter_context(people.serve(server))
+                print(stamped(f"for people: {people.url}"), flush=True)
             if arguments.demo:
                 stack.enter_context(RecordedFleet(bus, keys, name, data))
-            renewal = key_renewal(bus, folder, name, router)
+            renewed = people.renew if people is not None else lambda own: None
+            renewal = key_renewal(bus, folder, name, router, renewed)
             last_line, manager = "", ServiceManager()
             manager.ready()
             while not stop.wait(1.0):

@@ -203,12 +203,12 @@ def run_serve(arguments: argparse.Namespace) -> int:
     """Serve the simulated robots until stopped."""
     from mapweave.processes.simulator import run_sim
     from mapweave.scenarios.scenario import load_scenario, scenario_path
-    from mapweave.terminal import STAMP
+    from mapweave.terminal import log_with_time
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Which robots time waits for, and which agents have gone.
-    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
+    log_with_time()
     logging.getLogger("mapweave.sim").setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 SILENT = 5.0
 """A robot that has sent nothing for longer is shown as silent, s; it sends twice a second."""
-COLUMNS = ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "last trouble")
-LEAST = 12
+COLUMNS = ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "trouble")
+MAY_LACK = ("battery", "trouble")
+LEAST = 9
 """Characters that a column of words keeps on a narrow terminal."""
 EVERY = 0.5
 """Time between two looks, s."""
@@ -84,31 +85,33 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
 
     Args:
         status: of the fleet.
-        width: characters of a line; what is long is cut, and nothing else.
+        width: characters of a line; what is long is cut: words before places, and numbers never.
         plan: in the coordinates of which robots are; None: of the merged map.
     """
     from rich.markup import escape
     from rich.table import Table
 
     rows = [cells(robot, plan) for robot in status.robots]
-    widest = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
-    doing, trouble = COLUMNS.index("doing"), COLUMNS.index("last trouble")
-    over = sum(widest) + len(COLUMNS) - 1 - width
-    for column in (trouble, doing):
-        cut = min(max(over, 0), max(widest[column] - LEAST, 0))
-        widest[column], over = widest[column] - cut, over - cut
+    # A column in which no robot has anything is left out: most have no battery, and no trouble.
+    shown = [k for k, name in enumerate(COLUMNS) if name not in MAY_LACK or any(row[k] for row in rows)]
+    widest = {k: max(len(row[k]) for row in (COLUMNS, *rows)) for k in shown}
+    over = sum(widest.values()) + len(shown) - 1 - width
+    for column in (COLUMNS.index(name) for name in ("trouble", "doing", "mission", "at")):
+        if column in shown:
+            cut = min(max(over, 0), max(widest[column] - LEAST, 0))
+            widest[column], over = widest[column] - cut, over - cut
     lines = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    for column, name in enumerate(COLUMNS):
-        number = name in ("nodes", "battery", "unsent")
+    for column in shown:
+        number = COLUMNS[column] in ("nodes", "battery", "unsent")
         lines.add_column(
-            name,
+            COLUMNS[column],
             justify="right" if number else "left",
             no_wrap=True,
             width=widest[column],
             overflow="ellipsis",
         )
     for row in rows:
-        lines.add_row(*map(escape, row))
+        lines.add_row(*(escape(row[column]) for column in shown))
     return lines
 
 
@@ -117,7 +120,7 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
     status = robot.status
     age = "gone" if not robot.alive else f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
     if status is None:
-        return robot.robot, "", "", "", "", "", "", age, ""
+        return robot.robot, "", "", "", "", "", "", age, robot.over_quota
     doing = status.status
     mission = ""
     if (report := status.mission) is not None:
@@ -132,7 +135,8 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
         "" if status.battery is None else f"{status.battery:.0%}",
         str(status.unsent),
         age,
-        f"{status.last_error} ({status.error_age:.0f} s ago)" if status.last_error else "",
+        robot.over_quota
+        or (f"{status.last_error} ({status.error_age:.0f} s ago)" if status.last_error else ""),
     )
 
 

@@ -86,7 +86,8 @@ def _answer(bus: ZenohBus, network: NetworkSettings) -> Finding:
         )  # fmt: skip
     return wrong(
         SUBJECT, f"the router answers, and no map server of fleet {network.fleet}",
-        "start `mapweave server`; a robot alone needs none: --offline leaves this out",
+        "start `mapweave server`; with a key, `mapweave keys list` there says whether it is good; a robot "
+        "alone needs none: --offline leaves this out",
     )  # fmt: skip
 
 

@@ -64,7 +64,10 @@ def read_key_file(path: Path) -> KeyFile:
     if mode & 0o077 and not handed_over:
         raise SettingsError(f"{path}: others may read this key (mode {mode:03o}); run: chmod 600 {path}")
     try:
-        table = build(_Table, read_toml(path), str(path))
+        try:
+            table = build(_Table, read_toml(path), str(path))
+        except SettingsError as error:
+            raise SettingsError(f"{error}; it is no key file, or not whole: copy it once more") from None
         credentials = Credentials(
             table.name, table.role, table.authority, table.certificate, table.private_key, table.password
         )

@@ -3,6 +3,7 @@
 fleet.json        name of the fleet, profile, endpoints, identities; no secret in it
 authority.pem     certificate of the authority; authority.key signs with it
 passwords         of the lab profile, as the router reads them
+tokens.json       hashes of the tokens for HTTP
 NAME.key.toml     key file of NAME: copy it there
 """
 
@@ -22,6 +23,7 @@ import msgspec
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.node import check_name
 from mapweave.identities.key_file import SUFFIX, KeyFile, read_key_file, write_key_file, write_private
+from mapweave.identities.tokens import add_token, end_tokens
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Access, Credentials, Member, Role
@@ -205,8 +207,20 @@ class KeyFolder:
             raise InvalidValue(f"{name} has no key; these have: {known}")
         when = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         said = f"{when}{f': {because}' if because else ''}"
+        end_tokens(self.path, name)
         (self.path / f"{name}{SUFFIX}").unlink(missing_ok=True)
         self._keep(replace(identity, revoked=said, void=(*identity.void, (identity.subject, said))))
+
+    def token(self, name: str, days: float) -> str:
+        """A new token with which an identity logs in over HTTP; only its hash is kept.
+
+        Raises:
+            InvalidValue: there is no such identity with a good key.
+        """
+        identity = self.find(name)
+        if identity is None or identity.state != "good":
+            raise InvalidValue(f"{name} has no good key: make one, `mapweave keys add {name} --role ROLE`")
+        return add_token(self.path, name, days)
 
     def find(self, name: str) -> Identity | None:
         """The identity of this name."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.identities.key_folder import KeyFolder
+from mapweave.wire.credentials import Credentials
 from mapweave.wire.zenoh_bus import ZenohBus
 
 
@@ -17,7 +18,13 @@ class KeyRenewal:
     """
 
     def __init__(
-        self, bus: ZenohBus, folder: KeyFolder, server: str, listen: Sequence[str], say: Callable[[str], None]
+        self,
+        bus: ZenohBus,
+        folder: KeyFolder,
+        server: str,
+        listen: Sequence[str],
+        say: Callable[[str], None],
+        renewed: Callable[[Credentials], None] = lambda credentials: None,
     ) -> None:
         """Begin with the keys that the router has.
 
@@ -27,9 +34,10 @@ class KeyRenewal:
             server: name of the map server whose key the router has.
             listen: endpoints at which it listens.
             say: takes a line for people.
+            renewed: takes the server's own key, which may be another one now.
         """
         self._bus, self._folder, self._server, self._say = bus, folder, server, say
-        self._listen = tuple(listen)
+        self._listen, self._renewed = tuple(listen), renewed
         self._behind = False
         self._complaint = ""
 
@@ -40,7 +48,10 @@ class KeyRenewal:
                 self._complaint = ""
                 return
             self._behind = True
-            self._bus.reopen(self._folder.router(self._server, self._listen))
+            settings = self._folder.router(self._server, self._listen)
+            self._bus.reopen(settings)
+            if settings.credentials is not None:
+                self._renewed(settings.credentials)
         except MapweaveError as error:
             if str(error) != self._complaint:
                 self._say(f"the keys cannot be used, which is tried again: {error}")

@@ -60,8 +60,8 @@ QUALITY = 80
 """Of the JPEG images, %."""
 STEP = 0.02
 """m between two points of the path."""
-FREE, UNKNOWN, OCCUPIED = 254, 205, 0
-"""Greys of the floor, as in the map files of ROS."""
+FREE, UNKNOWN, OCCUPIED = 0, 255, 100
+"""Cells of the floor, as in an OccupancyGrid of ROS, where -1 is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,14 +326,24 @@ def _floor(cells: GridCells) -> rr.GridMap:
         width=image.shape[1], height=image.shape[0], color_model="L", channel_datatype="U8"
     )
     corner = [*cells.corner.tolist(), -0.01]
-    return rr.GridMap(data=image.tobytes(), format=form, cell_size=cells.side, translation=corner)
+    return rr.GridMap(
+        data=image.tobytes(),
+        format=form,
+        cell_size=cells.side,
+        translation=corner,
+        colormap=rr.components.Colormap.RvizMap,
+    )
 
 
 def _layout(robot: str) -> rrb.Blueprint:
     """The map on the left; camera, curves and words on the right."""
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Spatial3DView(origin=f"{robot}/map", name="map"),
+            rrb.Spatial3DView(
+                origin=f"{robot}/map",
+                name="map",
+                eye_controls=rrb.EyeControls3D(position=(-4.0, 0.0, 6.0), look_target=(1.0, 0.0, 0.0)),
+            ),
             rrb.Vertical(
                 rrb.Spatial2DView(origin=f"{robot}/map/robot/camera", name="camera"),
                 rrb.TimeSeriesView(origin=f"{robot}/bearings", name="bearings against the limit, deg"),

@@ -25,5 +25,6 @@ class ServerWatch:
         self._missing = True
         return (
             f"no map server {self._server} in reach for {PATIENCE:g} s: what is mapped stays on this disk; "
-            "start `mapweave server`, with the same --fleet"
+            "start `mapweave server`, with the same --fleet; with a key, `mapweave keys list` there says "
+            "whether it is good"
         )

@@ -5,14 +5,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 
+from mapweave.hybridmap.errors import DeviceError
 from mapweave.sim.bridge import SimBridge
 from mapweave.sim.robots import RobotSetup
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
 from mapweave.wire.bus import Bus
+from mapweave.wire.keys import Keys
 
 PATIENCE = 60.0
 """How long the other robots wait for one that does not ask, s; they must not give up their body before."""
+ANSWER = 1.0
+"""A base that is there answers sooner, s."""
 
 
 def run_sim(
@@ -36,8 +40,12 @@ def run_sim(
         held: time passes only on request.
 
     Raises:
-        MapweaveError: the world holds no place for so many robots.
+        MapweaveError: the world holds no place for so many robots, or one of them has a base already.
     """
+    for name in (setup.name for setup in robots):
+        # Two bases of one name would end the agent that drives the first.
+        if any(not reply.error for reply in bus.ask(Keys(fleet).robot_describe(name), b"", ANSWER)):
+            raise DeviceError(f"robot {name} has a base already: stop the other `mapweave sim serve`")
     with Simulation(world, robots, seed) as simulation:
         bridge = SimBridge(simulation, bus, fleet, PATIENCE, held=held)
         try:

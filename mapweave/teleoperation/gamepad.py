@@ -48,7 +48,9 @@ class Gamepad:
         try:
             self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
-            raise DeviceError(f"gamepad {path}: {error.strerror}") from None
+            raise DeviceError(
+                f"gamepad {path}: {error.strerror}; connect it, or give its device, --gamepad /dev/input/js1"
+            ) from None
 
     def fileno(self) -> int:
         """For `select`."""

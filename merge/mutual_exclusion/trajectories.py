@@ -62,14 +62,26 @@ class RobotTrajectory:
         return out
 
 
+BACKWARDS = 1.0
+"""By which a clock may be set back while a robot maps, s."""
+
+
+def runs_backwards(nodes: Collection[Node]) -> bool:
+    """Whether the clock of a robot's nodes does: they are numbered in the order in which they were made."""
+    times = _seconds(sorted(nodes, key=lambda node: node.id))
+    return bool(len(times) and (np.maximum.accumulate(times) - times).max() > BACKWARDS)
+
+
 def trajectories_of(nodes: Collection[Node]) -> tuple[RobotTrajectory, ...]:
-    """The trajectories of one robot's nodes, one a clock; nodes of unknown clocks are left out."""
+    """The trajectories of one robot's nodes, one a clock, without clocks unknown or running backwards."""
     by_clock: dict[str, list[Node]] = {}
     for node in nodes:
         if node.clock:
             by_clock.setdefault(node.clock, []).append(node)
     trajectories = []
     for clock, nodes_of_clock in sorted(by_clock.items()):
+        if runs_backwards(nodes_of_clock):
+            continue
         nodes_of_clock.sort(key=lambda node: (node.stamp_ns, node.id))
         radius = min(node.radius for node in nodes_of_clock)
         # Segments of neighbours may overlap by a rounded moment: they are ordered by time here.

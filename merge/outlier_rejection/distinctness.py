@@ -10,6 +10,10 @@ Sparck Jones 1972; here geometry shows at how many places a landmark is.)
 
 What remains of a true link is unique: a sign, a wall, a bay with other goods.
 
+Who says that a landmark occurs twice is the source of that: the robot by whose drive the two places differ.
+A robot is believed about the links of its own maps; about links between others only if a second one says the
+same. Else one robot with a wrong drive, or with copies of others' nodes, would part all maps.
+
 Landmarks are followed from node to node, by the images that a robot saw on its way and by loops that agree
 with it: what is found out at one node holds for all that show the same thing.
 """
@@ -39,6 +43,10 @@ FOLLOWED = (EdgeKind.MAPPED, EdgeKind.TURNED)
 
 Landmark = tuple[NodeId, int]
 """Which node, and which of its landmarks."""
+ENOUGH = 2
+"""Robots that say the same are believed about all links."""
+Sources = dict[Landmark, set[str]]
+"""Aliased landmarks with the names of robots that say so, `ENOUGH` of them at most."""
 
 
 def weigh(
@@ -65,18 +73,18 @@ def weigh(
     claims = [link_of(e) for e in own if e.kind is EdgeKind.LOOP]
     with_landmarks = (link for link in (*links, *claims) if len(link.shared))
     connected = [link for link in with_landmarks if link.a in by_node and link.b in by_node]
-    aliased: set[Landmark] = set()
+    aliased: Sources = {}
     if connected:
         sides = _Sides.of(connected, by_node)
         loops, pairs = sides.loops(), sides.pairs()
         astray = sides.contradict(loops, None, c)
-        for k in loops[astray]:
-            aliased |= _ends(connected[k])
+        claimed = [(end, connected[k].a.agent) for k in loops[astray] for end in _ends(connected[k])]
         for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c)]:
             node, a, b = sides.meeting(i, j)
-            aliased |= {(node, int(landmark)) for landmark in np.intersect1d(a, b)}
-        if aliased:
-            aliased = _followed(aliased, [connected[k] for k in loops[~astray]], maps)
+            source = sides.agent(i)
+            claimed += [((node, int(landmark)), source) for landmark in np.intersect1d(a, b)]
+        if claimed:
+            aliased = _followed(claimed, [connected[k] for k in loops[~astray]], maps)
     return [_weighed(link, aliased) for link in links]
 
 
@@ -164,6 +172,11 @@ class _Sides:
         a, b = (link.shared[:, column] for link, column in zip(links, columns, strict=True))
         return links[0].pair[columns[0]], a, b
 
+    def agent(self, side: int) -> str:
+        """The robot into whose map a side goes."""
+        agent: str = self.graphs[self.fragments[self.far[side]]].anchor.agent
+        return agent
+
     def contradict(
         self,
         sides: NDArray[np.int64],
@@ -207,23 +220,26 @@ def _ends(link: Link) -> set[Landmark]:
 
 
 def _followed(
-    aliased: Iterable[Landmark], loops: Sequence[Link], maps: Mapping[MapId, HybridMap]
-) -> set[Landmark]:
-    """All landmarks that show the same things as some."""
+    claimed: Iterable[tuple[Landmark, str]], loops: Sequence[Link], maps: Mapping[MapId, HybridMap]
+) -> Sources:
+    """All landmarks that show the same things as some that are claimed to be aliased, with who says so."""
     by_loop: dict[NodeId, list[Link]] = defaultdict(list)
     for link in loops:
         by_loop[link.a].append(link)
         by_loop[link.b].append(link.turned())
     onward: dict[NodeId, dict[int, list[Landmark]]] = {}
-    reached, waiting = set(aliased), list(aliased)
+    sources: Sources = defaultdict(set)
+    waiting = list(claimed)
     while waiting:
-        node, landmark = waiting.pop()
+        (node, landmark), source = waiting.pop()
+        known = sources[node, landmark]
+        if source in known or len(known) == ENOUGH:
+            continue
+        known.add(source)
         if node not in onward:
             onward[node] = _next_to(node, by_loop.get(node, ()), maps[node.map])
-        fresh = [same for same in onward[node].get(landmark, ()) if same not in reached]
-        reached.update(fresh)
-        waiting += fresh
-    return reached
+        waiting += [(same, source) for same in onward[node].get(landmark, ())]
+    return sources
 
 
 def _next_to(node: NodeId, loops: Iterable[Link], hybrid_map: HybridMap) -> dict[int, list[Landmark]]:
@@ -237,10 +253,16 @@ def _next_to(node: NodeId, loops: Iterable[Link], hybrid_map: HybridMap) -> dict
     return table
 
 
-def _weighed(link: Link, aliased: set[Landmark]) -> Link:
+def _weighed(link: Link, aliased: Sources) -> Link:
     count = 0
     if aliased:
-        count = sum((link.a, i) in aliased or (link.b, j) in aliased for i, j in link.shared.tolist())
+        agents = {link.a.agent, link.b.agent}
+
+        def counts(landmark: Landmark) -> bool:
+            sources = aliased.get(landmark, ())
+            return len(sources) == ENOUGH or not agents.isdisjoint(sources)
+
+        count = sum(counts((link.a, i)) or counts((link.b, j)) for i, j in link.shared.tolist())
     if count == link.aliased:
         return link
     evidence = {name: value for name, value in link.evidence.items() if name != ALIASED}

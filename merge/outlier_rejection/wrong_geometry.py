@@ -14,6 +14,8 @@ So a map is wrong if lines of sight refute every placement among several maps th
 Clutter and wrong depths are seen through at true places too. Their share is measured on the same nodes, each
 placed by its own links. Unobserved placements are not refuted, and the map may be right: it may have a room
 that only looks like theirs.
+
+A map that is only a little wrong is seen through nowhere: see `mapweave.merge.outlier_rejection.bent_maps`.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from scipy.special import bdtrc
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
+from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
@@ -43,9 +46,6 @@ MOST_LINKS = 60
 """Links between two pieces of map that are tested, evenly chosen: pairs of links grow by the square."""
 MOST_PARTNERS = 5
 """Maps against which one is held: those with which it has most links."""
-AGREEING = 0.9
-"""Two maps agree if this share of their links do: a few are false. Sound maps of the benchmark have 0.97 and
-more, those of a robot with wrong geometry up to 0.75."""
 LEAST_SHARE = 0.25
 """A set of links is a placement if it has this share of the links of the largest set."""
 RARE = 0.05
@@ -255,6 +255,8 @@ def all_refuted(
     """
     if not _nodes_agree(links, fixed):
         return False
+    if is_bent(links, placed, fixed):
+        return True
     sets = link_sets(links, placed, fixed, s)
     sets = [some_links for some_links in sets if len(some_links) >= LEAST_SHARE * len(sets[0])]
     own: dict[NodeId, list[Link]] = {}

@@ -127,7 +127,10 @@ class MergedMap:
             nodes.
         faded: (N,) of nodes, which of their landmarks have faded, see
             mapweave.merge.map_maintenance.landmark_removal. Nodes without faded landmarks are left out.
-        set_apart: maps that are not among these, because the merge fails with them, and why.
+        set_apart: maps that are not among these, because the merge fails with them or they are copies, and
+            why.
+        implausible: maps in which is what no robot can have measured, and what; see
+            mapweave.mapserver.plausibility.
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
         contradicted: links by hand that the rest of the map contradicts, by their nodes, and how.
         pins: people's pins of components' frames, oldest first.
@@ -143,6 +146,7 @@ class MergedMap:
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     set_apart: Mapping[MapId, str] = field(default_factory=dict)
+    implausible: Mapping[MapId, str] = field(default_factory=dict)
     wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
     contradicted: Mapping[tuple[NodeId, NodeId], str] = field(default_factory=dict)
     pins: tuple[Pin, ...] = ()
@@ -194,6 +198,15 @@ class MergedMap:
             some = f"of its {len(numbers)} nodes the nearest are {', '.join(map(str, nearest))}"
             span = some if numbers else "it has none"
             raise InvalidValue(f"map {which} has no node {end.number}; {span}")
+
+    def accusations(self) -> dict[MapId, str]:
+        """What is held against maps, in a few words each."""
+        wrong = {which: verdict.reason for which, verdict in self.wrong.items()}
+        implausible = {
+            which: f"map {which} is implausible: {reason}" for which, reason in self.implausible.items()
+        }
+        apart = {which: f"map {which} is set apart: {reason}" for which, reason in self.set_apart.items()}
+        return implausible | wrong | apart
 
     def joined(self, first: MapId, second: MapId) -> bool:
         """Whether any node of one map is in one component with any of the other."""

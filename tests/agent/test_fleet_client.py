@@ -35,6 +35,7 @@ from mapweave.hybridmap.query import (
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, decode_view, encode
+from mapweave.wire.senders import sent_by_any
 from mapweave.wire.traffic_meter import TrafficMeter
 from tests.waiting import eventually
 
@@ -269,8 +270,8 @@ def test_the_servers_answers_come_with_their_numbers(link: FleetClient, other: M
         asked.append(decode(request.payload, RouteRequest))
         request.reply(encode(RouteAnswer((), "no way")))
 
-    other.serve(KEYS.relocalize("s0"), relocalize)
-    other.serve(KEYS.route("s0"), route)
+    other.serve(sent_by_any(KEYS.relocalize("s0")), relocalize)
+    other.serve(sent_by_any(KEYS.route("s0")), route)
     link.ask(WhereAmI(1, VIEW))
     link.ask(WhichWay(2, HERE, THERE, Pose2(0.25, -0.5, 1.0), ((HERE, THERE),)))
     first, second = link.answers(wait=True)
@@ -296,7 +297,7 @@ def test_it_gets_what_others_have_mapped(link: FleetClient, other: MemoryBus) ->
         asked.append(decode(request.payload, KnownRequest))
         request.reply(encode(KnownAnswer(np.array([[1.0, 2.0, 0.5, 0.5]]), "one view")))
 
-    other.serve(KEYS.known("s0"), known)
+    other.serve(sent_by_any(KEYS.known("s0")), known)
     link.ask(WhatIsKnown(-1, MAP, 1.5, -2.0, 9.0))
     (answer,) = link.answers(wait=True)
     assert asked == [KnownRequest(MAP, 1.5, -2.0, 9.0)]
@@ -311,7 +312,7 @@ def test_a_robot_never_waits(link: FleetClient, other: MemoryBus) -> None:
         release.wait(60)
         request.reply(encode(RouteAnswer((), "at last")))
 
-    other.serve(KEYS.route("s0"), slow)
+    other.serve(sent_by_any(KEYS.route("s0")), slow)
     begin = time.monotonic()
     link.ask(WhichWay(1, HERE, THERE))
     assert link.answers() == ()
@@ -324,7 +325,7 @@ def test_a_robot_never_waits(link: FleetClient, other: MemoryBus) -> None:
 
 def test_waiting_ends_when_the_time_is_over(link: FleetClient, other: MemoryBus) -> None:
     release = threading.Event()
-    other.serve(KEYS.route("s0"), lambda request: release.wait(60))
+    other.serve(sent_by_any(KEYS.route("s0")), lambda request: release.wait(60))
     begin = time.monotonic()
     for number in (1, 2):
         link.ask(WhichWay(number, HERE, THERE))
@@ -335,17 +336,17 @@ def test_waiting_ends_when_the_time_is_over(link: FleetClient, other: MemoryBus)
 
 
 def test_a_refusal_is_quoted_and_another_servers_answer_is_used(link: FleetClient, other: MemoryBus) -> None:
-    other.serve(KEYS.route("s0"), lambda request: request.refuse("no such node"))
+    other.serve(sent_by_any(KEYS.route("s0")), lambda request: request.refuse("no such node"))
     link.ask(WhichWay(1, HERE, THERE))
     (answer,) = link.answers(wait=True)
     assert answer.content is None
     assert "no such node" in answer.error
-    other.serve(KEYS.route("s1"), lambda request: request.reply(b"garbage"))
+    other.serve(sent_by_any(KEYS.route("s1")), lambda request: request.reply(b"garbage"))
     link.ask(WhichWay(2, HERE, THERE))
     (answer,) = link.answers(wait=True)
     assert answer.content is None
     assert answer.error
-    other.serve(KEYS.route("s2"), lambda request: request.reply(encode(RouteAnswer((), "yes"))))
+    other.serve(sent_by_any(KEYS.route("s2")), lambda request: request.reply(encode(RouteAnswer((), "yes"))))
     link.ask(WhichWay(3, HERE, THERE))
     (answer,) = link.answers(wait=True)
     assert isinstance(answer.content, RouteAnswer)
@@ -355,7 +356,7 @@ def test_a_question_that_cannot_be_sent_is_answered_and_the_next_one_is_asked(
     link: FleetClient, other: MemoryBus
 ) -> None:
     """A robot that stood before very many closed doors must not lose its voice, nor stop a lock-step."""
-    other.serve(KEYS.route("s0"), lambda request: request.reply(encode(RouteAnswer((), "yes"))))
+    other.serve(sent_by_any(KEYS.route("s0")), lambda request: request.reply(encode(RouteAnswer((), "yes"))))
     link.ask(WhichWay(1, HERE, THERE, Pose2(), ((HERE, THERE),) * (MAX_BLOCKED + 1)))
     link.ask(WhichWay(2, HERE, THERE))
     got: list[Answer] = []

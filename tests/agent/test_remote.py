@@ -31,6 +31,8 @@ from mapweave.agent.observation import Command, Observation, Odometry, RobotDesc
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
 from mapweave.processes import simulator
+from mapweave.sim.robots import robot_setups
+from mapweave.sim.worlds.office import make_office
 from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.bus import Request
 from mapweave.wire.keys import Keys
@@ -361,3 +363,16 @@ def test_a_closed_robot_senses_nothing(body: Body, bus: MemoryBus) -> None:
     robot.close()
     assert robot.sense() is None
     assert body.steps == []
+
+
+def test_a_second_simulator_ends_before_it_disturbs_the_first() -> None:
+    """Its base would answer as well, and the agent that drives the first one ends then."""
+    hub = MemoryHub()
+    first, second = MemoryBus(hub), MemoryBus(hub)
+    first.serve(KEYS.robot_describe("r1"), lambda request: request.reply(b"a description"))
+    robots = robot_setups(["r0", "r1"])
+    (stop := threading.Event()).set()
+    with pytest.raises(
+        DeviceError, match=r"^robot r1 has a base already: stop the other `mapweave sim serve`$"
+    ):
+        simulator.run_sim(second, KEYS.fleet, make_office(1), robots, 1, stop)

@@ -108,9 +108,9 @@ def test_a_robot_that_promises_none_is_not_held_back_by_their_silence(walls):
 def test_a_single_sensor_is_named() -> None:
     monitor = RangerMonitor(RobotDescription(BODY.camera, ranger_bearings=(0.0,), ranger_reach=1.0))
     assert monitor.fault == ""
-    monitor.see(np.zeros(0))
+    monitor.see(np.zeros(0), Odometry(0.0, 0.0))
     assert monitor.fault == "1 proximity sensor promised, none read for 0.1 s: standing"
-    monitor.see(np.array([0.4]))
+    monitor.see(np.array([0.4]), Odometry(0.0, 0.0))
     assert monitor.fault == ""
 
 

@@ -22,6 +22,8 @@ WRONG = [
     ("landmarks", "--pairs 1", "at least 2 pairs, 0 places and seed 0"),
     ("landmarks", "--places -1", "at least 2 pairs, 0 places and seed 0"),
     ("landmarks", "--pairs x", "--pairs"),
+    ("flood", "--seconds nan", "--seconds and --rate must be positive"),
+    ("flood", "--rate 0", "--seconds and --rate must be positive"),
     ("fuzz", "--seconds 0", "seconds above 0"),
     ("life_sim", "--drives 0", "at least one drive"),
     ("mapping_run", "--out {file}", "name a folder that can be written"),
@@ -36,6 +38,7 @@ WRONG = [
     ("sim", "--robots 3 17", "--robots"),
     ("sim", "--seconds 0", "--seconds"),
     ("sim", "--seconds nan", "--seconds"),
+    ("trust", "--lying 0", "trust: a seed of 0 or more"),
     ("tracking", "--drives 0", "tracking: at least 1 drive, 12 frames and seed 0 are needed"),
     ("tracking", "--frames 3", "tracking: at least 1 drive, 12 frames and seed 0 are needed"),
 ]

@@ -10,6 +10,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest, IngestSettings
 from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.quotas import Quotas
 from mapweave.wire.bus import Request
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
@@ -72,8 +73,8 @@ class HandAgent:
 class Server:
     """An ingest with its store, which can be restarted."""
 
-    def __init__(self, hub: MemoryHub, path: Path, name: str = "s0") -> None:
-        self.hub, self.path, self.name = hub, path, name
+    def __init__(self, hub: MemoryHub, path: Path, name: str = "s0", quotas: Quotas | None = None) -> None:
+        self.hub, self.path, self.name, self.quotas = hub, path, name, quotas
         self.seen: list[Change] = []
         self.on_change: Callable[[Change], None] = self.seen.append
         self.begin()
@@ -81,7 +82,9 @@ class Server:
     def begin(self) -> None:
         self.bus = MemoryBus(self.hub)
         self.store = Store(self.path)
-        self.ingest = Ingest(self.bus, KEYS, self.store, self.name, lambda c: self.on_change(c), QUICK)
+        self.ingest = Ingest(
+            self.bus, KEYS, self.store, self.name, lambda c: self.on_change(c), QUICK, quotas=self.quotas
+        )
 
     def end(self) -> None:
         self.ingest.close()

@@ -64,7 +64,8 @@ class Asking:
 
     def http(self, method: str, body: object = None) -> tuple[int, dict[str, Any]]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        connection.request(method, "/constraints", None if body is None else json.dumps(body).encode())
+        data = None if body is None else json.dumps(body).encode()
+        connection.request(method, "/constraints", data, {"Content-Type": "application/json"})
         reply = connection.getresponse()
         return reply.status, json.loads(reply.read())
 

@@ -15,7 +15,7 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.fleet import Fleet
-from mapweave.hybridmap.annotation import Annotation, Annotations, Place
+from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
@@ -106,7 +106,7 @@ def link_status():
 def ask(web: Web, method: str, path: str, body: object = None) -> tuple[int, dict]:
     connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=20)
     data = body if isinstance(body, bytes) else json.dumps(body).encode() if body is not None else None
-    connection.request(method, path, data)
+    connection.request(method, path, data, {"Content-Type": "application/json"})
     reply = connection.getresponse()
     content = reply.read()
     connection.close()
@@ -300,6 +300,10 @@ def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.C
                 assert "map r0.1" not in person.annotate("floor", "r0.1", node=str(first), label="ground")
                 with pytest.raises(InvalidValue, match=r"floor of map r1\.1 cannot be called 'r0.1'"):
                     person.annotate("floor", "r0.1", node="r1.1.1", label="upper")
+                upper = Annotation("r1.1", Floor(NodeId("r1", 1, 1), "upper"), False, "anna", 1)
+                count = len(server.merged().links)
+                said = server.annotate(upper, check=True)
+                assert said.endswith(f"; {count} links between this map and maps on other floors"), said
                 person.annotate("floor", "r1.1", node="r1.1.1", label="upper")
                 eventually(lambda: server.status()["components"] == 2)
             answer = server.locate(lambda: view, 1).result(20.0)

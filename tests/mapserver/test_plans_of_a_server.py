@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -65,6 +66,7 @@ def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
 
 def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> None:
     fleet = house.person
+    assert house.server.settle(20.0)
     with pytest.raises(InvalidValue, match="the image of this plan is not on the server"):
         fleet.annotate("plan", "flat", **fields())
     assert fleet.put_plan_image(PNG.png).sha256 == PNG.image.sha256
@@ -72,6 +74,7 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
         fleet.annotate("plan", "flat", **{**fields(), "pairs": fields()["pairs"][:2]})  # type: ignore[index]
     assert fleet.annotate("plan", "flat", **fields()) == "plan flat is flat.png, 4 pairs, 0.02 m/px, by anna"
     for _ in range(2):
+        assert house.server.settle(20.0)
         placed = fleet.plans().plan("flat")
         assert np.allclose(placed.part().plan_from_merged.vector, PLAN_FROM_MERGED.vector, atol=1e-6)
         assert fleet.plan_image(placed.plan.image.sha256) == PNG.png
@@ -129,6 +132,7 @@ def test_an_image_comes_in_pieces_and_in_order(house: House) -> None:
 
 
 def test_plans_over_http(house: House) -> None:
+    assert house.server.settle(20.0)
     with Web(("127.0.0.1", 0), house.server) as served:
         jpeg = cv2.imencode(".jpg", np.full((500, 400), 200, np.uint8))[1].tobytes()
         status, _, body = ask(served, "POST", "/plans", jpeg)
@@ -148,6 +152,50 @@ def test_plans_over_http(house: House) -> None:
         assert cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (500, 400)
         assert ask(served, "GET", "/plans/none.png")[0] == 400
         assert ask(served, "POST", "/plans", b"a page")[0] == 400
+
+
+def test_a_plan_is_tried_over_http_before_it_is_kept(house: House) -> None:
+    """The image may come with its map.yaml; the fit comes without anything being kept."""
+    assert house.server.settle(20.0)
+    described = "image: flat.pgm\nresolution: 0.02\norigin: [1.0, -2.0, 0.5]\nnegate: 1\n"
+    pgm = cv2.imencode(".pgm", np.full((500, 400), 200, np.uint8))[1].tobytes()
+
+    def form(words: str) -> tuple[int, dict[str, Any]]:
+        parts = (("map", words.encode()), ("image", pgm))
+        body = b"".join(
+            f'--b\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'.encode() + data + b"\r\n"
+            for name, data in parts
+        )
+        headers = {"Content-Type": "multipart/form-data; boundary=b"}
+        status, _, content = ask(served, "POST", "/plans", body + b"--b--\r\n", headers)
+        return status, json.loads(content)
+
+    def try_out(**body: Any) -> tuple[int, dict[str, Any]]:
+        posted = {"name": "flat", "body": {"kind": "plan", **body}, "check": True}
+        status, _, content = ask(served, "POST", "/annotations", json.dumps(posted).encode())
+        return status, json.loads(content)
+
+    with Web(("127.0.0.1", 0), house.server) as served:
+        status, kept = form(described)
+        assert status == 200 and kept["metres_per_pixel"] == 0.02 and kept["origin"] == [1.0, -2.0, 0.5]
+        png = ask(served, "GET", f"/plan-images/{kept['sha256']}.png")[2]
+        assert (cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE) == 55).all(), "negated"
+        assert form(described.replace("0.02", "-1")) == (
+            400,
+            {"error": "map.yaml: resolution -1: give metres in a pixel, for example 0.05"},
+        )
+        assert ask(served, "GET", f"/plan-images/{'0' * 64}.png")[0] == 503
+        image = {name: kept[name] for name in ("sha256", "width", "height", "file")}
+        known = {**fields(), "image": image}
+        status, answer = try_out(**known)
+        (part,) = answer["plan"]["parts"]
+        assert status == 200 and answer["said"].startswith("only checked, nothing is changed: plan flat is")
+        assert part["plan_from_merged"] == pytest.approx(PLAN_FROM_MERGED.vector.tolist(), abs=1e-6)
+        assert [pair["off"] for pair in part["pairs"]] == pytest.approx([0.0] * 4, abs=1e-6)
+        status, answer = try_out(**{**known, "pairs": fields()["pairs"][:2]})  # type: ignore[index]
+        assert status == 400 and "3 are needed" in answer["error"]
+        assert json.loads(ask(served, "GET", "/annotations")[2]) == {"annotations": []}
+        assert house.server.plans().plans == ()
 
 
 def test_plans_and_pins_of_a_map_file_from_the_shell(

@@ -19,7 +19,6 @@ from mapweave.hybridmap.query import (
     RelocalizeAnswer,
     RouteAnswer,
     RouteRequest,
-    View,
 )
 from mapweave.mapserver.admission_control import AdmissionSettings
 from mapweave.mapserver.merging.merger import Merger
@@ -167,7 +166,7 @@ def test_errors_are_reported_and_cost_no_worker(
     assert reply.error.startswith("view:")
     assert reply.retry_after == 0.0
 
-    def broken(self: Relocalizer, view: View) -> RelocalizeAnswer:
+    def broken(self: Relocalizer, *_: object) -> RelocalizeAnswer:
         raise ZeroDivisionError("a defect")
 
     with monkeypatch.context() as patch:

@@ -125,7 +125,11 @@ class Fleet:
         self.server_bus, self.bus = MemoryBus(hub), MemoryBus(hub)
         self.acks: list[Ack] = []
         self.server = MapServer(self.server_bus, KEYS, path, "s0").__enter__()
-        self.bus.subscribe(KEYS.acks(BAD.agent), lambda sample: self.acks.append(Ack.decode(sample.payload)))
+        self.acks_of(BAD.agent)
+
+    def acks_of(self, agent: str) -> None:
+        """Hear the acknowledgements for a robot."""
+        self.bus.subscribe(KEYS.acks(agent), lambda sample: self.acks.append(Ack.decode(sample.payload)))
 
     def ask(self, key: str, payload: bytes) -> Reply:
         (reply,) = self.bus.ask(key, payload, 20.0)
@@ -346,6 +350,10 @@ def test_nodes_that_show_the_same_break_nothing(beside: Beside) -> None:
             if isinstance(body, NodePut) and rng.random() < 0.8:
                 like = seen[rng.integers(len(seen))]
                 some = like.landmarks.take(np.arange(rng.integers(30, len(like.landmarks))))
+                # Bit by bit they would be copies.
+                some = replace(
+                    some, codes=(some.codes ^ rng.integers(0, 2, some.codes.shape)).astype(np.uint8)
+                )
                 body = NodePut(replace(body.node, landmarks=some, camera=like.camera))
             log.append((map_id, body))
         merged, _ = beside.merged(log)

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from mapweave.cli import main
-from mapweave.commands.status import cells, table
+from mapweave.commands.status import COLUMNS, MAY_LACK, cells, table
 from mapweave.exit_status import NO
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
@@ -157,7 +157,9 @@ def test_without_a_router_one_line_says_so_and_what_to_do(
         where = f"tcp/127.0.0.1:{deaf.getsockname()[1]}"
         began = time.monotonic()
         output = complaint(capfd, *words.split(), *ASKING[words], "--connect", where)
-        assert f"no router at {where}: start `mapweave server`" in output
+        assert (
+            f"no router at {where}: what listens there does not let this in; if the fleet has keys" in output
+        )
         assert time.monotonic() - began < 5.0, "Zenoh's own patience is 10 s, that for an answer 20 s"
 
 
@@ -180,3 +182,24 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         _, line = printed.getvalue().splitlines()
         assert len(line) <= width and "go to r1.1.5 (kitchen) running 25%" in line and "7.0 s silent" in line
         assert ("0.4 m to node r1.1.5" in line) is (width == 240)
+
+
+def test_a_terminal_of_80_columns_shows_every_column() -> None:
+    """Each was cut to three characters there: `ro… mission doing at no… batt… un… age last tro…`."""
+    robots = []
+    for name, trouble in (("r0", ""), ("r1", "no map server answered")):
+        order = MissionOrder("a1", name, MissionKind.GO, 1, "anna", NodeId("r1", 1, 5), "kitchen")
+        doing = Status("driving along the route", "0.4 m to node r1.1.5", 128, 40, Pose2(), False)
+        mission = MissionReport(order, MissionState.RUNNING, 0.25)
+        status = AgentStatus(
+            doing, 1, name, 1, 1234, mission=mission, battery=0.5 if trouble else None, last_error=trouble
+        )
+        robots.append(RobotEntry(name, True, 7.04, status, Pose2(-12.345, -5.0, 3.0), 2))
+    for shown in (robots[:1], robots):
+        lines = Console(width=80, file=(printed := io.StringIO()))
+        lines.print(table(FleetStatus(tuple(shown)), 80))
+        head, *rows = printed.getvalue().splitlines()
+        assert [name for name in COLUMNS if name in head] == (
+            [name for name in COLUMNS if name not in MAY_LACK] if shown == robots[:1] else list(COLUMNS)
+        ), head
+        assert all("128" in row and "1234" in row and "7.0 s silent" in row for row in rows), rows

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from rerun.components import Colormap
 from scipy.spatial.transform import Rotation
 
 from mapweave.agent.localization.fix import Fix
@@ -156,6 +157,9 @@ def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen() -
     assert len(places) and np.abs(places - [1.02, 2.02 + reach]).max() < side
     middle = image[len(image) - 1 - int((2.4 - y) / side), int((1.02 - x) / side)]
     assert middle == FREE
+    # Without a colormap the viewer draws greys as costs: all floor was one orange sheet.
+    assert map_.colormap is not None
+    assert map_.colormap.as_arrow_array().to_pylist() == [Colormap.RvizMap.value]
 
 
 def test_the_loop_never_waits_for_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,7 +65,8 @@ def get(http: int, path: str) -> dict:
 
 
 def post(http: int, path: str, content: dict) -> dict:
-    request = Request(f"http://127.0.0.1:{http}/{path}", json.dumps(content).encode())
+    data, headers = json.dumps(content).encode(), {"Content-Type": "application/json"}
+    request = Request(f"http://127.0.0.1:{http}/{path}", data, headers)
     with urlopen(request, timeout=10) as reply:
         return json.load(reply)
 
@@ -138,8 +139,14 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
             # It is undone, and taken back.
             a, b = page.run("return ['a', 'b'].map(name => document.getElementById(name).value)")
             standing = f"explain?a={a}&b={b}"
-            page.run("document.querySelector('#result form input').value = 'two kitchens'")
-            page.run("document.querySelector('#result form').requestSubmit()")
+            page.run(
+                "[...document.querySelectorAll('#result button')]"
+                ".find(one => one.textContent === 'Undo this link').click()"
+            )
+            page.type("#edit-because", "two kitchens")
+            page.run("document.getElementById('edit-check').click()")
+            eventually(lambda: "1 link is undone" in page.run(TEXT.format("edit-answer")))
+            page.run("document.getElementById('edit-apply').click()")
             eventually(lambda: "two kitchens" in page.run(TEXT.format("corrections")))
             eventually(lambda: get(http, standing).get("standing") == "undone")
             page.run("document.querySelector('#corrections button').click()")

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -117,3 +118,27 @@ def test_progress_is_a_plain_line_now_and_then_where_there_is_no_terminal() -> N
     ]
     console, file = plain()
     assert list(tracked([], "frames", console=console)) == [] and file.getvalue() == ""
+
+
+def test_a_long_detail_leaves_the_numbers_of_a_bar() -> None:
+    """On 80 columns they were cut away: `d… 11 nodes, 51 of 53 features left ...`."""
+    file = io.StringIO()
+    with Bar(Console(file=file, force_terminal=True, width=80, color_system=None), "drive", 1475) as bar:
+        bar.update(324, "11 nodes, 51 of 53 features left after 0.6 m; 36 landmarks in view are too few")
+    last = file.getvalue().split("\r")[-1]
+    assert "drive " in last and " 324/1475 " in last and "11 nodes, 51 of 53" in last and "…" in last
+
+
+@pytest.mark.parametrize("words", ["agent r0", "router", "server", "sim serve office"])
+def test_warnings_of_any_part_have_the_time(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`a tick took 459 ms instead of 100` stood without it among lines that have it."""
+
+    class Asked(Exception):
+        pass
+
+    def asked(**options: str) -> None:
+        raise Asked(time.strftime(options["datefmt"]) + options["format"].removeprefix("%(asctime)s"))
+
+    monkeypatch.setattr("logging.basicConfig", asked)
+    with pytest.raises(Asked, match=f"^{STAMP}"):
+        main(words.split())

@@ -38,6 +38,48 @@ def test_its_command_parses(unit: Path) -> None:
     assert str(arguments.data).startswith("/var/lib/mapweave")
 
 
+def directives(unit: Path) -> dict[str, list[str]]:
+    """All values of each directive."""
+    given: dict[str, list[str]] = {}
+    for line in unit.read_text().splitlines():
+        name, equals, value = line.partition("=")
+        if equals and not line.startswith("#"):
+            given.setdefault(name, []).append(value)
+    return given
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+def test_it_is_hardened_and_writes_only_where_it_may(unit: Path) -> None:
+    given = directives(unit)
+    for name in ("NoNewPrivileges", "PrivateTmp", "ProtectHome", "DynamicUser", "RestrictSUIDSGID"):
+        assert given[name] == ["yes"], name
+    assert given["ProtectSystem"] == ["strict"] and given["CapabilityBoundingSet"] == [""]
+    assert given["MemoryMax"] and given["TasksMax"]
+    writable = [
+        Path("/var/lib") / given["StateDirectory"][0],
+        Path("/var/cache") / given["CacheDirectory"][0],
+    ]
+    words = given["ExecStart"][0].replace("%i", "r0").split()
+    used = [Path(words[words.index(flag) + 1]) for flag in ("--data", "--calibration") if flag in words]
+    used += [Path(given["WorkingDirectory"][0]), Path(given["Environment"][0].partition("=")[2])]
+    arguments = parser().parse_args(words[1:])
+    # A default that is relative lies below the working directory.
+    used += [value for name, value in vars(arguments).items() if name in ("data", "calibration") and value]
+    for path in used:
+        assert any((writable[0] / path).is_relative_to(folder) for folder in writable), path
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+def test_systemd_finds_little_exposure(unit: Path, tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("needs systemd-analyze")
+    copy = tmp_path / unit.name.replace("@", "@r0")
+    copy.write_text(unit.read_text().replace(INSTALLED, "/bin/true"))
+    command = ["systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", copy]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-300:] + done.stderr
+
+
 @pytest.fixture
 def manager(tmp_path: Path) -> Iterator[socket.socket]:
     """What systemd listens at."""

@@ -71,9 +71,8 @@ def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) 
 
 
 def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> None:
-    rng = np.random.default_rng(3)
-    world = room(0, 0, 5, 4, 700, rng)
-    third = MapId("c", 1)
+    world = room(0, 0, 5, 4, 700, np.random.default_rng(3))
+    third, rng = MapId("c", 1), np.random.default_rng(4)
     nodes, edges = take_map(world, third, [Pose2(2.45 + 0.05 * k, 2.05, 0.7 * k) for k in range(6)], rng)
     for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
         merger.apply(third, change)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import struct
 import zlib
 from contextlib import nullcontext
-from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -36,93 +34,10 @@ from mapweave.wire.landmark_codec import (
     unpack_landmarks,
 )
 from tests.hybridmap.kernel_forms import in_numpy
+from tests.wire.plain_decoder import Landmarks as PlainLandmarks
 
 data = st.data()
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)
-
-
-TABLES = Path(__file__).parents[2] / "hybridmap" / "landmarks.npz"
-
-
-class PlainDecoder:
-    """Reads landmarks bit by bit with Python's numbers alone, from the page on the wire."""
-
-    def __init__(self, packed: bytes) -> None:
-        head = struct.unpack_from("<BBHHHHH", packed)
-        self.version, self.flags, self.count, self.least_x, self.reach_x, self.least_y, self.reach_y = head
-        (check,) = struct.unpack("<I", packed[-4:])
-        assert zlib.crc32(packed[:-4]) == check
-        self.text = "".join(f"{byte:08b}" for byte in packed[12:-4])
-        self.at = 0
-
-    def take(self, count: int) -> int:
-        self.at += count
-        return int(self.text[self.at - count : self.at] or "0", 2)
-
-    def rows(self) -> tuple[list[int], int]:
-        if not self.flags & 1:
-            return [0] * self.count, self.reach_y.bit_length()
-        low = 0
-        while 2 << low <= (self.reach_y + 1) // self.count:
-            low += 1
-        high, step = [], 0
-        for _ in range(self.count + (self.reach_y >> low)):
-            if self.take(1):
-                high.append(step)
-            else:
-                step += 1
-        return high, low
-
-    def pop(self, lane: int, frequencies: list[int]) -> int:
-        slot, symbol = self.states[lane] % 4096, 0
-        while slot >= frequencies[symbol]:
-            slot -= frequencies[symbol]
-            symbol += 1
-        self.states[lane] = frequencies[symbol] * (self.states[lane] // 4096) + slot
-        self.missing.append(lane)
-        return symbol
-
-    def refill(self) -> None:
-        for lane in self.missing:
-            while self.states[lane] < 1 << self.size:
-                self.states[lane] = 2 * self.states[lane] + self.take(1)
-        self.missing = []
-
-    def read(self) -> list[tuple[float, float, list[int], float, float]]:
-        """(x, y, code, depth, sigma) of each landmark for a camera of 320 x 240."""
-        tables, everyone = np.load(TABLES), range(self.count)
-        high, low = self.rows()
-        self.size = max(12, (((self.reach_x + 1) << low) - 1).bit_length())
-        self.states = [(1 << self.size) + self.take(self.size) for _ in everyone]
-        self.missing: list[int] = []
-        codes: list[list[int]] = [[] for _ in everyone]
-        for k in range(32):
-            for lane in everyone:
-                codes[lane].append(self.pop(lane, tables["codes"][k].tolist()))
-            self.refill()
-        depths, sigmas = [math.nan] * self.count, [math.nan] * self.count
-        if self.flags & 2:
-            shares = [self.pop(lane, tables["shares"].tolist()) for lane in everyone]
-            self.refill()
-            known = [lane for lane in everyone if shares[lane]]
-            cells = {lane: self.pop(lane, tables["cells"].tolist()) for lane in known}
-            self.refill()
-            for lane in known:
-                share = 0.002 * math.exp((shares[lane] - 1) / 8)
-                fine = max(0, math.ceil(math.log2(0.75 / share)))
-                step = self.pop(lane, [1 << (12 - fine)] * (1 << fine))
-                q = cells[lane] * 2**fine + step + 0.5
-                depths[lane] = 0.01 * math.exp(q / 4 / 2**fine)
-                sigmas[lane] = depths[lane] * share
-            self.refill()
-        seeds = [state - (1 << self.size) for state in self.states]
-        assert set(self.text[self.at :]) <= {"0"}
-        assert len(self.text) - self.at < 8
-        x = [self.least_x + (seed >> low) for seed in seeds]
-        y = [self.least_y + (h << low) + seed % (1 << low) for h, seed in zip(high, seeds, strict=True)]
-        return [
-            (x[n] / 8 - 160, y[n] / 8 - 120, codes[n], depths[n], sigmas[n]) for n in everyone
-        ]  # fmt: skip
 
 
 @pytest.mark.parametrize("count", [1, 2, 40, 150])
@@ -131,11 +46,11 @@ def test_a_second_decoder_reads_landmarks(some: SimpleNamespace, count: int, by_
     one: Landmarks = some.node(count).landmarks
     if by_rows:
         one, _ = settle(one, CAMERA)
-    plain = PlainDecoder(pack_landmarks(one, CAMERA))
+    plain = PlainLandmarks(pack_landmarks(one, CAMERA))
     assert (plain.version, plain.count) == (1, count)
     assert plain.flags == 2 + (by_rows or count == 1 or (one.pixels[1, 1] >= one.pixels[0, 1] and count == 2))
     back = unpack_landmarks(pack_landmarks(one, CAMERA), CAMERA)
-    for n, (x, y, code, depth, sigma) in enumerate(plain.read()):
+    for n, (x, y, code, depth, sigma) in enumerate(plain.read(320, 240)):
         assert code == one.codes[n].tolist()
         assert (x, y) == tuple(back.pixels[n])
         assert (x, y) == pytest.approx(one.pixels[n], abs=1 / 16)
@@ -145,10 +60,10 @@ def test_a_second_decoder_reads_landmarks(some: SimpleNamespace, count: int, by_
 
 def test_a_second_decoder_reads_features(some: SimpleNamespace) -> None:
     one: Landmarks = some.node(30).landmarks
-    plain = PlainDecoder(pack_features(one.pixels, one.codes, CAMERA))
+    plain = PlainLandmarks(pack_features(one.pixels, one.codes, CAMERA))
     assert plain.flags == 0
     pixels, codes = unpack_features(pack_features(one.pixels, one.codes, CAMERA), CAMERA)
-    for n, (x, y, code, depth, _) in enumerate(plain.read()):
+    for n, (x, y, code, depth, _) in enumerate(plain.read(320, 240)):
         assert (x, y, code) == (*pixels[n], codes[n].tolist())
         assert math.isnan(depth)
 

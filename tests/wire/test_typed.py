@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgpack
@@ -17,26 +16,11 @@ from hypothesis import strategies as st
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from mapweave.hybridmap import (
-    agent_status,
-    annotation,
-    area,
-    constraint_subject,
-    explanation,
-    floor_plan,
-    manual_constraint,
-    map_event,
-    mission_order,
-    pin,
-    query,
-    superseded,
-)  # fmt: skip
 from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.storage import map_file
 from mapweave.wire.packing import Limit
 from mapweave.wire.typed import decode, encode, packed
 
@@ -153,18 +137,3 @@ def test_arrays_come_back(seed: int, shape: list[int]) -> None:
         assert old.dtype == new.dtype and old.shape == new.shape and np.array_equal(old, new)
     with pytest.raises(InvalidValue, match="f8"):
         encode(Arrays(numbers, numbers, numbers, numbers, numbers), LIMIT)  # type: ignore[arg-type]
-
-
-def test_the_page_on_the_wire_names_the_fields() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
-    rows = {
-        name: re.findall(r"`([a-z]\w*)`", re.sub(r"\([^)]*\)", "", words))
-        for name, words in ROW.findall(page)
-    }
-    modules = (
-        annotation, area, constraint_subject, floor_plan, pin, query, explanation, manual_constraint,
-        map_event, superseded, map_file, agent_status, mission_order,
-    )  # fmt: skip
-    classes = {name: getattr(module, name) for module in modules for name in rows if hasattr(module, name)}
-    assert classes.keys() == rows.keys() and len(rows) == 61
-    assert {name: [one.name for one in fields(kind)] for name, kind in classes.items()} == rows

@@ -1,4 +1,4 @@
-// What people have said about the map: named places, closures and preferences. GET /annotations; older servers
+// What people have said about the map: named places, closures, preferences and portals. GET /annotations; older servers
 // have none.
 import { add, ask, button, byId } from "./dom.js";
 import { colours } from "./colours.js";
@@ -27,6 +27,7 @@ export async function loadAnnotations(select) {
 }
 export function drawAnnotations(c, viewport, model) {
   for (const { name, body } of annotations) {
+    const edge = body.edge || (body.kind === "portal" ? [body.a, body.b] : null);
     const colour = { closure: colours.bad, preference: colours.good }[body.kind] || colours.accent;
     c.strokeStyle = c.fillStyle = colour; c.lineWidth = 2;
     const at = id => model.rowOf(id) ?? null;
@@ -38,11 +39,13 @@ export function drawAnnotations(c, viewport, model) {
       c.beginPath(); corners.forEach(([u, v], k) => k ? c.lineTo(u, v) : c.moveTo(u, v)); c.closePath();
       c.globalAlpha = 0.15; c.fill(); c.globalAlpha = 1; c.stroke();
       label = [0, 1].map(k => corners.reduce((sum, corner) => sum + corner[k], 0) / corners.length);
-    } else if (body.edge) {
-      const [a, b] = body.edge.map(at);
+    } else if (edge) {
+      const [a, b] = edge.map(at);
       if (a === null || b === null) continue;
       const [from, to] = [a, b].map(row => viewport.toScreen(model.x[row], model.y[row]));
-      c.lineWidth = 4; c.beginPath(); c.moveTo(...from); c.lineTo(...to); c.stroke();
+      c.lineWidth = 4; c.setLineDash(body.edge ? [] : [3, 5]);
+      c.beginPath(); c.moveTo(...from); c.lineTo(...to); c.stroke();
+      c.setLineDash([]);
       label = [(from[0] + to[0]) / 2, (from[1] + to[1]) / 2];
     } else if (body.node) {
       const row = at(body.node);
@@ -52,7 +55,9 @@ export function drawAnnotations(c, viewport, model) {
     } else continue;
     c.font = "600 13px system-ui, sans-serif"; c.textAlign = "center";
     c.lineWidth = 3; c.strokeStyle = colours.ground;
-    c.strokeText(name, label[0], label[1] - 10); c.fillText(name, label[0], label[1] - 10);
+    // An edge is named by its nodes unless a person has named it, a floor by its map.
+    const words = body.edge?.join(" ") === name ? body.kind : body.kind === "floor" ? `floor ${body.label}` : name;
+    c.strokeText(words, label[0], label[1] - 10); c.fillText(words, label[0], label[1] - 10);
     c.textAlign = "left";
   }
 }

@@ -1,6 +1,5 @@
 // Why two nodes or maps are one, or are not, and why a route leads as it does: GET /explain and GET /route.
-import { add, ask, byId, degrees, draw, metres, percent } from "./dom.js";
-import { correct } from "./corrections.js";
+import { add, ask, button, byId, degrees, draw, metres, percent } from "./dom.js";
 
 const BAD_PX = 10;
 const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
@@ -67,7 +66,11 @@ function showPair(pair) {
     (pair.misfit.alone ? "; nothing else connects them." : "."));
   if (pair.other_links.length) showOthers(box, pair.other_links);
   for (const words of [...pair.claims, ...pair.constraints.map(one => one.words)]) add(box, "p", words);
-  if (pair.standing === "linked") offerUndo(box, pair.a.id, pair.b.id);
+  const edit = { linked: ["unmerge", "Undo this link"], own: null }[pair.standing];
+  if (edit !== null) {
+    const [kind, words] = edit || ["link", "Link them by hand"];
+    button(add(box, "div", "", "actions"), words, () => explanation.edit(kind, [pair.a.id, pair.b.id]));
+  }
 }
 function showOthers(box, links) {
   const agree = links.filter(w => w.agrees).length;
@@ -81,17 +84,6 @@ function showOthers(box, links) {
     to(item, w.a, w.b, `${w.a} - ${w.b}`);
     item.append(`: ${w.agrees ? "agrees" : "contradicts"}, ${deviations(w.distance2)}, ${w.kept ? "stands" : "refused"}`);
   }
-}
-function offerUndo(box, a, b) {
-  if (!explanation.commands) return;
-  const line = add(box, "form", "", "actions"), why = add(line, "input");
-  why.placeholder = "why is it wrong?"; why.setAttribute("aria-label", "Why the link is wrong"); why.maxLength = 300;
-  add(line, "button", "Undo this link");
-  line.addEventListener("submit", async event => {
-    event.preventDefault();
-    const answer = await correct({ unmerge: [a, b], because: why.value });
-    add(box, "p", answer.error || answer.said, answer.error ? "bad" : "good").setAttribute("role", "status");
-  });
 }
 function showTwo(one) {
   const box = add(result, "section", "", one.joined ? "box good" : "box");
@@ -129,7 +121,8 @@ function showRoute(route) {
   if (route.apart) showTwo(route.apart);
 }
 
-export const explanation = { commands: false, shown: () => {} };
+// Called with what is shown, and to edit what is shown.
+export const explanation = { shown: () => {}, edit: () => {} };
 
 let asked = 0;
 

@@ -1,9 +1,10 @@
-// The WebSocket /live: connects again when it is lost, and hands messages on by their kind.
+// The WebSocket /live: connects when the page may ask, again when it is lost, and hands messages on by their kind.
 const LONGEST_PAUSE = 8000;
 
-export function watch(handlers, connected) {
+export function watch(handlers, connected, admitted) {
   let pause = 500;
-  function connect() {
+  async function connect() {
+    await admitted();
     const socket = new WebSocket(new URL("live", location.href.replace(/^http/, "ws")));
     socket.onmessage = event => {
       const message = JSON.parse(event.data);

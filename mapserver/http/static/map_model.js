@@ -118,17 +118,23 @@ export class MapModel {
     const c = Math.cos(this.nodes.heading[row]), s = Math.sin(this.nodes.heading[row]);
     return [this.x[row] + c * x - s * y, this.y[row] + s * x + c * y];
   }
-  nearest(x, y, reach) {
+  // A point of the plane in a node's frame.
+  toNode(row, x, y) {
+    const c = Math.cos(this.nodes.heading[row]), s = Math.sin(this.nodes.heading[row]);
+    const dx = x - this.x[row], dy = y - this.y[row];
+    return [c * dx + s * dy, c * dy - s * dx];
+  }
+  nearest(x, y, reach, rows = this.order) {
     let best = -1, least = reach * reach;
-    for (const row of this.order) {
+    for (const row of rows) {
       const d = (this.x[row] - x) ** 2 + (this.y[row] - y) ** 2;
       if (d < least) { least = d; best = row; }
     }
     return best;
   }
-  nearestLink(x, y, reach) {
+  nearestLink(x, y, reach, rows = this.links) {
     let best = -1, least = reach * reach;
-    for (const row of this.links) {
+    for (const row of rows) {
       const a = this.edges.a[row], b = this.edges.b[row];
       const ux = this.x[b] - this.x[a], uy = this.y[b] - this.y[a], length = ux * ux + uy * uy;
       const t = length ? Math.min(1, Math.max(0, ((x - this.x[a]) * ux + (y - this.y[a]) * uy) / length)) : 0;
@@ -136,6 +142,10 @@ export class MapModel {
       if (d < least) { least = d; best = row; }
     }
     return best;
+  }
+  nearestEdge(x, y, reach) {
+    const kinds = this.edges.kind || [];
+    return this.nearestLink(x, y, reach, [...kinds.keys()].filter(row => kinds[row]));
   }
   // [left, bottom, right, top] of some nodes, without strays; null without any.
   bounds(rows = this.order) {

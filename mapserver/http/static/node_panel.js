@@ -18,7 +18,7 @@ function picture(parent, node) {
     draw(svg, "circle", { cx, cy, r: width / 130, class: faded.has(k) ? "faded" : "landmark" }));
   add(parent, "small", `The landmarks in its image, ${width} x ${height} px` + (faded.size ? "; red: faded" : ""));
 }
-export async function showNode(name, { select, why, send }) {
+export async function showNode(name, { select, why, send, edit }) {
   latest = name;
   const node = await ask("nodes/" + encodeURIComponent(name));
   if (latest !== name) return;
@@ -38,6 +38,7 @@ export async function showNode(name, { select, why, send }) {
   const actions = add(box, "div", "", "actions");
   if (fate) button(actions, `Show ${fate.by}`, () => select(fate.by));
   send(actions, name);
+  button(actions, "Edit", () => edit(name));
   picture(box, node);
   add(box, "h3", "Edges and links");
   const list = add(box, "ul", "", "list");

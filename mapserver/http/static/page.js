@@ -2,16 +2,23 @@
 import { add, button, byId, draw } from "./dom.js";
 import { colours, edgeColour, followTheme, hue } from "./colours.js";
 import { drawAnnotations, loadAnnotations, nodeOf, placeNamed } from "./annotations.js";
+import { permit } from "./changes.js";
 import { listCorrections } from "./corrections.js";
+import { Drawing } from "./drawing.js";
+import { EditPanel } from "./edit_panel.js";
 import { explain, explainAddress, explanation } from "./explanation.js";
+import { admitted } from "./login.js";
 import { forget, showNode } from "./node_panel.js";
 import { leaveRobot, listRobots, poseOf, showRobot, updateRobot } from "./robot_panel.js";
 import { listen } from "./input.js";
 import { listenForPhotos } from "./photo.js";
-import { listenToTabs, openTab } from "./panels.js";
+import { isOpen, listenToTabs, openTab } from "./panels.js";
 import { MapModel } from "./map_model.js";
+import { crosshair } from "./plan_pane.js";
 import { drawPlans, loadPlans } from "./plans.js";
 import { Painter } from "./painter.js";
+import { PlanEditor } from "./plan_editor.js";
+import { Selection } from "./selection.js";
 import { addEvents, clearEvents } from "./timeline.js";
 import { Viewport } from "./viewport.js";
 import { watch } from "./live.js";
@@ -21,9 +28,13 @@ const MOST_NAMES = 500;       // in the list that helps searching
 const SAID_EVERY = 10000;       // ms, between two looks at annotations and plans
 
 const model = new MapModel(), viewport = new Viewport(), painter = new Painter(byId("canvas"), model, viewport);
-const page = { robots: [], commands: false, node: "", robot: "", photo: [], places: [], readOnly: false };
+const moved = () => painter.ask();
+const selection = new Selection(model), drawing = new Drawing(viewport, corners => selection.enclose(corners));
+const planEditor = new PlanEditor(model, viewport, moved);
+const panel = new EditPanel(model, selection, drawing, { moved, planning: openPlan });
+const page = { robots: [], commands: false, whyNot: "", node: "", robot: "", photo: [], places: [], readOnly: false };
 // For tests and measurements.
-window.mapweave = { model, viewport, painter, page };
+window.mapweave = { model, viewport, painter, page, selection, drawing, planEditor };
 
 function selectNode(name, move = true) {
   const row = model.rowOf(name);
@@ -32,7 +43,7 @@ function selectNode(name, move = true) {
   painter.selected = row ?? -1;
   if (row !== undefined && move) viewport.show(model.x[row], model.y[row]);
   openTab("selected");
-  showNode(name, { select: selectNode, why: (a, b) => showWhy({ a, b }), send: offerToSend });
+  showNode(name, { select: selectNode, why: (a, b) => showWhy({ a, b }), send: offerToSend, edit: addToEdited });
   painter.ask();
 }
 function offerToSend(parent, name) {
@@ -43,11 +54,22 @@ function offerToSend(parent, name) {
       byId("goal").form.requestSubmit();
     });
 }
+function openPlan() { planEditor.show(isOpen("edit") && byId("edit-kind").value === "plan"); }
+function edit(kind, names) {
+  openTab("edit");
+  panel.show(kind);
+  selection.set(names);
+}
+function addToEdited(name) {
+  openTab("edit");
+  if (panel.kind === "plan") panel.show("link");
+  selection.toggle(name);
+}
 function selectRobot(name, goal = page.node) {
   page.robot = painter.robot = name;
   forget();
   openTab("selected");
-  showRobot(name, page.commands, goal);
+  showRobot(name, page.whyNot, goal);
   updateRobot(page.robots);
   const robot = painter.robots.find(one => one.name === name);
   if (robot) viewport.show(robot.x, robot.y);
@@ -66,8 +88,16 @@ function markLink(a, b) {
   }) ?? -1;
   painter.ask();
 }
-function chosen(u, v) {
+function chosen(u, v, shift) {
   const [x, y] = viewport.toPlane(u, v), reach = PICK / viewport.scale;
+  if (isOpen("edit") && drawing.shape) { drawing.corner(u, v); return; }
+  if (isOpen("edit") && planEditor.open) { planEditor.clickedMap(x, y); return; }
+  if (isOpen("edit") || shift) {
+    const row = model.nearest(x, y, reach), edge = row < 0 ? model.nearestEdge(x, y, reach / 2) : -1;
+    if (row >= 0) addToEdited(model.name(row));
+    if (edge >= 0) edit(panel.kind, [model.edges.a[edge], model.edges.b[edge]].map(one => model.name(one)));
+    return;
+  }
   const robot = painter.robots.find(one => Math.hypot(one.x - x, one.y - y) < reach);
   if (robot) { selectRobot(robot.name); return; }
   const row = model.nearest(x, y, reach);
@@ -139,6 +169,11 @@ function drawLegend() {
 painter.underlays.push(drawPlans);
 // Where the photo may have been taken.
 painter.overlays.push(drawAnnotations, (c, v) => {
+  selection.draw(c, v);
+  drawing.draw(c, v);
+  planEditor.drawMarks(c, v);
+  if (isOpen("edit") && (drawing.shape || planEditor.open) && byId("canvas").matches(":focus-visible")) crosshair(c, v);
+}, (c, v) => {
   for (const { merged_from_robot, component, probability } of page.photo) {
     if (!merged_from_robot || component < 0) continue;
     const [x, y, heading] = model.placed(merged_from_robot.mean, component), [u, w] = v.toScreen(x, y);
@@ -154,9 +189,12 @@ painter.overlays.push(drawAnnotations, (c, v) => {
 });
 
 watch({
-  hello({ commands, read_only }) {
-    page.commands = explanation.commands = commands;
+  hello({ name, commands, read_only, why_not }) {
+    page.commands = commands;
+    page.whyNot = why_not;
+    if (name) panel.sign(name);
     page.readOnly = read_only;
+    permit(commands, why_not);
     byId("connection").textContent = read_only ? "map file" : "live";
     clearEvents();
   },
@@ -168,6 +206,7 @@ watch({
     if (!viewport.touched) viewport.fit(model.bounds());
     if (selected) painter.selected = model.rowOf(selected) ?? -1;
     painter.link = -1;
+    panel.counts();
     listComponents();
     listNames();
     painter.changed();
@@ -188,14 +227,15 @@ watch({
     addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name));
     if (page.heard) byId("announcement").textContent = history.at(-1)?.words || "";
     page.heard = true;
-    listCorrections(page.commands);
+    listCorrections();
   },
 }, up => {
+  if (!up) permit(false, "The map server does not answer: nothing can be changed until it does. What you have typed stays.");
   byId("connection").className = up ? "" : "lost";
   byId("connection").textContent = up ? "live" : "no server, trying again";
-});
+}, admitted);
 async function loadSaid() {
-  loadPlans(() => painter.ask());
+  loadPlans(() => { planEditor.list(); painter.ask(); });
   const places = await loadAnnotations(selectNode);
   if (!places) return;
   page.places = places;
@@ -204,11 +244,19 @@ async function loadSaid() {
 }
 setInterval(loadSaid, SAID_EVERY);
 
+document.addEventListener("mapchanged", loadSaid);
+document.addEventListener("tabopened", openPlan);
+byId("opacity").addEventListener("input", moved);
+
+explanation.edit = edit;
 explanation.shown = answer => { if (answer.a?.id) markLink(answer.a.id, answer.b.id); };
-followTheme(() => { drawLegend(); listComponents(); painter.changed(); });
+followTheme(() => { drawLegend(); listComponents(); painter.changed(); planEditor.draw(); });
 drawLegend();
 listenToTabs(name => { if (name === "why" && !byId("result").textContent) explain({}, false); });
-listen(byId("canvas"), viewport, { moved: () => painter.ask(), chosen, fit, next });
+listen(byId("canvas"), viewport, { moved, chosen, fit, next,
+  drag: (from, to, ended) => isOpen("edit") && drawing.drag(from, to, ended),
+  keys: { Escape: () => drawing.cancel(), Backspace: () => drawing.back(),
+    " ": () => { if (painter.selected >= 0) addToEdited(model.name(painter.selected)); byId("canvas").focus(); } } });
 listenForPhotos(() => openTab("photo"), candidates => {
   page.photo = candidates;
   const best = candidates[0];
@@ -223,4 +271,4 @@ for (const [id, factor] of [["closer", 1.4], ["farther", 1 / 1.4]])
   byId(id).addEventListener("click", () => { viewport.zoom(factor); painter.ask(); });
 addEventListener("popstate", () => { if (location.pathname.endsWith("/why")) { openTab("why"); explainAddress(); } });
 new ResizeObserver(() => { painter.resize(); if (!viewport.touched) fit(); }).observe(byId("map"));
-if (location.pathname.endsWith("/why")) { openTab("why"); explainAddress(); }
+if (location.pathname.endsWith("/why")) { openTab("why"); admitted().then(explainAddress); }

@@ -28,7 +28,7 @@ export class Painter {
   }
   changed() { this.drawn = null; this.ask(); }
   ask() {
-    if (this.asked) return;
+    if (this.asked || !this.ratio) return;
     this.asked = true;
     requestAnimationFrame(() => { this.asked = false; this.frame(); });
   }

@@ -3,6 +3,7 @@ import { byId } from "./dom.js";
 
 const tabs = [...document.querySelectorAll("[role=tab]")];
 
+export const isOpen = name => !byId(name).hidden;
 export function openTab(name, focus = false) {
   for (const tab of tabs) {
     const open = tab.getAttribute("aria-controls") === name;
@@ -11,6 +12,7 @@ export function openTab(name, focus = false) {
     byId(tab.getAttribute("aria-controls")).hidden = !open;
     if (open && focus) tab.focus();
   }
+  document.dispatchEvent(new CustomEvent("tabopened"));
 }
 export function listenToTabs(opened) {
   tabs.forEach((tab, k) => {

@@ -47,7 +47,8 @@ async function locate(found, show) {
   for (const name of ["height_m", "hfov"]) if (byId(name).value) query.set(name, byId(name).value);
   result.className = ""; result.textContent = "Looking ...";
   const busy = () => { result.textContent = "Many robots ask at present, waiting ..."; };
-  const answer = await ask("relocalize?" + query, { method: "POST", body: await shrunk(file) }, busy);
+  const body = await shrunk(file), headers = { "Content-Type": body.type || "application/octet-stream" };
+  const answer = await ask("relocalize?" + query, { method: "POST", headers, body }, busy);
   result.textContent = "";
   if (answer.error) { result.className = "box failed"; result.textContent = answer.error; found([]); return; }
   const good = answer.certainty === "found" || answer.certainty === "place";

@@ -1,9 +1,13 @@
 // Floor plans under the map: GET /plans and their images. A map file of before has none.
-import { ask } from "./dom.js";
+import { ask, byId } from "./dom.js";
 
-const FAINT = 0.5;
 const images = new Map(); // by digest
 let plans = [], offered = true;
+// The plan that is being edited takes the place of the one of its name: `{ name, image, parts }`.
+export const draft = { plan: null };
+
+export const planNamed = name => plans.find(one => one.name === name);
+export const planNames = () => plans.map(one => one.name);
 
 export async function loadPlans(loaded) {
   if (!offered) return;
@@ -11,19 +15,26 @@ export async function loadPlans(loaded) {
   offered = answer.status !== 404;
   if (answer.error) return;
   plans = answer.plans || [];
-  for (const { name, plan } of plans) {
-    if (images.has(plan.image.sha256)) continue;
-    const image = new Image();
-    images.set(plan.image.sha256, image);
-    image.onload = loaded;
-    image.src = `plans/${name.split("/").map(encodeURIComponent).join("/")}.png`;
-  }
+  for (const { plan } of plans) imageOf(plan.image.sha256, loaded);
   loaded();
 }
+export function imageOf(sha256, loaded = () => {}) {
+  if (!images.has(sha256)) {
+    const image = new Image();
+    images.set(sha256, image);
+    image.src = `plan-images/${sha256}.png`;
+  }
+  const image = images.get(sha256);
+  if (!image.complete) image.addEventListener("load", loaded);
+  return image;
+}
+const shown = () => [...plans.filter(one => one.name !== draft.plan?.name), ...draft.plan ? [draft.plan] : []];
+
 export function drawPlans(c, viewport, model) {
-  c.globalAlpha = FAINT;
-  for (const { plan, parts } of plans) {
-    const image = images.get(plan.image.sha256);
+  let drawn = false;
+  c.globalAlpha = byId("opacity").value / 100;
+  for (const { plan, parts } of shown()) {
+    const image = images.get(plan.image?.sha256);
     if (!image?.complete || !image.naturalWidth) continue;
     for (const { component, merged_from_image: [a, b, e, d, x, y] } of parts) {
       const [dx, dy] = model.offset(component), [u, v] = viewport.toScreen(x + dx, y + dy), s = viewport.scale;
@@ -32,7 +43,9 @@ export function drawPlans(c, viewport, model) {
       c.transform(s * a, -s * b, s * e, -s * d, u, v);
       c.drawImage(image, 0, 0);
       c.restore();
+      drawn = true;
     }
   }
   c.globalAlpha = 1;
+  byId("opacity-label").hidden = !drawn;
 }

@@ -33,6 +33,8 @@ export function listRobots(robots, select) {
     const choice = button(item, robot.robot, () => select(robot.robot));
     choice.dataset.robot = robot.robot;
     add(item, "span", ` ${word}`, kind);
+    if (robot.over_quota) add(item, "span", ", over its quota", "bad");
+    if (robot.accusation) add(item, "span", " not trusted", "bad").title = robot.accusation;
     const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
       robot.component < 0 ? "not on the map" : ""];
     item.append(" " + parts.filter(Boolean).join(", "));
@@ -40,12 +42,12 @@ export function listRobots(robots, select) {
   }
 }
 // The frame of the panel is made once, so that a goal can be typed while statuses come.
-export function showRobot(name, commands, goal) {
+export function showRobot(name, whyNot, goal) {
   const box = byId("selected");
   box.textContent = "";
   add(box, "h2", `Robot ${name}`);
   panel = { name, facts: add(box, "div"), portal: null };
-  if (!commands) { add(box, "p", "Robots take missions from the server's own machine alone.", "soft"); return; }
+  if (whyNot) { add(box, "p", whyNot, "soft"); return; }
   const form = add(box, "form", "", "actions"), input = add(form, "input");
   input.id = "goal"; input.value = goal; input.placeholder = "node, x,y, place or home"; input.setAttribute("list", "names");
   input.setAttribute("aria-label", `Where to send ${name}`);
@@ -80,6 +82,7 @@ export function updateRobot(robots) {
   const spread = xx + yy > 0 ? ` (sigma ${xx.toFixed(3)}, ${yy.toFixed(3)} m, ${degrees(hh)})` : "";
   facts(panel.facts, [
     ["state", word, kind],
+    ["held against it", robot.accusation, "bad"],
     ["last heard", `${seconds(robot.age)} ago`],
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
@@ -89,6 +92,7 @@ export function updateRobot(robots) {
     ["images skipped", status && status.skipped],
     ["battery", status?.battery != null ? percent(status.battery) : ""],
     ["sees the server", status && (status.linked ? "yes" : "no")],
+    ["quota", robot.over_quota, "bad"],
     ["last error", status?.last_error ? `${status.last_error} (${seconds(status.error_age)} before)` : "", "bad"],
   ]);
 }

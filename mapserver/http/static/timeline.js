@@ -2,7 +2,7 @@
 import { add, byId } from "./dom.js";
 
 const MOST = 300;
-const KINDS = { joined: "good", parted: "warn", "kept apart": "warn", "set apart": "warn", failed: "bad" };
+const KINDS = { joined: "good", parted: "warn", "kept apart": "warn", "set apart": "warn", implausible: "warn", failed: "bad" };
 const NAMES = /\b[a-z0-9][a-z0-9_-]*\.\d+(?:\.\d+)?\b/g;
 
 // Names of nodes and maps in the words become buttons.

@@ -14,12 +14,12 @@ export class Viewport {
     const [nx, ny] = this.toPlane(u, v);
     this.x += x - nx; this.y += y - ny; this.touched = true;
   }
-  fit(bounds, most = 120) {
+  fit(bounds, { most = 120, margin = MARGIN, tools = TOOLS } = {}) {
     if (!bounds) return;
     const wide = Math.max(bounds[2] - bounds[0], 1), high = Math.max(bounds[3] - bounds[1], 1);
-    const across = (this.width - 2 * MARGIN - TOOLS) / wide, down = (this.height - 2 * MARGIN) / high;
+    const across = (this.width - 2 * margin - tools) / wide, down = (this.height - 2 * margin) / high;
     this.scale = Math.min(most, MOST, Math.max(LEAST, Math.min(across, down)));
-    this.x = (bounds[0] + bounds[2] + TOOLS / this.scale) / 2; this.y = (bounds[1] + bounds[3]) / 2;
+    this.x = (bounds[0] + bounds[2] + tools / this.scale) / 2; this.y = (bounds[1] + bounds[3]) / 2;
   }
   show(x, y, least = 40) {
     this.x = x; this.y = y; this.scale = Math.max(this.scale, least); this.touched = true;

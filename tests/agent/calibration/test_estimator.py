@@ -10,7 +10,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mapweave.agent.calibration.camera_motions import WheelTrack
-from mapweave.agent.calibration.estimator import Estimate, Estimator
+from mapweave.agent.calibration.estimate import Estimate
+from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.image_pairs import sigma_of
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.report import causes

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
@@ -17,11 +19,17 @@ BLANK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 SOURCE = object()
 
 
-def watched(run: RoomDrive, declared: DriveGeometry, seed: int, sigma: float = 0.3) -> OnlineCalibration:
+def watched(
+    run: RoomDrive,
+    declared: DriveGeometry,
+    seed: int,
+    sigma: float = 0.3,
+    online: OnlineCalibration | None = None,
+) -> OnlineCalibration:
     """What the agent has found out at the end of a drive past points in the room and on its floor."""
     rng = np.random.default_rng(seed)
     camera = replace(CAMERA, mount_forward=declared.forward, mount_height=declared.height)
-    online = OnlineCalibration(RobotDescription(camera, geometry=declared))
+    online = online or OnlineCalibration(RobotDescription(camera, geometry=declared))
     half = 0.5 * np.array(SIDE)
     points = np.column_stack([rng.uniform(-half, half, (8000, 2)), rng.uniform(0.0, 1.5, 8000)])
     points[::2, 2] = 0.0
@@ -100,3 +108,25 @@ def test_a_clock_that_goes_back_is_survived():
     online = watched(drive(np.random.default_rng(1), true, 20.0), true, 1)
     online.correct(Observation(1, Odometry(0.1, 0.0)))
     assert online.estimate is None
+
+
+def test_no_tick_does_two_of_the_costly_things(monkeypatch: pytest.MonkeyPatch):
+    """Reducing a pair, telling the floor, solving: together they are a late tick on a small computer."""
+    done: list[tuple[float, str]] = []
+
+    def note(name: str) -> None:
+        do: Callable[..., object] = getattr(Estimator, name)
+
+        def noted(self: Estimator, *arguments: object) -> object:
+            done.append((online._stamps[-1], name))
+            return do(self, *arguments)
+
+        monkeypatch.setattr(Estimator, name, noted)
+
+    for name in ("_reduced", "find_floor", "solve"):
+        note(name)
+    run = drive(np.random.default_rng(1), TRUE, 20.0)
+    online = OnlineCalibration(RobotDescription(CAMERA, geometry=TRUE))
+    watched(run, TRUE, 1, online=online)
+    assert [name for _, name in done].count("solve") >= 3
+    assert len({stamp for stamp, _ in done}) == len(done)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapweave.agent.drivers.checked import CheckedRobot
+from mapweave.agent.drivers.checked import FIRST, CheckedRobot
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
@@ -108,6 +108,12 @@ def test_stamps_that_do_not_rise_as_they_should(second: int, words: str) -> None
     robot.sense()
     with pytest.raises(DeviceError, match=words):
         robot.sense()
+
+
+def test_a_clock_that_fails_later_is_for_the_pipeline_to_say() -> None:
+    stamps = [*(NOW_NS + k * 100_000_000 for k in range(FIRST + 1)), NOW_NS, NOW_NS, NOW_NS + 3600 * 10**9]
+    robot = checked(*(good(stamp_ns=stamp) for stamp in stamps))
+    assert [robot.sense().stamp_ns for _ in stamps] == stamps  # type: ignore[union-attr]
 
 
 def test_seconds_since_the_start_are_no_nanoseconds() -> None:

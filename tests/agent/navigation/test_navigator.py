@@ -17,7 +17,7 @@ from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.node import EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
-from synthetic.world import World
+from synthetic.world import World, take_map
 from tests.agent.scripted_fleet import (
     BODY,
     EXACT,
@@ -156,24 +156,32 @@ def test_without_a_server_its_own_map_leads_the_way(home, own_map):
     assert "not in the map" in onboard_route(own_map, nodes[0], C).reason
 
 
-def test_a_goal_without_features_is_reached_by_its_neighbours(home):
-    """The goal has no landmarks: the robot stands there by what it knows of A, looks again, has arrived."""
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_goal_without_features_is_reached_by_its_neighbours(home, seen):
+    """The goal has no landmarks: the robot stands there by what it sees of A, looks again, has arrived.
+
+    Where it sees nothing of A either, it has the fleet's word alone, and that is not enough.
+    """
     eyes = Eyes(home, Pose2(2.0, 2.0))
     start = eyes.pose
     nav = navigator(eyes, NOWHERE, B)
-    goal = bare(B)
+    nodes, _ = take_map(home, A.map, [start], np.random.default_rng(2), sigma_xy=0.002)
+    node = replace(nodes[0], id=A) if seen else bare(A)
     observations: list[float] = []
 
     def fleet(question: Question) -> Answer:
         if isinstance(question, WhichWay):
-            leg = RouteLeg(goal, PoseGaussian(Pose2(0.6) if question.start == A else Pose2(), EXACT), None)
-            return Answer(question.number, RouteAnswer((leg,), "a way"))
+            return Answer(question.number, RouteAnswer(straight(node, bare(B), step=0.6), "a way"))
         observations.append((start.inverse() @ eyes.pose).x)
         return found(question, here(A, start.inverse() @ eyes.pose))
 
     trial = Trial(nav, eyes, fleet)
-    trial.run(60.0, lambda: nav.arrived)
-    assert nav.arrived and "its own landmarks" in nav.detail
+    trial.run(150.0, lambda: nav.arrived or nav.given_up)
+    assert nav.arrived == seen
+    if not seen:
+        assert nav.given_up and f"at node {A}; nothing of it is in view" in nav.detail
+        return
+    assert "its own landmarks" in nav.detail
     assert (start @ Pose2(0.6)).distance(eyes.pose) < 0.03
     assert len(observations) == 2 and observations[1] == pytest.approx(0.6, abs=0.03), (
         "it has looked again at the goal"

@@ -205,7 +205,7 @@ def test_a_journal_in_use_is_refused(path: Path, journal: Journal) -> None:
     output = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
-    assert output == f"{path}: agent journal is in use by another process\n"
+    assert output == f"{path}: agent journal is in use by another process; stop it first\n"
 
 
 @pytest.mark.parametrize("data", [b"no database at all" * 100, b"SQLite format 3\0" + b"\xff" * 4096])

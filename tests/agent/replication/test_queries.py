@@ -39,6 +39,15 @@ def test_a_route_to_another_node_is_refused() -> None:
         decode_answer(WhichWay(1, A, C), encode(route_of(Pose2(1.0))))
 
 
+def test_a_circle_and_a_way_that_was_blocked_are_refused() -> None:
+    a, b, c = (bare(node) for node in (A, B, C))
+    with pytest.raises(InvalidMessage, match=f"route: it leads in a circle, to node {A} twice"):
+        decode_answer(WhichWay(1, A, C), encode(RouteAnswer(straight(a, b, a, b, c), "a way")))
+    blocked = WhichWay(1, A, C, blocked=((C, B),))
+    with pytest.raises(InvalidMessage, match=f"from {B} to {C}, where the robot did not get through"):
+        decode_answer(blocked, encode(RouteAnswer(straight(a, b, c), "a way")))
+
+
 def test_no_way_is_an_answer() -> None:
     answer = decode_answer(WhichWay(1, A, C), encode(RouteAnswer((), "all blocked")))
     assert isinstance(answer, RouteAnswer)

@@ -323,9 +323,17 @@ def test_a_map_that_was_left_is_still_handed_over(hub: MemoryHub, path: Path, se
     assert [sequence for sequence, _ in server.ask(1, 9).changes] == [1, 2, 3]
     server.acknowledge(old_id, 3)
     assert replicator.wait_acknowledged(30)
+    replicator.submit([NodeRetired(NodeId("r0", fresh.epoch, 1))], 0)
     server.heads.clear()
     eventually(lambda: len(server.heads) > 12)
     assert sum(head.log_id == old_id for head in server.heads) <= 2, "it is complete: rarely a beacon"
+    server.bus.publish(KEYS.ack("s0", "r0"), Ack(fresh, journal.log_id(fresh), 1, (), 0).encode())
+    assert replicator.wait_acknowledged(30)
+    server.heads.clear()
+    alive = server.bus.announce(KEYS.server_alive("s0"))
+    eventually(lambda: {head.log_id for head in server.heads[-3:]} == {old_id, journal.log_id(fresh)})
+    assert len(server.heads) < 12, "a server that comes hears at once of all maps"
+    alive.close()
     replicator.close()
     bus.close()
     journal.close()

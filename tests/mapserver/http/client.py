@@ -15,7 +15,8 @@ def ask(
     served: Web, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
 ) -> tuple[int, Message, bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
-    connection.request(method, path, body, headers or {})
+    kind = "application/json" if body and body.startswith((b"{", b"[")) else "image/png"
+    connection.request(method, path, body, {"Content-Type": kind, **(headers or {})})
     reply = connection.getresponse()
     content = reply.read()
     connection.close()

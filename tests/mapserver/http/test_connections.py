@@ -12,8 +12,9 @@ import pytest
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.mapserver.http import serving, web
+from mapweave.mapserver.http.body import MOST_BYTES
 from mapweave.mapserver.http.serving import Limits
-from mapweave.mapserver.http.web import MOST_BYTES, Web, parse_address
+from mapweave.mapserver.http.web import Questions, Web, parse_address
 from tests.mapserver.http.client import ask, post, raw
 from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
@@ -42,7 +43,8 @@ def test_a_too_long_request_gets_an_answer(served: Web) -> None:
     assert (status, answer) == (413, {"error": "at most 16 MiB are taken"})
 
 
-HALF = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nabc"
+HEAD = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/png\r\n"
+HALF = HEAD + b"Content-Length: 1000\r\n\r\nabc"
 
 
 def test_closed_or_slow_connections_block_no_other(services: StubServices) -> None:
@@ -154,6 +156,48 @@ def test_ambiguous_requests_are_answered_once(served: Web, head: bytes, status: 
     assert b'{"error":' in got
 
 
+UPGRADE = (
+    b"GET /live HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n%s"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+ANSWERS = {
+    b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n": b"200",
+    b"GET /static/page.js HTTP/1.1\r\nHost: localhost\r\n\r\n": b"200",
+    b"GET /nothing HTTP/1.1\r\nHost: localhost\r\n\r\n": b"404",
+    b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n": b"403",
+    HEAD + b"\r\n": b"411",
+    b"noise\r\n\r\n": b"400",
+    UPGRADE % b"Origin: http://evil.example\r\n": b"403",
+}
+
+
+@pytest.mark.parametrize("request_", ANSWERS)
+def test_every_answer_has_the_headers_and_names_no_version(served: Web, request_: bytes) -> None:
+    got = raw(served, request_, close=request_.startswith(b"noise"))
+    head = got.partition(b"\r\n\r\n")[0].lower()
+    assert got.startswith(b"HTTP/1.1 " + ANSWERS[request_])
+    for header in (
+        b"x-content-type-options: nosniff", b"x-frame-options: deny", b"referrer-policy: no-referrer",
+        b"cross-origin-opener-policy: same-origin", b"cross-origin-resource-policy: same-origin",
+        b"cache-control: no-store", b"server: mapweave",
+    ):  # fmt: skip
+        assert head.count(b"\r\n" + header + b"\r\n") == 1 or head.endswith(b"\r\n" + header), header
+    assert b"frame-ancestors 'none'" in head and b"default-src 'none'" in head and b"unsafe" not in head
+    assert not any(word in got.lower() for word in (b"uvicorn", b"starlette", b"wsproto", b"python/"))
+
+
+@pytest.mark.parametrize("path", ["/constraints", "/annotations", "/plans", "/relocalize"])
+@pytest.mark.parametrize(
+    "kind", ["", "text/plain", "application/x-www-form-urlencoded", "image/svg+xml", "x"]
+)
+def test_a_body_of_another_type_is_refused(served: Web, path: str, kind: str) -> None:
+    """Among them are those that a form of another site's page sends without asking first."""
+    stated = b"Content-Type: %s\r\n" % kind.encode() if kind else b""
+    head = b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n" % path.encode()
+    got = raw(served, head + stated + b"\r\n{}")
+    assert got.startswith(b"HTTP/1.1 415") and b"send Content-Type: " in got
+
+
 def test_one_request_a_connection(served: Web) -> None:
     got = raw(served, b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
     assert got.count(b"HTTP/1.1 200") == 1 and b"\r\nconnection: close\r\n" in got.lower()
@@ -203,5 +247,5 @@ def test_addresses_that_are_none(text: str) -> None:
 def test_a_port_that_is_taken(served: Web, services: StubServices) -> None:
     with pytest.raises(NotConnected, match=r"cannot listen at http 127.0.0.1:\d+: the port is taken"):
         Web(("127.0.0.1", served.port), services)
-    with pytest.raises(NotConnected, match=r"cannot listen at http 192.0.2.1:8080: "):
-        Web(("192.0.2.1", 8080), services)
+    with pytest.raises(NotConnected, match="address"):
+        serving.HttpThread(Questions(services, 1.0).app, ("192.0.2.1", 8080))

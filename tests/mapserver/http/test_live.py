@@ -25,6 +25,7 @@ from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.http.live import MOST_VIEWERS, Live
+from mapweave.mapserver.http.login import Access
 from mapweave.mapserver.http.row_table import RowTable
 from mapweave.mapserver.http.serving import Limits
 from mapweave.mapserver.http.web import Web
@@ -133,7 +134,9 @@ def test_a_viewer_gets_the_map_and_what_changes(served: Web, services: StubServi
     services.events = (MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now"),)
     merged = two_maps()
     with viewer(served) as first:
-        assert first.until("hello") == {"kind": "hello", "read_only": False, "commands": True}
+        assert first.until("hello") == {
+            "kind": "hello", "name": "", "role": "", "read_only": False, "commands": True, "why_not": ""
+        }  # fmt: skip
         assert first.until("map")["whole"]
         assert same(first.nodes(), expected(merged))
         (component,) = first.last["map"]["components"]
@@ -183,7 +186,8 @@ def test_robots_come_twice_a_second(served: Web, services: StubServices) -> None
 def test_a_map_file_is_read_only(services: StubServices, served: Web) -> None:
     services.read_only = True
     with viewer(served) as watching:
-        assert watching.until("hello") == {"kind": "hello", "read_only": True, "commands": False}
+        hello = watching.until("hello")
+        assert (hello["read_only"], hello["commands"]) == (True, False) and "map file" in hello["why_not"]
 
 
 @pytest.mark.parametrize("headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}])
@@ -257,7 +261,7 @@ def test_a_slow_viewer_gets_the_newest_state(services: StubServices, monkeypatch
         return {"summary": str(looks)}
 
     async def watch() -> None:
-        live, slow = Live(services, lambda _: False), SlowSocket()
+        live, slow = Live(services, Access(None, 1.0)), SlowSocket()
         serving = asyncio.create_task(live.serve(slow))  # type: ignore[arg-type]
         for _ in range(3):
             slow.free.release()

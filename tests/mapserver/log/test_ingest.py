@@ -160,4 +160,4 @@ def test_messages_while_closing_are_no_error(server: Server, agent: HandAgent) -
         agent.publish(sequence)
     server.ingest.close()
     server.ingest.close()
-    server.ingest._work.put(Sample(KEYS.head(MAP), b""))
+    server.ingest._hear(Sample(KEYS.head(MAP), b""))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -19,11 +19,12 @@ from mapweave.hybridmap.node import MapId
 from mapweave.identities.authority import Authority
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
-from mapweave.wire.access_rules import ASKS, COMMANDS, OF_ROBOTS
+from mapweave.wire.access_rules import ASKS, COMMANDS, OF_ROBOTS, SIGNED
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.keys import Keys
+from mapweave.wire.senders import sent_by, sent_by_any, serve_senders
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.waiting import eventually, free_port
 
@@ -132,27 +133,41 @@ def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet) -> None:
     r0 = fleet.join("r0")
     r0.announce(KEYS.agent_alive(MapId("r1", 1)))
     r0.announce(KEYS.agent_alive(MapId("r0", 1)))
-    for key in (KEYS.mission("r1"), KEYS.log(MapId("r1", 1)), KEYS.relocalize("s0"), KEYS.route("s0")):
+    for key in (
+        KEYS.log(MapId("r1", 1)), KEYS.relocalize("s0"),
+        *(sent_by(question, "r1") for question in (KEYS.relocalize("s0"), KEYS.route("s0"))),
+    ):  # fmt: skip
         r0.serve(key, answer)
-    r0.serve(KEYS.mission("r0"), answer)
+    serve_senders(r0, KEYS.mission("r0"), lambda request, who: answer(request))
+    serve_senders(r0, KEYS.mission("r1"), lambda request, who: answer(request))
     anna, r1 = fleet.join("anna"), fleet.join("r1")
-    eventually(lambda: asked(anna, KEYS.mission("r0")))
+    eventually(lambda: asked(anna, sent_by(KEYS.mission("r0"), "anna")))
     eventually(lambda: alive)
     assert alive == [KEYS.agent_alive(MapId("r0", 1))]
-    assert not asked(anna, KEYS.mission("r1"))
+    assert not asked(anna, sent_by(KEYS.mission("r1"), "anna"))
     assert not asked(fleet.router, KEYS.log(MapId("r1", 1)))
-    assert not asked(r1, KEYS.relocalize("s0"))
-    assert not asked(r1, KEYS.route("s0"))
+    assert not asked(r1, sent_by(KEYS.relocalize("s0"), "r1"))
+    assert not asked(r1, sent_by(KEYS.route("s0"), "r1"))
+
+
+IN_ANOTHERS_NAME = {f"{what}/{name}" for what in OF_ROBOTS for name in ("r1", "*")}
 
 
 @pytest.mark.parametrize(
     ("name", "may"),
-    [("r0", OF_ROBOTS), ("bob", frozenset(ASKS) - COMMANDS), ("anna", frozenset(ASKS))],
+    [
+        ("r0", frozenset({"status", *(f"{what}/r0" for what in OF_ROBOTS)})),
+        ("bob", frozenset(ASKS) - COMMANDS),
+        ("anna", frozenset(ASKS)),
+    ],
 )
 def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[str]) -> None:
-    every = {what: f"{KEYS.root}/server/s0/{what}" for what in ASKS}
-    for key in every.values():
-        certified.router.serve(key, answer)
+    asks = {*ASKS, *IN_ANOTHERS_NAME, *(f"{what}/r0" for what in OF_ROBOTS)}
+    root = f"{KEYS.root}/server/s0"
+    every = {what: sent_by(f"{root}/{what}", name if what in SIGNED else "") for what in asks}
+    for what, key in every.items():
+        if what in SIGNED or "*" in key or not key.endswith(("/r0", "/r1")):
+            certified.router.serve(key, answer)
     bus = certified.join(name)
     eventually(lambda: asked(bus, every["status"]))
     answered: set[str] = set()
@@ -171,15 +186,56 @@ def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[
 
 def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
     r0 = fleet.join("r0")
-    for key in (KEYS.mission("r0"), KEYS.drive("r0"), KEYS.portal("r0"), KEYS.agent_status("r0")):
+    for key in (KEYS.drive("r0"), KEYS.agent_status("r0")):
         r0.serve(key, answer)
+    for key in (KEYS.mission("r0"), KEYS.portal("r0")):
+        serve_senders(r0, key, lambda request, who: answer(request))
     anna, bob = fleet.join("anna"), fleet.join("bob")
-    eventually(lambda: asked(anna, KEYS.mission("r0")) and asked(anna, KEYS.drive("r0")))
-    eventually(lambda: asked(anna, KEYS.portal("r0")))
+    eventually(lambda: asked(anna, sent_by(KEYS.mission("r0"), "anna")) and asked(anna, KEYS.drive("r0")))
+    eventually(lambda: asked(anna, sent_by(KEYS.portal("r0"), "anna")))
     eventually(lambda: asked(bob, KEYS.agent_status("r0")))
-    assert not asked(bob, KEYS.mission("r0"))
+    for key in (KEYS.mission("r0"), KEYS.portal("r0")):
+        assert not any(asked(bob, sent_by(key, who)) for who in ("", "anna", "bob"))
     assert not asked(bob, KEYS.drive("r0"))
-    assert not asked(bob, KEYS.portal("r0"))
+
+
+def test_an_operator_commands_under_the_own_name_alone(fleet: Fleet) -> None:
+    """Whatever a message says, its key has the name that is recorded; patterns are no way around it."""
+    senders: list[tuple[str, str]] = []
+
+    def hear(what: str) -> Callable[[Request, str], None]:
+        def handler(request: Request, who: str) -> None:
+            senders.append((what, who))
+            answer(request)
+
+        return handler
+
+    r0, carl = fleet.join("r0"), read_key_file(fleet.folder.add("carl", Role.OPERATOR)).credentials
+    fleet.renew()
+    serve_senders(r0, KEYS.mission("r0"), hear("order"))
+    serve_senders(r0, KEYS.portal("r0"), hear("portal"))
+    for key in (KEYS.constrain("s0"), KEYS.annotate("s0"), KEYS.server_mission("s0")):
+        serve_senders(fleet.router, key, hear(key.rpartition("/")[2]))
+    anna, second = fleet.join("anna"), fleet.join_as(carl)
+    keys = {
+        "order": KEYS.mission("r0"), "constrain": KEYS.any_constrain(), "annotate": KEYS.any_annotate(),
+        "mission": KEYS.any_mission(), "portal": KEYS.portal("r0"),
+    }  # fmt: skip
+    for what, key in keys.items():
+        eventually(lambda key=key: asked(anna, sent_by(key, "anna")))
+        assert set(senders) == {(what, "anna")}
+        threads = [
+            threading.Thread(target=anna.ask, args=(forged, b"", SOON))
+            for forged in (key, *(f"{key}/{end}" for end in ("carl", "s0", "*", "**")))
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert asked(second, sent_by(key, "carl"))
+        assert set(senders) == {(what, "anna"), (what, "carl")}
+        assert senders.count((what, "carl")) == 1
+        senders.clear()
 
 
 def test_who_has_no_good_key_is_not_let_in(certified: Fleet) -> None:
@@ -250,7 +306,7 @@ def test_a_revoked_key_is_of_no_use_and_nothing_else_changes(
     stolen = read_key_file(fleet.folder.key_file("r0")).credentials
     got: list[bytes] = []
     fleet.router.subscribe(KEYS.changes(), lambda sample: got.append(sample.payload))
-    fleet.router.serve(KEYS.route("s0"), answer)
+    fleet.router.serve(sent_by_any(KEYS.route("s0")), answer)
     r1 = fleet.join("r1")
     fleet.folder.revoke("r0", "stolen")
     replacement = read_key_file(fleet.folder.add("r0", Role.ROBOT)).credentials
@@ -266,8 +322,8 @@ def test_a_revoked_key_is_of_no_use_and_nothing_else_changes(
 
     eventually(both)
     assert b"old" not in got
-    assert not asked(old, KEYS.route("s0"))
-    eventually(lambda: asked(r1, KEYS.route("s0")))
+    assert not asked(old, sent_by(KEYS.route("s0"), "r0"))
+    eventually(lambda: asked(r1, sent_by(KEYS.route("s0"), "r1")))
     if fleet.folder.profile is Profile.PRODUCTION:
         eventually(lambda: "refused: r0 at" in caplog.text)
         assert "this key was revoked" in caplog.text

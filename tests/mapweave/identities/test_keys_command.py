@@ -12,6 +12,7 @@ from cryptography import x509
 from mapweave.cli import main
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder
+from mapweave.identities.logins import Logins
 from mapweave.wire.credentials import Role
 from tests.mapweave.command_line import complaint
 
@@ -65,6 +66,26 @@ def test_who_has_a_key_is_listed(keys: Path, capsys: pytest.CaptureFixture[str])
     assert not (keys / "r0.key.toml").exists()
 
 
+def test_a_token_is_shown_once_and_its_hash_alone_is_kept(
+    keys: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    where = ["--keys", str(keys)]
+    assert main(["keys", "token", "r0", *where]) == 0
+    token = capfd.readouterr().out.strip()
+    assert len(token) > 43 and not any(token in path.read_text() for path in keys.iterdir())
+    login = Logins(keys).login(token)
+    assert login is not None and (login.name, login.role) == ("r0", Role.ROBOT)
+    assert main(["keys", "list", "--json", *where]) == 0
+    rows = {row["name"]: row for row in json.loads(capfd.readouterr().out)["identities"]}
+    assert len(rows["r0"]["tokens"]) == 1 and rows["s0"]["tokens"] == []
+    assert main(["keys", "list", *where]) == 0
+    assert f"token of {rows['r0']['tokens'][0]['issued'][:10]}, until 2" in capfd.readouterr().out
+    assert main(["keys", "revoke", "r0", "--tokens", *where]) == 0
+    assert Logins(keys).login(token) is None and (keys / "r0.key.toml").exists()
+    assert "r0 has no token" in complaint(capfd, "keys", "revoke", "r0", "--tokens", *where)
+    assert "r9 has no good key" in complaint(capfd, "keys", "token", "r9", *where)
+
+
 def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     where = ("--keys", keys)
     assert "there are keys already" in complaint(capfd, "keys", "init", *where)
@@ -76,6 +97,12 @@ def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.Capture
     for host in ('a"b', "a b", "-x", "a/b", ""):
         assert "write a name or an address" in complaint(capfd, "keys", "init", *fresh, f"--at={host}")
     assert not (tmp_path / "fresh").exists()
+    cut = tmp_path / "cut.key.toml"
+    whole = (keys / "r0.key.toml").read_bytes()
+    for length in (0, len(whole) // 2):
+        cut.touch(mode=0o600)
+        cut.write_bytes(whole[:length])
+        assert "copy it once more" in complaint(capfd, "status", "--keys", cut)
     (keys / "fleet.json").write_text('{"fleet": 3}')
     assert "fleet.json" in complaint(capfd, "keys", "list", *where)
 

@@ -219,3 +219,23 @@ def test_order_does_not_matter() -> None:
     aisle.maps = dict(reversed(aisle.maps.items()))
     turned = [link.turned() if k % 2 else link for k, link in enumerate(links)]
     assert {link.canonical().pair: link.aliased for link in aisle.weighed(turned)} == collected
+
+
+def test_one_robot_alone_takes_no_landmarks_from_links_of_others() -> None:
+    """It shows a bay once more, elsewhere on its way; a second robot that does so is believed."""
+    aisle = Aisle(1, signs=(0,), cartons=0)
+    aisle.drive("a", [0])
+    aisle.drive("b", [0])
+    aliased = []
+    for robot in ("y", "z"):
+        aisle.drive(robot, [0, 5])
+        for node, pose in aisle.truth.items():
+            if node.agent == robot and pose.x > 4 * BAY:
+                aisle.things[node] = aisle.shown(0)
+        weighed = aisle.weighed(aisle.links())
+        aliased.append({link.pair: link.aliased for link in weighed if not link.within})
+    between = [pair for pair in aliased[0] if {end.agent for end in pair} == {"a", "b"}]
+    own = [pair for pair in aliased[0] if pair[1].agent == "y"]
+    assert len(between) == 9 and {aliased[0][pair] for pair in between} == {0}
+    assert {aliased[0][pair] for pair in own} == {SIGNS}
+    assert {aliased[1][pair] for pair in between} == {SIGNS}

@@ -1,0 +1,66 @@
+"""What a drive tells of its geometry, and how surely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.calibration.floor_scale import LEAST_FLOOR
+from mapweave.agent.calibration.parameter_sigmas import PRIOR_SIGMAS, useful
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
+from mapweave.hybridmap.pose import Array
+
+P = Parameter
+SIGNIFICANT = 3.5
+"""Sigmas from the declared value at which a parameter is declared wrongly."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters with their covariance.
+
+    Attributes:
+        vector: (10,) in the order of `Parameter`.
+        covariance: (10, 10).
+        declared: (10,) before anything was seen.
+        pairs: how many image pairs it is made of.
+        floor_tracks: tracks on the floor in all of them.
+        keep_wheels: whether the wheels' scale was held instead of the height.
+    """
+
+    vector: Array
+    covariance: Array
+    declared: Array
+    pairs: int
+    floor_tracks: int
+    keep_wheels: bool = False
+
+    @property
+    def geometry(self) -> DriveGeometry:
+        """All estimated values, shown or not."""
+        return DriveGeometry.of(self.vector)
+
+    @property
+    def sigmas(self) -> Array:
+        """(10,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def shown(self) -> NDArray[np.bool_]:
+        """(10,) which parameters the drive shows: better than useful, and much better than assumed.
+
+        Without the floor nothing tells a scale.
+        """
+        assumed = np.array([PRIOR_SIGMAS[p] for p in P])
+        if self.keep_wheels:
+            assumed[[P.WHEEL_SCALE, P.HEIGHT]] = assumed[[P.HEIGHT, P.WHEEL_SCALE]]
+        shown = np.asarray((self.sigmas < useful(self.declared)) & (self.sigmas < 0.5 * assumed))
+        shown[[P.WHEEL_SCALE, P.HEIGHT, P.LEFT]] &= self.floor_tracks >= LEAST_FLOOR
+        return shown
+
+    @property
+    def usable(self) -> DriveGeometry:
+        """What the drive shows; all else as declared."""
+        return DriveGeometry.of(np.where(self.shown, self.vector, self.declared))

@@ -1,0 +1,175 @@
+"""Tiles of the floor ahead, each aligned from one image to another as its plane lets it appear.
+
+A floor has little texture and is seen at a grazing angle: over the way of one pair a patch of road grows by
+half. A window that is only shifted loses it or slides. Here the plane predicts how each tile is distorted,
+and one unknown is left: how far off it is, along the line on which the camera's motion lets it move. Direct
+alignment in a region ahead of the vehicle is how Song and Chandraker (Robust scale estimation in real-time
+monocular SFM, 2014) measure the height over the road; tiles leave it to `floor_scale.py` which of them are
+floor.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.calibration.camera_motions import CameraMotions
+from mapweave.agent.calibration.pair_information import FLOOR_STEEPNESS, FloorMatches
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array
+from mapweave.vision.lens import Lens
+
+WIDTH_PX, HEIGHT_PX = 16, 8
+ABREAST = 1.0
+"""Tiles lie this many heights of the camera to either side of it: what a vehicle drives on, no verge."""
+MOST = 48
+MARGIN_PX = 4
+BLUR_PX = 0.8
+SEARCHED = np.arange(-0.3, 0.31, 0.05)
+"""Logarithms of inverse depth over the floor's with which a tile is tried first,"""
+STEPS = 3
+"""and Gauss-Newton steps from the best."""
+CONVERGED = 0.02
+"""Last step at most."""
+LEAST_CORRELATION = 0.85
+"""Of a tile with where it is found."""
+STEP = 0.02
+"""Of the numeric derivative by a logarithm."""
+INDEPENDENT = 0.25
+"""Share of a tile's pixels that count: blur makes neighbours alike."""
+LEAST_SIGMA_PX = 0.1
+"""Interpolation and lens."""
+
+
+class FloorTiles:
+    """Where tiles of the floor can lie in the images of one camera.
+
+    Attributes:
+        camera: intrinsics of the images.
+        lens: of them.
+        distorted: whether the lens moves any tile.
+        top: first row of an image that matters.
+    """
+
+    def __init__(self, camera: Camera, lens: Lens) -> None:
+        """Take the camera of the images, and their lens."""
+        self.camera, self.lens = camera, lens
+        self.top = max(math.floor(camera.cy), 0)
+        rows = np.arange(self.top + MARGIN_PX, camera.height - MARGIN_PX - HEIGHT_PX, HEIGHT_PX)
+        columns = np.arange(MARGIN_PX, camera.width - MARGIN_PX - WIDTH_PX, WIDTH_PX)
+        corner = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
+        y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
+        self._pixels = corner + np.stack([x, y], axis=-1).reshape(1, -1, 2)
+        raw = self._pixels.reshape(-1, 2).astype(np.float64)
+        ideal = lens.undistort(raw)
+        self.distorted = not np.array_equal(raw, ideal)
+        rays = np.ones((len(ideal), 3))
+        rays[:, :2] = (ideal - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        self._rays = rays.reshape(*self._pixels.shape[:2], 3)
+
+    def part(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """What matters of an image, (H, W) grey: below the middle row, a little blurred."""
+        below = image[self.top :].astype(np.float32)
+        if not below.size:
+            return below
+        return np.asarray(cv2.GaussianBlur(below, (0, 0), BLUR_PX), np.float32)
+
+    def match(
+        self, before: NDArray[np.float32], after: NDArray[np.float32], at: CameraMotions
+    ) -> FloorMatches:
+        """Align the tiles.
+
+        Args:
+            before: part of the first image.
+            after: part of the second.
+            at: one motion between them.
+        """
+        middle = self._rays.mean(axis=1)
+        steepness = middle @ (at.floor / np.linalg.norm(at.floor))
+        ahead = (steepness > FLOOR_STEEPNESS) & (np.abs(middle[:, 0]) < ABREAST * steepness)
+        chosen = np.flatnonzero(ahead)
+        size = (self.camera.height - self.top, self.camera.width)
+        if not before.shape == after.shape == size or not len(chosen):
+            return FloorMatches.none()
+        column, row = np.moveaxis(self._pixels[chosen], -1, 0)
+        template = before[row - self.top, column]
+        # Texture along the way counts: gradients down the image.
+        energy = np.square(np.diff(template.reshape(-1, HEIGHT_PX, WIDTH_PX), axis=1)).sum((1, 2))
+        best = np.sort(np.argsort(-energy, kind="stable")[:MOST])
+        chosen, template = chosen[best], template[best]
+        warp = _Warp(self, self._rays[chosen], at)
+        template = template - template.mean(axis=1, keepdims=True)
+        logs = _searched(template, after, warp)
+        step = sigma = np.zeros(len(logs))
+        for _ in range(STEPS):
+            nearer, farther = (warp.values(after, logs + off) for off in (STEP, -STEP))
+            shown, slope = 0.5 * (nearer + farther), (nearer - farther) / (2.0 * STEP)
+            gain = ((template * shown).sum(1) / np.maximum((shown**2).sum(1), 1e-6))[:, None]
+            error, slope = gain * shown - template, gain * slope
+            stiffness = (slope**2).sum(1) + 1e-6
+            step = np.clip(-(slope * error).sum(1) / stiffness, -0.05, 0.05)
+            logs = np.clip(logs + step, -1.0, 1.0)
+            sigma = np.sqrt((error**2).sum(1) / (INDEPENDENT * error.shape[1] * stiffness))
+        sigma = np.minimum(sigma, 1.0)
+        column, row = warp.pixels(logs)
+        inside = ((column > 2) & (column < self.camera.width - 3)).all(axis=1)
+        inside &= ((row > self.top + 2) & (row < self.camera.height - 3)).all(axis=1)
+        kept = inside & (np.abs(step) < CONVERGED)
+        kept &= _correlation(template, warp.values(after, logs)) > LEAST_CORRELATION
+        moved = warp.middle(logs + 0.5 * sigma) - warp.middle(logs - 0.5 * sigma)
+        across = np.hypot(np.linalg.norm(moved, axis=1), LEAST_SIGMA_PX / self.camera.fy)
+        return FloorMatches(middle[chosen][kept, :2], warp.middle(logs)[kept], across[kept])
+
+
+class _Warp:
+    """Where pixels of tiles are in the second image, by the logarithms of their inverse depths."""
+
+    def __init__(self, tiles: FloorTiles, rays: Array, at: CameraMotions) -> None:
+        self._tiles = tiles
+        self._turned = np.moveaxis(rays @ at.rotation.T, -1, 0)
+        self._floor = rays @ at.floor
+        self._translation = at.translation
+
+    def pixels(self, logs: Array, part: slice = slice(None)) -> tuple[Array, Array]:
+        """Columns and rows (N, P) px in the real image."""
+        tiles, camera = self._tiles, self._tiles.camera
+        rho = self._floor[:, part] * np.exp(logs)[:, None]
+        x, y, z = (a[:, part] + rho * t for a, t in zip(self._turned, self._translation, strict=True))
+        focal = 1.0 / np.maximum(z, 0.05)
+        column, row = camera.cx + camera.fx * x * focal, camera.cy + camera.fy * y * focal
+        if tiles.distorted:
+            there = tiles.lens.distort(np.column_stack([column.ravel(), row.ravel()]))
+            column, row = there.T.reshape(2, *column.shape)
+        return column, row
+
+    def middle(self, logs: Array) -> Array:
+        """(N, 2) normalised coordinates of the tiles' middles."""
+        turned, floor = self._turned.mean(axis=2), self._floor.mean(axis=1)
+        y = turned.T + (floor * np.exp(logs))[:, None] * self._translation
+        return np.asarray(y[:, :2] / np.maximum(y[:, 2:], 0.05))
+
+    def values(self, after: NDArray[np.float32], logs: Array, part: slice = slice(None)) -> Array:
+        """(N, P) of the second image there, less each tile's mean."""
+        column, row = self.pixels(logs, part)
+        there = (column.astype(np.float32), (row - self._tiles.top).astype(np.float32))
+        values = cv2.remap(after, *there, cv2.INTER_LINEAR)
+        return np.asarray(values - values.mean(axis=1, keepdims=True), np.float64)
+
+
+def _correlation(one: Array, other: Array) -> Array:
+    """(N,) of rows that have no mean."""
+    size = np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
+    return np.asarray((one * other).sum(axis=1) / np.maximum(size, 1e-6))
+
+
+def _searched(template: Array, after: NDArray[np.float32], warp: _Warp) -> Array:
+    """(N,) best of the logarithms that are tried, by every other pixel."""
+    part = slice(None, None, 2)
+    tried = [
+        _correlation(template[:, part], warp.values(after, np.full(len(template), log), part))
+        for log in SEARCHED
+    ]
+    return np.asarray(SEARCHED[np.stack(tried).argmax(axis=0)])

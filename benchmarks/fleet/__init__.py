@@ -1,0 +1,1 @@
+"""How many robots one map server carries."""

@@ -1,0 +1,196 @@
+"""The links of some agents of a fleet, in a process of their own: journal, replication, status, missions.
+
+    python -m benchmarks.fleet.agents_process '{"endpoint": ..., "folder": ..., "first": ..., ...}'
+
+It prints `ready` when every agent has handed over its first node, then reads one line with the time of the
+start, and prints one JSON object at the end. Times are those of the system's monotonic clock, s.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.fleet.drives import drive, name_of
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mission_control import MissionControl
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
+
+FLEET, SERVER = "fleet", "s0"
+INTERVAL = 10.0
+"""Between two nodes of a robot, s."""
+REPORTS = 2.0
+"""Status reports of a robot in a second, as `mapweave agent` sends them."""
+PATIENCE = 60.0
+"""Longest wait for acknowledgements behind the last change, s."""
+
+
+@dataclass(frozen=True)
+class Orders:
+    """What the process has to do.
+
+    Attributes:
+        endpoint: of the router.
+        folder: for the journals.
+        first: number of its first agent.
+        count: of its agents.
+        agents: of all processes.
+        seconds: of mapping at a node each `INTERVAL`.
+        burst: changes of the whole fleet within the second behind that.
+        seed: of the drives.
+    """
+
+    endpoint: str
+    folder: str
+    first: int
+    count: int
+    agents: int
+    seconds: float
+    burst: int
+    seed: int
+
+
+class TimedJournal(Journal):
+    """A journal that notes when the server's acknowledgement of each change is on the disk.
+
+    Attributes:
+        noted: s, by sequence number.
+    """
+
+    def __init__(self, path: Path, agent: str) -> None:
+        """See Journal."""
+        super().__init__(path, agent)
+        self.noted: list[float] = []
+
+    def acknowledge(self, server: str, map_id: MapId, watermark: int, reset: bool = False) -> None:
+        """See Journal."""
+        super().acknowledge(server, map_id, watermark, reset)
+        self.noted += [time.monotonic()] * (watermark - len(self.noted))
+
+
+class Agent:
+    """One robot's link.
+
+    Attributes:
+        submitted: when each change was handed over, s.
+        stops: changes that it has yet to hand over, a list for each stop.
+    """
+
+    def __init__(self, orders: Orders, number: int, stops: int) -> None:
+        """Connect, and open the journal."""
+        name = name_of(number)
+        keys = Keys(FLEET)
+        self._bus = ZenohBus(BusSettings(endpoints=(orders.endpoint,)))
+        self.journal = TimedJournal(Path(orders.folder) / f"{name}.sqlite", name)
+        self._map = self.journal.open_map(1)
+        self._replicator = Replicator(self._bus, keys, self.journal, self._map, (SERVER,))
+        self._client = FleetClient(self._bus, keys, self._map, MissionControl(name), server=SERVER)
+        self.submitted: list[float] = []
+        self.stops: list[list[ChangeBody]] = drive(number, stops, orders.seed).changes[::-1]
+
+    def map_on(self) -> None:
+        """Hand over the next stop."""
+        bodies = self.stops.pop()
+        self.submitted += [time.monotonic()] * len(bodies)
+        self._replicator.submit(bodies, time.time_ns())
+
+    def report(self) -> None:
+        """Publish a status."""
+        self._client.report(Status("mapping", "", 1, 0, Pose2(), True), time.time_ns())
+
+    def waits(self) -> bool:
+        """Whether something is not acknowledged."""
+        return len(self.journal.noted) < len(self.submitted)
+
+    def latencies(self, begin: float, end: float) -> list[float]:
+        """From handing over to the noted acknowledgement, s, of what was handed over then; inf without."""
+        noted = [*self.journal.noted, *[float("inf")] * len(self.submitted)]
+        return [b - a for a, b in zip(self.submitted, noted, strict=False) if begin <= a < end]
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._client.close()
+        self._replicator.close()
+        self._bus.close()
+        self.journal.close()
+
+
+def run_schedule(agents: Sequence[Agent], orders: Orders, begin: float) -> None:
+    """Nodes and reports of all agents, each at its own times; then the burst."""
+    rng = np.random.default_rng([orders.seed, orders.first, 1])
+    end = begin + orders.seconds
+    due: list[tuple[float, int, bool]] = []
+    for k in range(len(agents)):
+        due.append((begin + rng.uniform(0.0, INTERVAL), k, True))
+        due.append((begin + rng.uniform(0.0, 1.0 / REPORTS), k, False))
+    due += [(end + rng.uniform(0.0, 1.0), number - orders.first, True) for number in burst_numbers(orders)]
+    heapq.heapify(due)
+    while due and due[0][0] < end + 1.0:
+        at, k, maps = heapq.heappop(due)
+        time.sleep(max(0.0, at - time.monotonic()))
+        if maps:
+            agents[k].map_on()
+        else:
+            agents[k].report()
+        after = at + (INTERVAL if maps else 1.0 / REPORTS)
+        if after < end:
+            heapq.heappush(due, (after, k, maps))
+
+
+def burst_numbers(orders: Orders) -> list[int]:
+    """Which of these agents make a node in the burst, once for each."""
+    # A stop is a node and an edge.
+    everyone = np.arange(orders.burst // 2) % orders.agents
+    return [int(n) for n in everyone if orders.first <= n < orders.first + orders.count]
+
+
+def main() -> None:
+    """Connect, wait for the start, map, and say how long acknowledgements took."""
+    orders = Orders(**json.loads(sys.argv[1]))
+    stops = 2 + int(orders.seconds / INTERVAL) + -(-orders.burst // 2 // orders.agents)
+    agents = [Agent(orders, orders.first + k, stops) for k in range(orders.count)]
+    for agent in agents:
+        agent.map_on()
+    wait_until_acknowledged(agents)
+    print("ready", flush=True)
+    begin = float(sys.stdin.readline())
+    run_schedule(agents, orders, begin)
+    end = begin + orders.seconds
+    wait_until_acknowledged(agents)
+    print(
+        json.dumps({
+            "steady": [x for agent in agents for x in agent.latencies(begin, end)],
+            "burst": [x for agent in agents for x in agent.latencies(end, end + 100.0)],
+            "burst_end": max((t for agent in agents for t in agent.journal.noted), default=end),
+        }),
+        flush=True,
+    )  # fmt: skip
+    # Closing a thousand sessions one after the other takes longer than the benchmark.
+    os._exit(0)
+
+
+def wait_until_acknowledged(agents: Sequence[Agent]) -> None:
+    """Until all is acknowledged, or patience ends."""
+    end = time.monotonic() + PATIENCE
+    while any(agent.waits() for agent in agents) and time.monotonic() < end:
+        time.sleep(0.02)
+
+
+if __name__ == "__main__":
+    main()

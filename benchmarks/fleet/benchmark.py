@@ -1,0 +1,267 @@
+"""How many robots one map server carries: what acknowledgements and answers take, and what that costs.
+
+    python -m benchmarks.fleet [--agents N ...] [--seconds S] [--burst N] [--seed N] [--json]
+
+A real `mapweave server` process with its router, over Zenoh on loopback. Each agent has a session, journal,
+replicator and fleet client of its own, as on a robot; a process holds up to 125 of them. Each agent maps a
+room of its own: a node of 150 landmarks and its edge every 10 s, and two status reports a second. Behind that
+comes a burst: so many changes within one second. Meanwhile one more session asks five times a second where it
+is. Journals lie in memory, as they are other machines' disks; the server's store is on this machine's disk.
+
+By number of agents: `acked_per_s`; `ack_p50_ms` and `ack_p99_ms` from handing a change over to the journal's
+note that the server has it; `burst_p99_ms` and `burst_s`, until all of the burst is acknowledged;
+`relocalize_p95_ms`; `unacked` changes at the end. Of one core: `server_cpu`, `router_cpu` (Zenoh's threads in
+the server's process) and `generator_cpu` (all agents). `floor_*` is a bare Zenoh question, answered after a
+bare commit of SQLite, in the same run on a router of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.fleet import floor_process
+from benchmarks.fleet.agents_process import FLEET, INTERVAL, PATIENCE, Orders
+from benchmarks.fleet.drives import drive
+from benchmarks.fleet.process_usage import cpu_seconds, resident_mb, total
+from mapweave.hybridmap.query import View
+from mapweave.processes import parent_watchdog
+from mapweave.scenarios.children import Children, free_port
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.messages import encode_view
+from mapweave.wire.zenoh_bus import ZenohBus
+
+AGENTS_PER_PROCESS = 125
+QUESTIONS_PER_S = 5.0
+CONNECTING = 300.0
+"""Longest wait until all agents are connected and have handed over their first node, s."""
+ASKED = {"ack_p99_ms": 500.0, "relocalize_p95_ms": 250.0}
+"""Of 1000 agents, at most."""
+
+Figures = dict[str, float]
+
+
+class Generator:
+    """A process with agents of the fleet."""
+
+    def __init__(self, orders: Orders) -> None:
+        """Start it."""
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.fleet.agents_process", json.dumps(asdict(orders))],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=dict(os.environ),
+        )  # fmt: skip
+        self.pid = self._process.pid
+
+    def line(self) -> str:
+        """The next line that it prints."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise SystemExit("a process with agents has ended before its time")
+        return line
+
+    def start(self, begin: float) -> None:
+        """Let its agents map."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{begin}\n")
+        self._process.stdin.flush()
+
+    def close(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def end_all(generators: Sequence[Generator]) -> None:
+    """End them, since they take too long."""
+    for generator in generators:
+        generator.close()
+
+
+def ask(bus: ZenohBus, views: Sequence[View], begin: float, end: float) -> tuple[list[float], int]:
+    """Ask where it is; returns how long each answer took, s, and how often there was none."""
+    took, lost = [], 0
+    messages = [encode_view(view) for view in views]
+    for k in range(round((end - begin) * QUESTIONS_PER_S)):
+        time.sleep(max(0.0, begin + k / QUESTIONS_PER_S - time.monotonic()))
+        asked = time.monotonic()
+        replies = bus.ask(Keys(FLEET).any_relocalize(), messages[k % len(messages)], 10.0)
+        if replies and not replies[0].error:
+            took.append(time.monotonic() - asked)
+        else:
+            lost += 1
+    return took, lost
+
+
+def measure_fleet(agents: int, options: argparse.Namespace, folder: Path, progress: Progress) -> Figures:
+    """Start a server and so many agents, and let them map."""
+    step = progress.add_task(f"{agents} agents connect", total=None)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    folder.mkdir()
+    with ExitStack() as stack:
+        journals = stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder()))
+        children = stack.enter_context(Children(folder / "logs"))
+        children.start("server", [
+            "server", "--fleet", FLEET, "--listen", endpoint, "--data", str(folder),
+        ])  # fmt: skip
+        bus = ZenohBus(BusSettings(endpoints=(endpoint,)))
+        stack.callback(bus.close)
+        if not bus.wait_connected(60.0):
+            raise SystemExit("the server does not listen")
+        generators = []
+        for first in range(0, agents, AGENTS_PER_PROCESS):
+            count = min(AGENTS_PER_PROCESS, agents - first)
+            orders = Orders(
+                endpoint, journals, first, count, agents, options.seconds, options.burst, options.seed
+            )
+            generators.append(Generator(orders))
+            stack.callback(generators[-1].close)
+        connecting = threading.Timer(CONNECTING, end_all, (generators,))
+        connecting.start()
+        for generator in generators:
+            generator.line()
+        connecting.cancel()
+        children.check()
+        views = [drive(k, 1, options.seed).view for k in range(min(agents, 20))]
+        begin = time.monotonic() + 1.0
+        end = begin + options.seconds
+        for generator in generators:
+            generator.start(begin)
+        progress.update(step, description=f"{agents} agents map", total=options.seconds + 1.0)
+        asked: list[tuple[list[float], int]] = []
+        asking = threading.Thread(target=lambda: asked.append(ask(bus, views, begin, end + 1.0)))
+        asking.start()
+        server, pids = children.pid("server"), [generator.pid for generator in generators]
+        time.sleep(max(0.0, begin - time.monotonic()))
+        before = (*cpu_seconds(server), total(pids))
+        while time.monotonic() < end:
+            time.sleep(min(0.2, max(0.0, end - time.monotonic())))
+            progress.update(step, completed=time.monotonic() - begin)
+        took = time.monotonic() - begin
+        own, zenoh, generated = (
+            (b - a) / took for a, b in zip(before, (*cpu_seconds(server), total(pids)), strict=True)
+        )
+        rss = resident_mb(server)
+        asking.join()
+        progress.update(step, description=f"{agents} agents wait for acknowledgements", total=None)
+        results = [json.loads(generator.line()) for generator in generators]
+        children.check()
+        progress.update(step, description=f"{agents} agents", total=1, completed=1)
+    steady = np.array([x for result in results for x in result["steady"]])
+    burst = np.array([x for result in results for x in result["burst"]])
+    (answers, unanswered), *_ = asked
+    return {
+        "acked_per_s": round(float(np.isfinite(steady).sum()) / options.seconds, 1),
+        "ack_p50_ms": milliseconds(steady, 50),
+        "ack_p99_ms": milliseconds(steady, 99),
+        "burst": len(burst),
+        "burst_p99_ms": milliseconds(burst, 99),
+        "burst_s": round(max(result["burst_end"] for result in results) - end, 2),
+        "unacked": int((~np.isfinite(steady)).sum() + (~np.isfinite(burst)).sum()),
+        "relocalize_p95_ms": milliseconds(np.array(answers), 95),
+        "unanswered": unanswered,
+        "server_cpu": round(own, 3),
+        "router_cpu": round(zenoh, 3),
+        "generator_cpu": round(generated, 3),
+        "server_rss_mb": round(rss),
+    }  # fmt: skip
+
+
+def milliseconds(times: np.ndarray, percent: float) -> float:
+    """A percentile; what never came counts as long as was waited for it."""
+    if not len(times):
+        return float("nan")
+    value = np.percentile(np.where(np.isfinite(times), times, PATIENCE), percent)
+    return round(1e3 * float(value), 1)
+
+
+def memory_folder() -> str | None:
+    """A folder in memory, if there is one."""
+    return "/dev/shm" if Path("/dev/shm").is_dir() else None
+
+
+def measure_floor(folder: Path, questions: int = 300) -> Figures:
+    """A bare question, answered after a bare commit."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ExitStack() as stack:
+        children = stack.enter_context(Children(folder / "floor"))
+        children.start("router", ["router", "--listen", endpoint])
+        process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.fleet.floor_process", endpoint, str(folder)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=parent_watchdog.environment(),
+        )  # fmt: skip
+        stack.callback(process.communicate)
+        stack.callback(process.kill)
+        assert process.stdout is not None
+        process.stdout.readline()
+        bus = ZenohBus(BusSettings(endpoints=(endpoint,)))
+        stack.callback(bus.close)
+        if not bus.wait_connected(20.0):
+            raise SystemExit("the router of the floor does not listen")
+        times = []
+        for _ in range(questions):
+            asked = time.monotonic()
+            if bus.ask(floor_process.KEY, bytes(3000), 5.0):
+                times.append(time.monotonic() - asked)
+    took = np.array(times)
+    return {"floor_p50_ms": milliseconds(took, 50), "floor_p99_ms": milliseconds(took, 99)}
+
+
+def main() -> None:
+    """Measure and print."""
+    about = (__doc__ or "").splitlines()[0]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.fleet", description=about)
+    parser.add_argument("--agents", type=int, nargs="+", default=[10, 50, 200, 1000], help="fleets")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of mapping")
+    parser.add_argument("--burst", type=int, default=1000, help="changes within a second, behind that")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    options = parser.parse_args()
+    if min(options.agents) < 1 or options.seconds < INTERVAL or options.burst < 0 or options.seed < 0:
+        parser.error(
+            f"--agents must be positive, --seconds at least {INTERVAL:g}, --burst and --seed not negative"
+        )
+    rows: dict[str, Figures] = {}
+    report: dict[str, object] = {
+        "seed": options.seed, "cores": os.cpu_count(), "load_before": round(os.getloadavg()[0], 1),
+    }  # fmt: skip
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Progress(console=Console(stderr=True)) as progress,
+    ):
+        floor = measure_floor(Path(folder))
+        for agents in options.agents:
+            rows[str(agents)] = measure_fleet(agents, options, Path(folder) / str(agents), progress)
+    table = Table(
+        title=f"a map server and its fleet; a bare question and commit: {floor['floor_p50_ms']:g} ms"
+    )
+    table.add_column("agents")
+    for name in rows:
+        table.add_column(name, justify="right")
+    for key in next(iter(rows.values())):
+        table.add_row(key, *(f"{row[key]:g}" for row in rows.values()))
+    Console(stderr=options.json).print(table)
+    if options.json:
+        largest = rows[str(max(options.agents))]
+        good = all(largest[key] <= most for key, most in ASKED.items()) and not largest["unacked"]
+        print(json.dumps({**report, **floor, "asked": ASKED, "good": good, "agents": rows}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""One robot of five floods the map server: what the other four notice.
+
+    python -m benchmarks.flood [--seconds S] [--rate N] [--seed N] [--json]
+
+A real `mapweave server` process, over Zenoh on loopback. Four honest robots send a change a second with the
+real journal and replicator, and ask once a second where they are. First they are alone (`quiet`), then a
+fifth process floods the server, each time in another way: `changes`, `--rate` node puts a second, and a new
+map each 200; `beacons`, as many of maps whose logs never answer; `questions`, relocalize, route and known
+from four threads without a pause.
+
+Of the honest robots: `ack_p50_ms` and `ack_p99_ms` from handing over a change to its acknowledgement;
+`answer_p50_ms` and `answer_p95_ms` from asking to an answer, refusals and their pauses included; `lost`,
+changes and questions that got none within 60 s. Of the server at the end of each part: `rss_mb`, its
+memory; `nodes` in the merged map, of which the honest robots have 80.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import os
+import tempfile
+import threading
+import time
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.flood.fleet import FLEET, HonestRobot, Waits
+from benchmarks.flood.flooder import KINDS, flood
+from mapweave.scenarios.children import Children, free_port
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
+from mapweave.wire.zenoh_bus import ZenohBus
+
+ROBOTS = 4
+"""Honest ones."""
+PARTS = ("quiet", *KINDS)
+
+
+def work(robots: list[HonestRobot], seconds: float) -> Waits:
+    """Let all robots work at once."""
+    waits = Waits()
+    threads = [threading.Thread(target=robot.work, args=(seconds, waits)) for robot in robots]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return waits
+
+
+def figures(waits: Waits) -> dict[str, float]:
+    """What is printed of one part."""
+    acks, answers = 1e3 * np.array(waits.acks or [math.nan]), 1e3 * np.array(waits.answers or [math.nan])
+    return {
+        "acks": len(waits.acks),
+        "ack_p50_ms": round(float(np.percentile(acks, 50)), 1),
+        "ack_p99_ms": round(float(np.percentile(acks, 99)), 1),
+        "answers": len(waits.answers),
+        "answer_p50_ms": round(float(np.percentile(answers, 50)), 1),
+        "answer_p95_ms": round(float(np.percentile(answers, 95)), 1),
+        "lost": waits.lost,
+    }
+
+
+def resident_mb(process: int) -> float:
+    """Memory of a process."""
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    (kilobytes,) = (line.split()[1] for line in lines if line.startswith("VmRSS:"))
+    return round(int(kilobytes) / 1024, 1)
+
+
+def end(flooders: list[BaseProcess]) -> None:
+    """End the flood."""
+    while flooders:
+        flooder = flooders.pop()
+        flooder.kill()
+        flooder.join()
+
+
+def measure(seconds: float, rate: float, seed: int, folder: Path) -> dict[str, dict[str, float]]:
+    """All parts."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with Children(folder / "logs") as children, Progress(console=Console(stderr=True)) as progress:
+        step = progress.add_task("the robots hand over their maps", total=len(PARTS))
+        children.start("server", ["server", "--fleet", FLEET, "--listen", endpoint, "--data", str(folder)])
+        server = children.pid("server")
+        robots = [HonestRobot(number, endpoint, folder, seed) for number in range(ROBOTS)]
+        asker = ZenohBus(BusSettings(endpoints=(endpoint,)))
+        flooders: list[BaseProcess] = []
+        try:
+            if not all(robot.hand_over() for robot in robots):
+                raise SystemExit("the server has not taken the maps in time")
+            parts: dict[str, dict[str, float]] = {}
+            for part in PARTS:
+                progress.update(step, description=part)
+                if part in KINDS:
+                    flooders.append(
+                        multiprocessing.get_context("spawn").Process(
+                            target=flood, args=(endpoint, part, rate, seed + 50), daemon=True
+                        )
+                    )
+                    flooders[-1].start()
+                    time.sleep(2.0)
+                waits = work(robots, seconds)
+                replies = asker.ask(Keys(FLEET).server_status("s0"), b"", 60.0)
+                nodes = int(decode_record(replies[0].payload)["nodes"]) if replies else -1
+                parts[part] = figures(waits) | {"rss_mb": resident_mb(server), "nodes": nodes}
+                end(flooders)
+                children.check()
+                progress.advance(step)
+            return parts
+        finally:
+            end(flooders)
+            for robot in robots:
+                robot.close()
+            asker.close()
+
+
+def main() -> None:
+    """Measure and print."""
+    about = (__doc__ or "").splitlines()[0]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.flood", description=about)
+    parser.add_argument("--seconds", type=float, default=15.0, help="of each part")
+    parser.add_argument("--rate", type=float, default=500.0, help="changes or beacons a second")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    options = parser.parse_args()
+    if not (0.0 < options.seconds < math.inf and 0.0 < options.rate < math.inf) or options.seed < 0:
+        parser.error("--seconds and --rate must be positive, --seed not negative")
+    report = {"seed": options.seed, "cores": os.cpu_count(), "load_before": round(os.getloadavg()[0], 1)}
+    with tempfile.TemporaryDirectory() as folder:
+        parts = measure(options.seconds, options.rate, options.seed, Path(folder))
+    table = Table(title="Four honest robots, without and with one that floods the server")
+    table.add_column("")
+    for part in PARTS:
+        table.add_column(part, justify="right")
+    for key in parts["quiet"]:
+        table.add_row(key, *(f"{parts[part][key]:g}" for part in PARTS))
+    Console(stderr=options.json).print(table)
+    if options.json:
+        print(json.dumps({**report, **parts}))

@@ -1,0 +1,103 @@
+"""Draws `edit.png`: the page while a floor plan is laid under the map of three robots, in a real browser.
+
+Where there is no Chromium, the picture that is there stays.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from docs.floor_plan import plan_of, to_pixels
+from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.node import NodeId
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.server import MapServer
+from mapweave.wire.codec import encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from synthetic.building import Building
+from tests.browser import Browser, there_is_none
+from tests.waiting import eventually
+
+PICTURE = Path(__file__).with_name("edit.png")
+ROOMS = (0, 2, 4, 6, 8)
+"""With a pair in each: the four corners and the middle of the building."""
+CLICKS = 2.0
+"""How far a person clicks beside a place, px."""
+MERGED = 240.0
+"""Longest wait for the merge, s."""
+
+
+@contextmanager
+def page_of(building: Building, folder: Path) -> Iterator[Browser]:
+    """The page of a server with the robots' maps."""
+    store = Store(folder / "s0.sqlite")
+    for robot in range(building.robots):
+        log = list(building.log(robot))
+        map_id = log[0][0]
+        entries = [
+            Entry.read(map_id, k, encode_change(Change(map_id, k, 0, body)))
+            for k, (_, body) in enumerate(log, 1)
+        ]
+        store.apply(map_id, 7, entries, len(entries))
+    store.close()
+    hub = MemoryHub()
+    with MapServer(MemoryBus(hub), Keys("docs"), folder / "s0.sqlite", "s0") as server:
+        assert server.settle(MERGED), "the map is merged"
+        with Web(("127.0.0.1", 0), server) as web, Browser(folder / "profile") as page:
+            page.look(1280, 800)
+            page.open(f"http://127.0.0.1:{web.port}/")
+            eventually(lambda: page.run("return mapweave.model.links.length"))
+            yield page
+
+
+def lay_plan(page: Browser, building: Building, image_path: Path) -> None:
+    """Choose the plan, and click the pairs."""
+    image, plan_from_world = plan_of(building)
+    cv2.imwrite(str(image_path), image)
+    page.run("document.getElementById('tab-edit').click()")
+    page.run(
+        "const kind = document.getElementById('edit-kind'); kind.value = 'plan';"
+        "kind.dispatchEvent(new Event('change'))"
+    )
+    page.type("#plan-file", str(image_path))
+    eventually(lambda: page.run("return mapweave.planEditor.pane.image?.naturalWidth"))
+    rng = np.random.default_rng(3)
+    for k, room in enumerate(ROOMS, 1):
+        robot, number = np.argwhere(building.rooms == room)[0]
+        node = NodeId(f"r{robot}", 1, 2 * number)
+        place = plan_from_world @ building.world_from(node)
+        u, v = to_pixels(np.array([place.x, place.y]), len(image)) + rng.normal(0.0, CLICKS, 2)
+        page.run(
+            f"const e = mapweave.planEditor, m = mapweave.model, row = m.rowOf('{node}');"
+            f"e.clickedPlan({u}, {v}); e.clickedMap(m.x[row], m.y[row])"
+        )
+        eventually(lambda k=k: page.run("return document.querySelectorAll('#plan-pairs li').length") == k)
+    eventually(lambda: "rms" in page.run("return document.getElementById('plan-fit').textContent"))
+    page.run("document.getElementById('fit').click()")
+    page.type("#plan-because", "drawing of 2024")
+    page.run("document.activeElement.blur()")
+
+
+def main() -> None:
+    """Draw."""
+    if there_is_none():
+        print("there is no Chromium: edit.png stays as it is", file=sys.stderr)
+        return
+    building = Building.draw(3, 48, seed=2)
+    with tempfile.TemporaryDirectory() as folder, page_of(building, Path(folder)) as page:
+        lay_plan(page, building, Path(folder) / "office.png")
+        page.screenshot(PICTURE)
+
+
+if __name__ == "__main__":
+    main()

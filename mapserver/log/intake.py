@@ -1,0 +1,139 @@
+"""How much of one robot's logs the server takes now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+
+from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.mapserver.log.agent_log import AgentLog
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.quotas import CHANGE_BYTES, MOST_ROBOTS, Quotas, TokenBucket
+from mapweave.wire.log_messages import MAX_ROWS
+
+WORTHWHILE = 16
+"""Changes for which it is worth asking a robot; fewer wait until so many may come."""
+ADVICE = "retire maps with `mapweave map retire`, or raise in [quotas]"
+MOST_UNMERGED = 1024
+"""Changes of a robot that wait to be merged; further ones stay on its disk."""
+
+
+class Intake:
+    """The quotas of one robot: rates, and what is kept of it."""
+
+    def __init__(
+        self, agent: str, quotas: Quotas, store: Store, retired: Callable[[], Collection[MapId]]
+    ) -> None:
+        """Count what is kept of the robot."""
+        self._agent, self._quotas, self._store, self._retired = agent, quotas, store, retired
+        rate, now = quotas.settings.changes, quotas.clock()
+        self._changes = TokenBucket(rate, now)
+        self._bytes = TokenBucket(rate * CHANGE_BYTES, now)
+        self._beacons = TokenBucket(rate, now)
+        self._current: AgentLog | None = None
+        self._nodes = self._landmarks = 0
+        self._count()
+
+    def beacon(self) -> bool:
+        """Whether a beacon is looked at; the next one says the same."""
+        now = self._quotas.clock()
+        allowed = self._beacons.wait(1.0, now) <= 0.0
+        if allowed:
+            self._beacons.spend(1.0, now)
+        else:
+            self._quotas.hold_back(self._agent, "beacons")
+        return allowed
+
+    def change(self, size: int, unmerged: int) -> bool:
+        """Whether a published change is taken; one that is not is pulled later."""
+        if self.rows(unmerged) < 1:
+            self._quotas.hold_back(self._agent, "changes")
+            return False
+        self.spend(1, size)
+        return True
+
+    def rows(self, unmerged: int) -> int:
+        """How many changes may come now."""
+        now = self._quotas.clock()
+        if self._bytes.available(now) <= 0.0:
+            return 0
+        return max(0, min(MAX_ROWS, int(self._changes.available(now)), MOST_UNMERGED - unmerged))
+
+    def pause(self) -> float:
+        """After how many seconds it is worth asking for changes again."""
+        now = self._quotas.clock()
+        return max(self._changes.wait(WORTHWHILE, now), self._bytes.wait(WORTHWHILE * CHANGE_BYTES, now), 0.1)
+
+    def spend(self, count: int, size: int) -> None:
+        """Changes have come."""
+        now = self._quotas.clock()
+        self._changes.spend(count, now)
+        self._bytes.spend(size, now)
+
+    def keep_ahead_of(self, agent_log: AgentLog) -> None:
+        """Changes behind a gap are kept for one map, which a robot makes at a time."""
+        if self._current is not None and self._current is not agent_log:
+            self._current.forget_ahead()
+        self._current = agent_log
+
+    def fitting(self, entries: Sequence[Entry]) -> tuple[int, str]:
+        """How many of these changes, in order, the robot's quota of nodes has room for, and why not more.
+
+        Those that fit count as kept from now on.
+        """
+        count, reason = self._fitting(entries)
+        if reason:
+            # People may have retired a map meanwhile.
+            self._count()
+            count, reason = self._fitting(entries)
+        return count, reason
+
+    def _fitting(self, entries: Sequence[Entry]) -> tuple[int, str]:
+        settings = self._quotas.settings
+        added: dict[NodeId, int] = {}
+        for count, entry in enumerate(entries):
+            if not (isinstance(entry.change, Change) and isinstance(entry.change.body, NodePut)):
+                continue
+            node = entry.change.body.node
+            before = added.get(node.id, self._store.landmarks(node.id))
+            nodes = self._nodes + (before is None)
+            landmarks = self._landmarks + len(node.landmarks) - (before or 0)
+            if nodes > settings.nodes or landmarks > settings.landmarks:
+                what = f"{self._nodes} nodes with {self._landmarks} landmarks"
+                return count, f"{self._agent} has {what} here, which is its quota: {ADVICE} `nodes`"
+            self._nodes, self._landmarks = nodes, landmarks
+            added[node.id] = len(node.landmarks)
+        return len(entries), ""
+
+    def _count(self) -> None:
+        kept, retired = self._store.kept(self._agent), self._retired()
+        counts = [count for map_id, count in kept.items() if map_id not in retired]
+        self._nodes = sum(nodes for nodes, _ in counts)
+        self._landmarks = sum(landmarks for _, landmarks in counts)
+
+
+class Intakes:
+    """Those of all robots."""
+
+    def __init__(self, store: Store, quotas: Quotas, retired: Callable[[], Collection[MapId]]) -> None:
+        """Start with none."""
+        self._store, self._quotas, self._retired = store, quotas, retired
+        self._intakes: dict[str, Intake] = {}
+
+    def of(self, agent: str) -> Intake:
+        """That of one robot."""
+        intake = self._intakes.get(agent)
+        if intake is None:
+            if len(self._intakes) >= MOST_ROBOTS:
+                del self._intakes[next(iter(self._intakes))]
+            intake = self._intakes[agent] = Intake(agent, self._quotas, self._store, self._retired)
+        return intake
+
+    def objection(self, map_id: MapId, known: Collection[MapId]) -> str:
+        """Why a new map of a robot is not taken; empty if it is."""
+        retired = self._retired()
+        kept = sum(other.agent == map_id.agent and other not in retired for other in known)
+        if kept < self._quotas.settings.maps:
+            return ""
+        return f"{map_id.agent} has {kept} maps here, which is its quota: {ADVICE} `maps`"

@@ -1,0 +1,76 @@
+"""Copies: nodes whose landmarks are other robots', bit by bit."""
+
+from __future__ import annotations
+
+from mapweave.hybridmap.node import CODE_BYTES, MapId, Node, NodeId
+
+LEAST_COPIED = 10
+"""Landmarks with the same descriptor, bit by bit: as many as a recognition needs. Two images of a thing never
+give the same 32 numbers as often."""
+
+
+def copied_landmarks(a: Node, b: Node) -> int:
+    """How many descriptors two nodes have in common, bit by bit."""
+    return len(_descriptors(a) & _descriptors(b))
+
+
+def _descriptors(node: Node) -> set[bytes]:
+    codes = node.landmarks.codes.tobytes()
+    return {codes[k : k + CODE_BYTES] for k in range(0, len(codes), CODE_BYTES)}
+
+
+class Copies:
+    """Nodes whose landmarks are copies of other robots': no views of their own, so no evidence.
+
+    Who came later has copied; that is known of nodes that came to this process. Of the others, those of
+    maps that were set apart before; else those of the robot that shares landmarks with more others.
+    """
+
+    def __init__(self) -> None:
+        """None are known."""
+        self._pairs: dict[tuple[NodeId, NodeId], int] = {}
+        self._came: dict[NodeId, int] = {}
+        self._count = 0
+
+    def came(self, node: Node, before: Node | None) -> None:
+        """Note when the landmarks of a node came.
+
+        Args:
+            node: as it is now.
+            before: as it was; None if it is new.
+        """
+        if before is None or 2 * copied_landmarks(node, before) < len(node.landmarks):
+            self._count += 1
+            self._came[node.id] = self._count
+
+    def compare(self, a: Node, b: Node) -> None:
+        """Look for copies among two nodes that show the same place."""
+        copied = copied_landmarks(a, b) if a.id.agent != b.id.agent else 0
+        if copied >= LEAST_COPIED:
+            self._pairs[a.id, b.id] = copied
+
+    def forget(self, pair: tuple[NodeId, NodeId]) -> None:
+        """Two nodes are no longer compared, or show different things now."""
+        self._pairs.pop(pair, None)
+
+    def maps(self, suspects: frozenset[MapId]) -> dict[MapId, str]:
+        """The maps with copies, and what they copy, in words.
+
+        Args:
+            suspects: maps that were set apart when this process began.
+        """
+        shared: dict[str, set[str]] = {}
+        for a, b in self._pairs:
+            shared.setdefault(a.agent, set()).add(b.agent)
+            shared.setdefault(b.agent, set()).add(a.agent)
+
+        def copier(node: NodeId) -> tuple[bool, int, int]:
+            return node.map in suspects, len(shared[node.agent]), self._came.get(node, 0)
+
+        out: dict[MapId, str] = {}
+        for pair, copied in sorted(self._pairs.items()):
+            original, copy = sorted(pair, key=copier)
+            out.setdefault(
+                copy.map, f"{copied} landmarks of its node {copy} are those of {original} bit by bit: copies"
+            )
+        return out

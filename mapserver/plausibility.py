@@ -1,0 +1,60 @@
+"""Plausibility: what is in a map that no robot can have measured, in words.
+
+Such a map is merged as far as its links carry it, but it is no second place: where it shows what other maps
+show, and is not joined with them, it makes no answer ambiguous (mapweave.mapserver.active_nodes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
+from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
+
+
+def implausible(hybrid_map: HybridMap) -> str:
+    """What no robot can have measured; empty if all of a map may be true."""
+    nodes = sorted(hybrid_map.nodes.values(), key=lambda node: node.id)
+    most = max(nodes, key=lambda node: len(node.landmarks), default=None)
+    if most is not None and len(most.landmarks) > MOST_LANDMARKS:
+        return f"node {most.id} has {len(most.landmarks)} landmarks, of which {MOST_LANDMARKS} are compared"
+    for clock in sorted({node.clock for node in nodes} - {""}):
+        if runs_backwards([node for node in nodes if node.clock == clock]):
+            return f"its clock {clock} runs backwards: nothing is concluded from its times"
+    return ""
+
+
+LEAST_NODES = 4
+"""Of a map whose geometry can be tested."""
+MOST_FRAGMENTS = 8
+"""Of a robot. One that loses its way leaves one or two a day."""
+
+
+def fragments(maps: Mapping[MapId, HybridMap]) -> list[MapId]:
+    """Maps with fewer nodes that their robots have left for others: nothing tells whether they are right.
+
+    Of a robot that leaves very many, the newest as well.
+    """
+    small: dict[str, list[MapId]] = {}
+    newest: dict[str, int] = {}
+    for map_id, hybrid_map in sorted(maps.items()):
+        newest[map_id.agent] = map_id.epoch
+        if len(hybrid_map.nodes) < LEAST_NODES:
+            small.setdefault(map_id.agent, []).append(map_id)
+    return [
+        map_id
+        for robot, some in small.items()
+        for map_id in some
+        if map_id.epoch < newest[robot] or len(some) > MOST_FRAGMENTS
+    ]
+
+
+def scattered(maps: Mapping[MapId, HybridMap]) -> dict[MapId, str]:
+    """The first fragment of each robot that leaves very many."""
+    by_robot: dict[str, list[MapId]] = {}
+    for map_id in fragments(maps):
+        by_robot.setdefault(map_id.agent, []).append(map_id)
+    words = f"its robot has left {MOST_FRAGMENTS} maps and more with fewer than {LEAST_NODES} nodes each"
+    return {some[0]: words for some in by_robot.values() if len(some) >= MOST_FRAGMENTS}

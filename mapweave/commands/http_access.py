@@ -1,0 +1,73 @@
+"""Where HTTP is served, and to which clients: `--http`, with the keys of the fleet if there are any."""
+
+from __future__ import annotations
+
+import ssl
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mapweave.identities.key_folder import KeyFolder
+    from mapweave.identities.logins import Logins
+    from mapweave.mapserver.http.answering import Answering
+    from mapweave.mapserver.http.web import Web
+    from mapweave.wire.credentials import Credentials
+
+
+@dataclass(frozen=True)
+class HttpAccess:
+    """How HTTP is served.
+
+    Attributes:
+        address: host and port.
+        logins: of the fleet's members; None without keys.
+        tls: serves HTTPS; None without certificates.
+    """
+
+    address: tuple[str, int]
+    logins: Logins | None
+    tls: ssl.SSLContext | None
+
+    @property
+    def url(self) -> str:
+        """For people."""
+        host, port = self.address
+        scheme = "http" if self.tls is None else "https"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
+
+    def serve(self, server: Answering) -> Web:
+        """Open the port."""
+        from mapweave.mapserver.http.web import Web
+
+        return Web(self.address, server, logins=self.logins, tls=self.tls)
+
+    def renew(self, own: Credentials) -> None:
+        """Go on with another certificate."""
+        from mapweave.mapserver.http.tls import load
+
+        if self.tls is not None:
+            load(self.tls, own)
+
+
+def http_access(words: str, folder: KeyFolder | None, server: str) -> HttpAccess:
+    """How HTTP is served.
+
+    Args:
+        words: `PORT` or `HOST:PORT`.
+        folder: of the fleet's keys.
+        server: whose certificate it is.
+
+    Raises:
+        SettingsError: other machines would be served without a login, or unencrypted; or a key is missing.
+    """
+    from mapweave.identities.key_file import read_key_file
+    from mapweave.identities.logins import Logins
+    from mapweave.mapserver.http.tls import server_context
+    from mapweave.mapserver.http.web import check_reach, parse_address
+
+    address, logins, tls = parse_address(words), None, None
+    if folder is not None:
+        logins = Logins(folder.path)
+        tls = server_context(read_key_file(folder.key_file(server)).credentials)
+    check_reach(address, logins is not None, tls is not None)
+    return HttpAccess(address, logins, tls)

@@ -1,0 +1,87 @@
+"""Tokens with which members of a fleet log in over HTTP. Only their hashes are kept, beside the identities.
+
+A token is 32 random bytes, so its plain SHA-256 cannot be turned back, and no guess meets it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+
+from mapweave.hybridmap.errors import SettingsError
+from mapweave.identities.key_file import write_private
+from mapweave.storage.atomic_file import read_whole
+
+TOKENS = "tokens.json"
+PREFIX = "mapweave_"
+"""By which people and scanners know a token when they see one."""
+DAYS = 90
+"""For which a token holds, unless it is said otherwise."""
+
+
+@dataclass(frozen=True)
+class Token:
+    """What is kept of a token.
+
+    Attributes:
+        name: whose it is.
+        sha256: its hash, hexadecimal.
+        issued: when it was made, ISO 8601.
+        expires: when it ends.
+    """
+
+    name: str
+    sha256: str
+    issued: str
+    expires: str
+
+    @property
+    def expired(self) -> bool:
+        """Whether it has ended."""
+        return datetime.fromisoformat(self.expires) <= datetime.now(UTC)
+
+
+def hash_of(token: str) -> str:
+    """The hash by which a token is known."""
+    return hashlib.sha256(token.encode("utf-8", errors="replace")).hexdigest()
+
+
+def read_tokens(folder: Path) -> tuple[Token, ...]:
+    """All tokens of a folder of keys, oldest first.
+
+    Raises:
+        SettingsError: their file is damaged.
+    """
+    try:
+        return msgspec.json.decode(read_whole(folder / TOKENS), type=tuple[Token, ...])
+    except FileNotFoundError:
+        return ()
+    except (OSError, msgspec.DecodeError) as error:
+        raise SettingsError(f"{folder / TOKENS}: {error}") from None
+
+
+def add_token(folder: Path, name: str, days: float) -> str:
+    """Make a token; it is returned, and nowhere else."""
+    token, now = PREFIX + secrets.token_urlsafe(32), datetime.now(UTC)
+    expires = (now + timedelta(days=days)).isoformat(timespec="seconds")
+    made = Token(name, hash_of(token), now.isoformat(timespec="seconds"), expires)
+    _write(folder, (*(one for one in read_tokens(folder) if not one.expired), made))
+    return token
+
+
+def end_tokens(folder: Path, name: str) -> int:
+    """End all tokens of a name; returns how many there were."""
+    before = read_tokens(folder)
+    left = tuple(one for one in before if one.name != name)
+    if len(left) < len(before):
+        _write(folder, left)
+    return len(before) - len(left)
+
+
+def _write(folder: Path, tokens: tuple[Token, ...]) -> None:
+    write_private(folder / TOKENS, msgspec.json.format(msgspec.json.encode(tokens), indent=1).decode() + "\n")

@@ -1,0 +1,46 @@
+"""Bent maps: a little wrong everywhere, so that no line of sight refutes them.
+
+Links of a bent map contradict each other, but each puts the map nearly where all others do. No second room is
+so near to the first: the map is at that one place, and its geometry is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link
+from mapweave.registration.pose_arrays import compose_poses, inverse_poses
+
+AGREEING = 0.9
+"""Two maps agree if this share of their links do: a few are false. Sound maps of the benchmark have 0.97 and
+more, those of a robot with wrong geometry up to 0.75."""
+BENT_XY, BENT_HEADING = 1.5, math.radians(30.0)
+"""Placements that differ by less are of one place, m and rad: rooms that look alike are at least as far apart
+as one is wide, and doors are 0.9 m wide alone."""
+
+
+def is_bent(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> bool:
+    """Whether a map can be placed so that nearly all links have their nodes nearly there.
+
+    Args:
+        links: from `placed` to `fixed`, which contradict each other.
+        placed: piece of map.
+        fixed: piece of map.
+    """
+    own = compose_poses(
+        fixed.graph.means[fixed.graph.index([link.b for link in links])],
+        inverse_poses(np.stack([link.a_from_b.mean.vector for link in links])),
+    )
+    inside = placed.graph.means[placed.graph.index([link.a for link in links])]
+    placements = compose_poses(own, inverse_poses(inside))
+    for placement in placements:
+        off = compose_poses(inverse_poses(own), compose_poses(placement[None], inside))
+        near = np.hypot(off[:, 0], off[:, 1]) < BENT_XY
+        near &= np.abs(off[:, 2]) < BENT_HEADING
+        if near.mean() >= AGREEING:
+            return True
+    return False

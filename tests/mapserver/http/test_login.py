@@ -1,0 +1,330 @@
+"""Who may do what over HTTP on a fleet with keys: tokens, sessions, roles, and pages of other sites.
+
+`TABLE` has every route: a new one is without a line until it is decided who may ask it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import socket
+import ssl
+import urllib.request
+from collections.abc import Callable, Iterator
+from email.message import Message
+from pathlib import Path
+
+import pytest
+from starlette.routing import Mount, Route, WebSocketRoute
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from mapweave.hybridmap.errors import SettingsError
+from mapweave.identities.key_file import read_key_file
+from mapweave.identities.key_folder import KeyFolder, Profile
+from mapweave.identities.logins import Logins
+from mapweave.identities.tokens import TOKENS, end_tokens
+from mapweave.mapserver.http import sessions
+from mapweave.mapserver.http.serving import Limits
+from mapweave.mapserver.http.tls import load, server_context
+from mapweave.mapserver.http.web import Questions, Web
+from mapweave.wire.credentials import Role
+from tests.mapserver.http.client import ask, raw
+from tests.mapserver.stub_services import StubServices
+from tests.waiting import eventually
+
+NAMES = {"vera": Role.VIEWER, "otto": Role.OPERATOR, "r0": Role.ROBOT, "s0": Role.SERVER}
+READ = {"vera", "otto", "s0"}
+COMMAND = {"otto", "s0"}
+ANY = {*NAMES}
+ALL = {"", *NAMES}
+"""Also without a login."""
+TABLE: dict[tuple[str, str], set[str]] = {
+    ("GET", "/"): ALL, ("GET", "/why"): ALL, ("GET", "/static"): ALL,
+    ("POST", "/login"): ALL, ("POST", "/logout"): ALL, ("GET", "/session"): ANY,
+    ("WS", "/live"): READ,
+    ("GET", "/status"): ANY, ("GET", "/history"): READ, ("GET", "/explain"): READ, ("GET", "/route"): READ,
+    ("GET", "/robots"): READ, ("GET", "/missions"): READ, ("GET", "/map"): READ,
+    ("GET", "/nodes/{node}"): READ,
+    ("GET", "/annotations"): READ, ("POST", "/annotations"): COMMAND,
+    ("GET", "/plan-images/{sha256}.png"): READ,
+    ("GET", "/plans"): READ, ("GET", "/plans/{name:path}.png"): READ, ("POST", "/plans"): COMMAND,
+    ("GET", "/constraints"): READ, ("POST", "/constraints"): COMMAND,
+    ("POST", "/robots/{robot}/{kind}"): COMMAND, ("POST", "/stop"): COMMAND,
+    ("POST", "/relocalize"): ANY,
+}  # fmt: skip
+
+
+class Keyed:
+    """A server with the keys of a fleet."""
+
+    def __init__(self, folder: Path, services: StubServices) -> None:
+        self.folder = KeyFolder.create(folder, "demo", Profile.LAB, ["maps.example"], "s0")
+        for name, role in NAMES.items():
+            if role is not Role.SERVER:
+                self.folder.add(name, role)
+        self.tokens = {name: self.folder.token(name, 1.0) for name in NAMES}
+        self.web = Web(("127.0.0.1", 0), services, logins=Logins(folder))
+        self.site = f"127.0.0.1:{self.web.port}"
+
+    def ask(self, method: str, path: str, name: str = "", body: bytes | None = None, **headers: str) -> int:
+        given = {"Authorization": f"Bearer {self.tokens[name]}"} if name else {}
+        return ask(self.web, method, path, body, {**given, **named(headers)})[0]
+
+    def log_in(self, token: str, **headers: str) -> tuple[int, Message, dict[str, str]]:
+        body = json.dumps({"token": token}).encode()
+        status, got, content = ask(
+            self.web, "POST", "/login", body, {"Content-Type": "application/json", **named(headers)}
+        )
+        return status, got, json.loads(content)
+
+    def session(self, name: str) -> dict[str, str]:
+        """The cookie of someone who has logged in, and the page's origin."""
+        cookie = self.log_in(self.tokens[name])[1]["Set-Cookie"].partition(";")[0]
+        return {"Cookie": cookie, "Origin": f"http://{self.site}"}
+
+    def watch(self, **headers: str) -> ClientConnection:
+        return connect(f"ws://{self.site}/live", additional_headers=named(headers))
+
+
+def named(headers: dict[str, str]) -> dict[str, str]:
+    return {name.replace("_", "-"): value for name, value in headers.items()}
+
+
+@pytest.fixture
+def keyed(tmp_path: Path, services: StubServices) -> Iterator[Keyed]:
+    keyed = Keyed(tmp_path / "keys", services)
+    with keyed.web:
+        yield keyed
+
+
+def routes(services: StubServices) -> set[tuple[str, str]]:
+    found: set[tuple[str, str]] = set()
+    for route in Questions(services, 1.0).app.routes:  # type: ignore[attr-defined]
+        match route:
+            case WebSocketRoute():
+                found.add(("WS", route.path))
+            case Mount():
+                found.add(("GET", route.path))
+            case Route():
+                found |= {(method, route.path) for method in (route.methods or set()) - {"HEAD"}}
+    return found
+
+
+def test_every_route_is_in_the_table(services: StubServices) -> None:
+    assert routes(services) == TABLE.keys()
+
+
+def test_each_role_may_ask_what_the_table_says(keyed: Keyed) -> None:
+    """What it may not is refused before anything of the request is looked at."""
+    filled = {
+        "{node}": "r0.1.1",
+        "{name:path}": "flat",
+        "{sha256}": "0" * 64,
+        "{robot}": "r0",
+        "{kind}": "stop",
+    }
+    for (method, path), may in TABLE.items():
+        for chunk, words in filled.items():
+            path = path.replace(chunk, words)
+        for name in ALL:
+            status = watched(keyed, name) if method == "WS" else keyed.ask(method, path, name)
+            refused = status == (403 if name else 401)
+            assert refused == (name not in may), (method, path, name, status)
+            if method == "GET":
+                assert keyed.ask("HEAD", path, name) == status
+
+
+def watched(keyed: Keyed, name: str) -> int:
+    given = {"Authorization": f"Bearer {keyed.tokens[name]}"} if name else {}
+    try:
+        with keyed.watch(**given):
+            return 101
+    except InvalidStatus as refused:
+        return (
+            refused.value.response.status_code if hasattr(refused, "value") else refused.response.status_code
+        )
+
+
+def test_a_session_is_a_cookie_that_pages_cannot_read_or_send_elsewhere(keyed: Keyed) -> None:
+    status, headers, answer = keyed.log_in(keyed.tokens["otto"])
+    cookie = headers["Set-Cookie"]
+    assert (status, answer) == (200, {"name": "otto", "role": "operator"})
+    assert {"HttpOnly", "SameSite=strict", "Path=/"} <= {part.strip() for part in cookie.split(";")}
+    assert keyed.tokens["otto"] not in cookie and "Secure" not in cookie
+    # A proxy on this machine says that it is asked by HTTPS.
+    secure = keyed.log_in(keyed.tokens["otto"], X_Forwarded_Proto="https")[1]["Set-Cookie"]
+    assert secure.startswith("__Host-") and "Secure" in secure
+    session = keyed.session("otto")
+    assert keyed.ask("GET", "/robots", **session) == 200
+    assert keyed.ask("POST", "/stop", **session) == 200
+    assert keyed.ask("POST", "/logout", **session) == 200
+    assert keyed.ask("GET", "/robots", **session) == 401
+
+
+@pytest.mark.parametrize("path", ["/stop", "/robots/r0/stop", "/constraints", "/annotations", "/logout"])
+def test_a_page_of_another_site_cannot_use_a_session(keyed: Keyed, path: str) -> None:
+    """As bytes: a browser may be old, and the cookie be sent along in spite of SameSite."""
+    session = keyed.session("otto")
+    other_port = session["Origin"].rpartition(":")[0] + ":1"
+    foreign = ["https://evil.example", "null", other_port, "http://127.0.0.1.evil.example"]
+    for origin in (*(f"Origin: {site}\r\n" for site in foreign), ""):
+        head = f"POST {path} HTTP/1.1\r\nHost: {keyed.site}\r\nCookie: {session['Cookie']}\r\n{origin}"
+        got = raw(keyed.web, f"{head}Content-Type: text/plain\r\nContent-Length: 2\r\n\r\n{{}}".encode())
+        assert got.startswith(b"HTTP/1.1 403 "), (origin, got[:80])
+    assert keyed.ask("GET", "/robots", **session) == 200, "it is not logged out, either"
+
+
+def test_a_page_of_another_site_cannot_watch_by_a_session(keyed: Keyed) -> None:
+    session = keyed.session("vera")
+    for headers in ({"Cookie": session["Cookie"]}, {**session, "Origin": "http://evil.example"}):
+        with pytest.raises(InvalidStatus) as refused, keyed.watch(**headers):
+            pass
+        assert refused.value.response.status_code == 403
+    with keyed.watch(**session) as watching:
+        hello = json.loads(watching.recv(timeout=20))
+    assert (hello["name"], hello["role"], hello["commands"]) == ("vera", "viewer", False)
+    assert hello["why_not"] == "You are vera, a viewer: missions and corrections need an operator."
+
+
+def revoke_identity(keyed: Keyed) -> None:
+    keyed.folder.revoke("vera", "left")
+
+
+def revoke_tokens(keyed: Keyed) -> None:
+    assert end_tokens(keyed.folder.path, "vera") == 1
+
+
+def damage_tokens(keyed: Keyed) -> None:
+    (keyed.folder.path / TOKENS).write_text("{")
+
+
+@pytest.mark.parametrize("end", [revoke_identity, revoke_tokens, damage_tokens])
+def test_revoking_ends_tokens_sessions_and_viewers_at_once(
+    keyed: Keyed, end: Callable[[Keyed], None]
+) -> None:
+    session = keyed.session("vera")
+    with keyed.watch(**session) as watching:
+        assert json.loads(watching.recv(timeout=20))["name"] == "vera"
+        end(keyed)
+        assert keyed.ask("GET", "/robots", "vera") == 401
+        assert keyed.ask("GET", "/robots", **session) == 401
+        with pytest.raises(ConnectionClosed) as closed:
+            while True:
+                watching.recv(timeout=20)
+        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+    assert keyed.log_in(keyed.tokens["vera"])[0] == 401
+    if end is not damage_tokens:
+        assert keyed.ask("GET", "/robots", "otto") == 200
+
+
+def test_a_token_and_a_session_end_by_themselves(keyed: Keyed, monkeypatch: pytest.MonkeyPatch) -> None:
+    keyed.tokens["vera"] = keyed.folder.token("vera", -1e-6)
+    assert keyed.ask("GET", "/robots", "vera") == 401
+    now = [0.0]
+    open_ones = sessions.Sessions(lambda: now[0])
+    secrets = [open_ones.begin(Login) for Login in range(sessions.MOST_SESSIONS + 1)]  # type: ignore[arg-type]
+    assert open_ones.find(secrets[0]) is None and open_ones.find(secrets[-1]) is not None
+    now[0] = sessions.LIFE
+    assert open_ones.find(secrets[-1]) is None
+
+
+def test_failed_logins_are_limited_and_logged(keyed: Keyed, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "mapweave.mapserver")
+    assert keyed.log_in(keyed.tokens["otto"])[0] == 200
+    answers = [keyed.log_in("mapweave_guess")[0] for _ in range(sessions.MOST_FAILURES + 1)]
+    assert answers == [401] * sessions.MOST_FAILURES + [429]
+    status, headers, _ = keyed.log_in(keyed.tokens["otto"])
+    assert status == 429 and 0 < int(headers["Retry-After"]) <= sessions.WINDOW
+    # Another address, as a proxy on this machine tells it.
+    assert keyed.log_in(keyed.tokens["otto"], X_Forwarded_For="10.0.0.7")[0] == 200
+    assert keyed.ask("GET", "/robots", "otto") == 200, "a script with a good token goes on"
+    assert "operator otto logs in from 127.0.0.1" in caplog.text and "refused: a token" in caplog.text
+    assert "mapweave_" not in caplog.text
+    for scheme in ("Basic abc", "Bearer", "Bearer mapweave_guess", "bearer\tx"):
+        assert keyed.ask("GET", "/robots", Authorization=scheme) == 401
+
+
+def test_what_failed_long_ago_is_forgotten() -> None:
+    now = [0.0]
+    failures = sessions.Failures(lambda: now[0])
+    for _ in range(sessions.MOST_FAILURES):
+        failures.add("10.0.0.1")
+    assert failures.wait("10.0.0.1") == sessions.WINDOW and failures.wait("10.0.0.2") == 0.0
+    now[0] = sessions.WINDOW
+    assert failures.wait("10.0.0.1") == 0.0
+    for number in range(sessions.MOST_ADDRESSES + 1):
+        failures.add(str(number))
+    assert len(failures._times) == sessions.MOST_ADDRESSES
+
+
+@pytest.mark.parametrize("body", [b"{}", b'{"token": 3}', b'{"token": "x", "name": "otto"}', b"\xff", b"[]"])
+def test_a_login_that_is_none(keyed: Keyed, body: bytes) -> None:
+    given = {"Content-Type": "application/json"}
+    assert ask(keyed.web, "POST", "/login", body, given)[0] == 400
+    assert ask(keyed.web, "POST", "/login", body, {"Content-Type": "text/plain"})[0] == 415
+    assert ask(keyed.web, "POST", "/login", body.ljust(2000), given)[0] == 413
+
+
+def test_the_name_of_the_server_is_known_with_keys(keyed: Keyed) -> None:
+    assert keyed.ask("GET", "/robots", "vera", Host="maps.example") == 200
+    assert keyed.ask("GET", "/robots", "vera", Host="evil.example") == 403
+
+
+def test_without_keys_this_machine_alone_is_served(services: StubServices, tmp_path: Path) -> None:
+    for host in ("0.0.0.0", "192.0.2.1", "::", "maps.local"):
+        with pytest.raises(SettingsError, match="without keys people are served on this machine alone"):
+            Web((host, 0), services)
+    lab = Logins(KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0").path)
+    with pytest.raises(SettingsError, match="no token may travel unencrypted"):
+        Web(("0.0.0.0", 0), services, logins=lab)
+    with Web(("127.0.0.1", 0), services) as open_one:
+        assert ask(open_one, "POST", "/stop")[0] == 200
+        # Other machines that a proxy lets in read.
+        forwarded = {"X-Forwarded-For": "10.0.0.7"}
+        assert ask(open_one, "GET", "/robots", None, forwarded)[0] == 200
+        status, _, content = ask(open_one, "POST", "/stop", None, forwarded)
+        assert status == 403 and "server's own machine alone" in json.loads(content)["error"]
+        login = ask(open_one, "POST", "/login", b'{"token": "x"}', {"Content-Type": "application/json"})
+        assert login[0] == 400 and b"no keys" in login[2]
+
+
+def test_who_logs_in_over_https_sees_the_certificate_of_the_authority(
+    services: StubServices, tmp_path: Path
+) -> None:
+    folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0")
+    folder.add("otto", Role.OPERATOR)
+    token, server = folder.token("otto", 1.0), folder.key_file("s0")
+    tls = server_context(read_key_file(server).credentials)
+    trusting = ssl.create_default_context(cafile=str(folder.path / "authority.pem"))
+    # As Python does from 3.13 on.
+    trusting.verify_flags |= ssl.VERIFY_X509_STRICT
+    with Web(("0.0.0.0", 0), services, limits=Limits(head=0.5), logins=Logins(folder.path), tls=tls) as web:
+        address = f"https://127.0.0.1:{web.port}/status"
+        asked = urllib.request.Request(address, headers={"Authorization": f"Bearer {token}"})
+        assert json.load(urllib.request.urlopen(asked, context=trusting, timeout=20))["nodes"] == 12
+        with pytest.raises(OSError, match="CERTIFICATE_VERIFY_FAILED"):
+            urllib.request.urlopen(asked, context=ssl.create_default_context(), timeout=20)
+        # A handshake that is never begun, a head that never ends, and what is no HTTP.
+        assert raw(web, b"") == b""
+        assert encrypted(web, trusting, b"GET /status HTTP/1.1\r\nX: ") == b""
+        assert encrypted(web, trusting, b"\x00\x01\r\n\r\n").startswith(b"HTTP/1.1 400")
+        eventually(lambda: web.connections == 0)
+        folder.add("s0", Role.SERVER)
+        load(tls, read_key_file(server).credentials)
+        assert json.load(urllib.request.urlopen(asked, context=trusting, timeout=20))["nodes"] == 12
+
+
+def encrypted(web: Web, context: ssl.SSLContext, data: bytes) -> bytes:
+    with (
+        socket.create_connection(("127.0.0.1", web.port), timeout=20) as plain,
+        context.wrap_socket(plain, server_hostname="127.0.0.1") as connection,
+    ):
+        connection.sendall(data)
+        got = b""
+        try:
+            while piece := connection.recv(65536):
+                got += piece
+        except (ssl.SSLError, ConnectionError):
+            pass  # cut off
+        return got

@@ -1,0 +1,233 @@
+"""A robot that floods the ingest: others do not wait for it, and what is held back of it is not lost."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log import ingest
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.intake import ADVICE
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
+from mapweave.wire.bus import Request
+from mapweave.wire.log_messages import Refusal
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.mapserver.log.acknowledged_fleet import AGENT, node
+from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server
+from tests.waiting import eventually
+
+OTHER = MapId("r1", 1)
+
+
+class Clock:
+    """Time that passes when the test says so."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def cleanup() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+def other_agent(hub: MemoryHub, cleanup: ExitStack, map_id: MapId = OTHER) -> HandAgent:
+    other = HandAgent(hub, map_id)
+    cleanup.callback(other.bus.close)
+    return other
+
+
+def test_a_flood_of_one_robot_is_no_queue_for_another(
+    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
+) -> None:
+    began, go = threading.Event(), threading.Event()
+
+    def hold(change: Change) -> None:
+        server.seen.append(change)
+        began.set()
+        go.wait(60)
+
+    server.on_change = hold
+    other = other_agent(hub, cleanup)
+    agent.publish(1)
+    began.wait(60)
+    for sequence in range(2, 400):
+        agent.publish(sequence)
+    other.publish(1)
+    eventually(lambda: len(server.ingest._work._items) == 399)
+    go.set()
+    eventually(lambda: len(server.seen) == 400)
+    place = [change.map for change in server.seen].index(OTHER)
+    assert place <= 1, f"{place} changes of the robot that floods went before"
+
+
+def test_a_pulled_log_is_no_queue_for_another_either(
+    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
+) -> None:
+    other = other_agent(hub, cleanup)
+
+    def publish_once(change: Change) -> None:
+        if not server.seen:
+            other.publish(1)
+            eventually(lambda: len(server.ingest._work._items))
+        server.seen.append(change)
+
+    server.on_change = publish_once
+    agent.serve(256)
+    agent.beacon(256)
+    eventually(lambda: len(server.seen) == 257)
+    assert [change.map for change in server.seen].index(OTHER) == ingest.AT_ONE_TURN
+
+
+def test_what_is_held_back_is_fetched_later_in_order(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack
+) -> None:
+    clock = Clock()
+    quotas = Quotas(QuotaSettings(changes=10.0), clock)
+    server = Server(hub, tmp_path / "s0.sqlite", quotas=quotas)
+    cleanup.callback(server.end)
+    agent, other = other_agent(hub, cleanup, MAP), other_agent(hub, cleanup)
+    at_once = round(10 * BURST)
+    agent.serve(300)
+    for sequence in range(1, 301):
+        agent.publish(sequence)
+    other.publish(1)
+    eventually(lambda: server.store.watermark(OTHER) == 1)
+    eventually(lambda: "100 changes" in quotas.over().get("r0", ""))
+    eventually(lambda: server.store.watermark(MAP) == at_once)
+    assert "r1" not in quotas.over()
+    for passed in (3.0, 60.0):
+        clock.now += passed
+        allowed = min(at_once + round(10 * clock.now), 300)
+        eventually(lambda allowed=allowed: server.store.watermark(MAP) == allowed)
+    assert [c.sequence for c in server.seen if c.map == MAP] == list(range(1, 301))
+    assert quotas.over() == {}, "it has kept to its quota for a while"
+
+
+def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack
+) -> None:
+    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(maps=3)))
+    agents = [other_agent(hub, cleanup, MapId("r0", epoch)) for epoch in range(1, 6)]
+    for agent in agents:
+        agent.serve(2)
+        agent.beacon(2)
+    eventually(lambda: all(server.store.watermark(agent.map) == 2 for agent in agents[:3]))
+    reason = f"r0 has 3 maps here, which is its quota: {ADVICE} `maps`"
+    for agent in agents[3:]:
+        refusals = [ack.refusals for ack in agent.acks if ack.map == agent.map]
+        assert refusals and set(refusals) == {(Refusal(0, reason),)}
+    other = other_agent(hub, cleanup)
+    other.publish(1)
+    eventually(lambda: server.store.watermark(OTHER) == 1)
+    agents[0].publish(3)
+    eventually(lambda: server.store.watermark(agents[0].map) == 3)
+    assert len(server.store.maps()) == 4
+    server.end()
+    server.quotas = None
+    server.begin()
+    cleanup.callback(server.end)
+    eventually(lambda: [agent.beacon(2) for agent in agents] and len(server.store.maps()) == 6)
+
+
+def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
+    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(nodes=10)))
+    bus = MemoryBus(hub)
+    cleanup.callback(bus.close)
+    journal = Journal(tmp_path / "r0.sqlite", "r0")
+    cleanup.callback(journal.close)
+    map_id = journal.open_map(1)
+    replicator = Replicator(bus, KEYS, journal, map_id, ["s0"], AGENT)
+    cleanup.callback(replicator.close)
+    rng = np.random.default_rng(1)
+    puts = [node(map_id, number, rng) for number in range(1, 16)]
+    again = [node(map_id, number, rng) for number in range(1, 6)]
+    replicator.submit([*puts[:5], *again, *puts[5:]], 1)
+    eventually(lambda: "r0 has 10 nodes" in replicator.status().failure)
+    assert server.store.watermark(map_id) == 15, "ten nodes, five of them twice"
+    assert replicator.unacknowledged() == 5
+    server.end()
+    server.quotas = Quotas(QuotaSettings(nodes=15))
+    server.begin()
+    cleanup.callback(server.end)
+    assert replicator.wait_acknowledged(60)
+    eventually(lambda: not replicator.status().failure)
+    assert [c.sequence for c in server.seen if c.map == map_id][-5:] == [16, 17, 18, 19, 20]
+
+
+def test_logs_that_never_answer_do_not_hold_up_one_that_does(
+    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
+) -> None:
+    agent.publish(1)
+    eventually(lambda: agent.acks)
+    kept: list[Request] = []
+    silent = other_agent(hub, cleanup, MapId("x0", 1))
+    for number in range(60):
+        silent.map = MapId(f"x{number}", 1)
+        silent.bus.serve(KEYS.log(silent.map), kept.append)
+        silent.beacon(5)
+    eventually(lambda: len(kept) >= ingest.AT_ONCE // 2)
+    agent.serve(5)
+    agent.beacon(5)
+    # Each of them is waited for 2 s, four at once: that alone is half a minute.
+    eventually(lambda: server.sequences == [1, 2, 3, 4, 5], 15)
+
+
+def test_names_alone_fill_no_memory(
+    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
+) -> None:
+    crowd = other_agent(hub, cleanup)
+    for number in range(3 * ingest.MOST_UNKNOWN):
+        crowd.map = MapId(f"x{number}", number % 7)
+        crowd.beacon(0)
+        if number % 500 == 0:
+            # They come faster than the inbox has room for.
+            eventually(lambda: not len(server.ingest._work._items))
+    agent.publish(1)
+    eventually(lambda: server.sequences == [1])
+    eventually(lambda: not len(server.ingest._work._items))
+    assert len(server.ingest._logs) <= ingest.MOST_UNKNOWN + 1
+
+
+def test_a_beacon_beyond_all_logs_moves_only_its_own(
+    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
+) -> None:
+    """It says 2^53 and answers with nothing, as if all that was pruned: that ends its own map alone."""
+    agent.serve(2)
+    agent.publish(1)
+    other = other_agent(hub, cleanup, MapId("r0", MAP.epoch + 1))
+    other.serve(2)
+    agent.beacon(2**53)
+    other.beacon(2)
+    eventually(lambda: server.store.watermark(other.map) == 2)
+    fresh = other_agent(hub, cleanup)
+    fresh.publish(1)
+    eventually(lambda: server.store.watermark(OTHER) == 1)
+    assert server.store.watermark(MAP) <= 2, "it has given no more than two"
+
+
+def test_undecodable_changes_fill_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapweave.mapserver.log.store.MOST_REFUSED_KEPT", 5)
+    store = Store(tmp_path / "s0.sqlite")
+    entries = [Entry.read(MAP, sequence, b"\xc1" * 100_000) for sequence in range(1, 51)]
+    store.apply(MAP, LOG_ID, entries)
+    assert store.refused() == store.watermark(MAP) == 50
+    assert store.refusals(MAP, 1)[0].reason
+    store.close()
+    assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 2_000_000

@@ -1,0 +1,192 @@
+"""One robot of three lies: the other two keep their map and their answers, and the page says who it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.agent_status import AgentStatus, Status
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.limits import MAX_NUMBER
+from mapweave.hybridmap.map_event import MapEventKind
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.log.entry import unmeasurable
+from mapweave.mapserver.merging.copies import Copies, copied_landmarks
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.plausibility import MOST_FRAGMENTS
+from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
+from mapweave.wire.codec import decode_change
+from mapweave.wire.log_messages import Head
+from mapweave.wire.messages import encode
+from synthetic.world import take_map
+from tests.mapserver.test_set_apart import (
+    KEYS,
+    TOUR,
+    WORLD,
+    Fleet,
+    messages,
+    serving,
+    sound_logs,
+    stored,
+    whereabouts,
+)
+from tests.mapserver.test_set_apart import views as lost
+from tests.waiting import eventually
+
+FIRST, LAST = MapId("a", 1), MapId("z", 1)
+"""Maps are sorted by name: one that lies is before or behind the others."""
+STEP = np.diag([0.03, 0.03, 0.02]) ** 2
+
+
+def copies(map_id: MapId) -> list[ChangeBody]:
+    """Two nodes of one robot and two of the other, with wrong ways between them."""
+    logs = [[decode_change(message).body for message in log] for log in sound_logs().values()]
+    nodes = [body.node for log in logs for body in log[:2] if isinstance(body, NodePut)]
+    assert len(nodes) == 4
+    return chain(map_id, nodes, Pose2(1.0, 2.0, 0.5), STEP)
+
+
+def views(map_id: MapId, step: Pose2, covariance: np.ndarray) -> list[ChangeBody]:
+    """Own views of the room, with wrong ways between them."""
+    return chain(map_id, take_map(WORLD, map_id, TOUR, np.random.default_rng(8))[0], step, covariance)
+
+
+def chain(map_id: MapId, nodes: list[Node], step: Pose2, covariance: np.ndarray) -> list[ChangeBody]:
+    out: list[ChangeBody] = []
+    for k, node in enumerate(nodes):
+        out.append(NodePut(replace(node, id=NodeId(*map_id, 2 * k + 1), stamp_ns=k * 10**9)))
+        if k:
+            ends = NodeId(*map_id, 2 * k - 1), NodeId(*map_id, 2 * k + 1)
+            edge = Edge(NodeId(*map_id, 2 * k), *ends, PoseGaussian(step, covariance), EdgeKind.MAPPED)
+            out.append(EdgePut(edge))
+    return out
+
+
+def lies(map_id: MapId) -> dict[str, tuple[list[ChangeBody], str]]:
+    """What is sent, and what is said against it."""
+    vague, true = (views(map_id, Pose2(), spread) for spread in (9e3 * np.eye(3), STEP))
+    backwards: list[ChangeBody] = [
+        NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock="utc"))
+        for body in true
+        if isinstance(body, NodePut)
+    ]
+    return {
+        "copies": (copies(map_id), f"map {map_id} is set apart: "),
+        "vague edges": (vague, f"map {map_id} is implausible: change 3 is refused (edge "),
+        "a clock": (backwards, f"map {map_id} is implausible: its clock utc runs backwards"),
+    }
+
+
+def said(fleet: Fleet, words: str) -> list[MapEventKind]:
+    return [event.kind for event in fleet.server.history() if event.words.startswith(words)]
+
+
+@pytest.mark.parametrize(
+    ("name", "map_id"), [("copies", FIRST), ("copies", LAST), ("vague edges", LAST), ("a clock", FIRST)]
+)
+def test_the_others_keep_their_map_and_their_answers(name: str, map_id: MapId, tmp_path: Path) -> None:
+    path = tmp_path / "s0.sqlite"
+    stored(path, sound_logs()).close()
+    log, words = lies(map_id)[name]
+    status = AgentStatus(Status("mapping", "", 4, 0, Pose2(), False), 1, map_id.agent, 1)
+    with serving(path) as fleet:
+        links, places = sound_links(fleet), [where[0] for where in whereabouts(fleet.where())]
+        assert links and set(places) == {Certainty.FOUND}
+        fleet.acks_of(map_id.agent)
+        fleet.tell(map_id, messages(map_id, log))
+        eventually(lambda: said(fleet, words))
+        assert fleet.server.settle(30)
+        assert sound_links(fleet) == links
+        assert [where[0] for where in whereabouts(fleet.where())] == places
+        fleet.bus.publish(KEYS.agent_status(map_id.agent), encode(status))
+        eventually(lambda: fleet.server.robots().robots)
+        assert fleet.server.robots().robots[0].accusation.startswith(words)
+    with serving(path) as fleet:
+        assert fleet.server.settle(30)
+        # Who has copied is known from before, and is said once.
+        assert len(said(fleet, f"map {map_id} is ")) == 1
+        assert sound_links(fleet) == links
+        assert [where[0] for where in whereabouts(fleet.where())] == places
+
+
+def sound_links(fleet: Fleet) -> set[tuple[NodeId, NodeId]]:
+    liars = {FIRST, LAST}
+    return {link.pair for link in fleet.server.merged().links if liars.isdisjoint({link.a.map, link.b.map})}
+
+
+def test_no_log_is_as_long_as_the_greatest_number(tmp_path: Path) -> None:
+    """It is not waited for; the log goes on."""
+    with serving(tmp_path / "s0.sqlite") as fleet:
+        fleet.acks_of(LAST.agent)
+        fleet.bus.publish(KEYS.head(LAST), Head(7, MAX_NUMBER).encode())
+        words = f"map {LAST} is implausible: change {MAX_NUMBER} is announced"
+        fleet.tell(LAST, messages(LAST, views(LAST, Pose2(), STEP)))
+        eventually(lambda: said(fleet, words))
+
+
+def test_who_shares_landmarks_with_most_has_copied_them_if_nothing_else_tells() -> None:
+    """A server that has lost its disk may hear the one that lies first."""
+    nodes = [body.node for body in copies(LAST) if isinstance(body, NodePut)]
+    logs = [[decode_change(message).body for message in log] for log in sound_logs().values()]
+    sound = [body.node for log in logs for body in log[:2] if isinstance(body, NodePut)]
+    found = Copies()
+    for one in (*nodes, *sound):
+        found.came(one, None)
+    for a, b in zip(nodes, sound, strict=True):
+        found.compare(b, a)
+    assert found.maps(frozenset()).keys() == {LAST}
+    # Known from before: even if it is the other way round.
+    assert found.maps(frozenset({sound[0].id.map})).keys() >= {sound[0].id.map}
+    # Views of one room from about the same places share none.
+    other = take_map(WORLD, LAST, TOUR, np.random.default_rng(9))[0]
+    assert all(copied_landmarks(a, b) == 0 for a in other for b in sound)
+
+
+def test_edges_that_no_robot_measures() -> None:
+    own, other = NodeId(*LAST, 1), NodeId(*FIRST, 3)
+    for end, kind, x, variance, words in (
+        (NodeId(*LAST, 3), EdgeKind.LOOP, 3.0, 0.1, ""),
+        (other, EdgeKind.DRIVEN, 999.0, 99.0, ""),
+        (other, EdgeKind.DRIVEN, 1001.0, 0.1, "is 1001 m long"),
+        (other, EdgeKind.DRIVEN, 3.0, 144.0, "deviation of 12 m"),
+        (other, EdgeKind.LOOP, 3.0, 0.1, "is loop and joins nodes of others"),
+    ):
+        pose = PoseGaussian(Pose2(x), variance * np.eye(3))
+        edge = Edge(NodeId(*LAST, 2), own, end, pose, kind)
+        assert words in unmeasurable(EdgePut(edge)) and bool(words) == bool(unmeasurable(EdgePut(edge)))
+
+
+def test_fragments_make_no_answer_ambiguous() -> None:
+    """A robot begins map after map, each with two views of the room and a wrong way between them."""
+    merger = Merger()
+    for log in sound_logs().values():
+        for message in log:
+            merger.on_change(decode_change(message))
+    first = Answers.of(merger, merger.merged(), merger.node).relocalizer
+    assert [first.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+    for epoch in range(1, MOST_FRAGMENTS + 2):
+        map_id = MapId(LAST.agent, epoch)
+        for number, body in enumerate(views(map_id, Pose2(1.0, 2.0, 0.5), STEP)[:3], start=1):
+            merger.on_change(Change(map_id, number, 0, body))
+    merged = merger.merged()
+    assert list(merged.implausible) == [LAST]
+    relocalizer = Answers.of(merger, merged, merger.node).relocalizer
+    assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+
+
+def test_nothing_is_concluded_from_a_clock_that_runs_backwards() -> None:
+    nodes = [
+        replace(node, stamp_ns=k * 10**10, clock="utc")
+        for k, node in enumerate(take_map(WORLD, LAST, TOUR, np.random.default_rng(8))[0])
+    ]
+    assert len(trajectories_of(nodes)) == 1
+    for back, known in ((0.9, True), (1.1, False)):
+        late = replace(nodes[1], stamp_ns=nodes[0].stamp_ns - round(back * 1e9) + 10**10)
+        ahead = replace(nodes[0], stamp_ns=10**10)
+        assert len(trajectories_of([ahead, late])) == known

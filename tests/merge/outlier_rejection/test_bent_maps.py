@@ -1,0 +1,65 @@
+"""Maps that are a little wrong everywhere, and maps of rooms that look alike."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.outlier_rejection.bent_maps import is_bent
+from mapweave.merge.outlier_rejection.segmentation import fragments_of
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link
+from synthetic.world import CAMERA
+
+SIGMAS = np.array([0.015, 0.015, 0.008])
+TOUR = [Pose2(2.5 + 1.5 * math.cos(0.5 * k), 2.0 + math.sin(0.5 * k), 0.7 * k) for k in range(20)]
+
+
+def piece(agent: str, steps: list[Pose2]) -> Fragment:
+    """The map of a robot that has measured these steps."""
+    hybrid_map, still = HybridMap(), PoseGaussian(Pose2(), np.zeros((3, 3)))
+    for k in range(len(steps) + 1):
+        hybrid_map.apply(NodePut(Node(NodeId(agent, 1, 2 * k + 1), 0, still, CAMERA, Landmarks.empty())))
+    for k, step in enumerate(steps, start=1):
+        ends = NodeId(agent, 1, 2 * k - 1), NodeId(agent, 1, 2 * k + 1)
+        pose = PoseGaussian(step, np.diag(SIGMAS**2))
+        hybrid_map.apply(EdgePut(Edge(NodeId(agent, 1, 2 * k), *ends, pose, EdgeKind.MAPPED)))
+    (fragment,) = fragments_of({MapId(agent, 1): hybrid_map})
+    return fragment
+
+
+def links(rng: np.random.Generator, shift: Pose2) -> list[Link]:
+    """Each node of one map with two of the other; those of the second half where a shift puts them."""
+    out = []
+    for k, at in enumerate(TOUR):
+        for j in (k, (k + 3) % len(TOUR)):
+            there = (shift @ at) if k >= len(TOUR) // 2 else at
+            noise = Pose2.from_vector(rng.normal(0.0, SIGMAS))
+            pose = PoseGaussian(there.inverse() @ TOUR[j] @ noise, np.diag(SIGMAS**2))
+            out.append(Link(NodeId("b", 1, 2 * k + 1), NodeId("a", 1, 2 * j + 1), pose))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "bent"),
+    [
+        (1.1, Pose2(), True),
+        (0.9, Pose2(), True),
+        (1.0, Pose2(4.0), False),
+        (1.0, Pose2(0.0, 3.0, math.pi), False),
+    ],
+)
+def test_a_bent_map_is_at_one_place_and_a_second_room_is_at_another(
+    scale: float, shift: Pose2, bent: bool
+) -> None:
+    rng = np.random.default_rng(1)
+    steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
+    placed = piece("b", [Pose2(scale * s.x, scale * s.y, s.heading) for s in steps])
+    assert is_bent(links(rng, shift), placed, piece("a", steps)) is bent

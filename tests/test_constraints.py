@@ -1,0 +1,29 @@
+"""constraints.txt pins what every Python that the project promises can install."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib.metadata import PackageNotFoundError, metadata
+from pathlib import Path
+
+from packaging.specifiers import SpecifierSet
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_what_is_pinned_installs_on_the_oldest_python() -> None:
+    """Debian 12 and Raspberry Pi OS have Python 3.11.2: a release for 3.11.5 alone made `make demo` fail."""
+    promised = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
+    oldest = f"{promised.removeprefix('>=')}.0"
+    checked = 0
+    for name, version in re.findall(r"^(\S+)==(\S+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE):
+        try:
+            installed = metadata(name)
+        except PackageNotFoundError:
+            continue
+        if installed["Version"] == version:
+            needs = installed["Requires-Python"] or ""
+            assert SpecifierSet(needs).contains(oldest), f"{name} {version} needs Python {needs}"
+            checked += 1
+    assert checked > 10
