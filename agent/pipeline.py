@@ -199,7 +199,8 @@ class Pipeline:
                 self._explorer = self._new_explorer()
             case GoTo(goal, via, passed, portal):
                 fix = None if self._navigator is None else self._navigator.fix
-                near = min(self.map.nodes) if self._located and self.map.nodes else fix and fix.node
+                near = None if fix is None else fix.node
+                near = min(self.map.nodes, default=near) if self._located else near
                 self._mapper.lose()
                 self._restart()
                 crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)
