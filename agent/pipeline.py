@@ -200,8 +200,7 @@ class Pipeline:
             case GoTo(goal, via, passed, portal):
                 fix = None if self._navigator is None else self._navigator.fix
                 near = None if fix is None else fix.node
-                if self._located and self.map.nodes:
-                    near = min(self.map.nodes)
+                near = min(self.map.nodes, default=near) if self._located else near
                 self._mapper.lose()
                 self._restart()
                 crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)

@@ -53,8 +53,8 @@ class Positioning:
         self._motion = motion
         self._description, self._lens, self._settings = description, lens, settings
         self._own, self._fleet = OwnMap(own_map, rng), FleetMap(motion)
-        self.refuted = self._fleet.refuted
         self._fleet.near = near
+        self.refuted = self._fleet.refuted
         self._localization, self._beyond = (
             GlobalLocalization(description, sift, motion, self._own, policy, self._fleet)
             for policy in (TO_NAVIGATE, BEYOND_PORTAL)
