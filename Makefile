@@ -29,9 +29,9 @@ endif
 demo: setup
 	$(BIN)/mapweave demo
 
-# One worker more than cores, four at the most: many tests wait for processes. Each takes up to 1 GB.
+# Two workers more than cores, four at the most: many tests wait for processes. Each takes up to 1 GB.
 # `make test WORKERS=0` is one process.
-WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 2)
 test: setup
 	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 4 --dist worksteal
 

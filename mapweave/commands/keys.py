@@ -22,8 +22,7 @@ def add_to(commands: Any) -> None:
     )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True, title="actions")
 
-    init = _action(actions, "init", "make the keys of a fleet, and those of its map server",
-                   "mapweave keys init --fleet demo --at 192.168.1.10")  # fmt: skip
+    init = _action(actions, "init", "make the keys of a fleet, and those of its map server")
     init.add_argument("--fleet", default="demo", metavar="NAME", help="name of the fleet (default: demo)")
     init.add_argument(
         "--at", action="append", default=[], metavar="HOST",
@@ -37,41 +36,36 @@ def add_to(commands: Any) -> None:
     init.add_argument("--server", default="s0", metavar="NAME", help="name of the map server (default: s0)")
     init.set_defaults(run=_init)
 
-    add = _action(actions, "add", "give a robot, server or person a key, or a new one",
-                  "mapweave keys add anna --role operator")  # fmt: skip
+    add = _action(actions, "add", "give a robot, server or person a key, or a new one")
     add.add_argument("name", metavar="NAME", help="a robot's name is that of its agent")
     add.add_argument("--role", choices=ROLES, default="robot", help="what it may do (default: robot)")
     add.add_argument("--days", type=float, default=365.0, help="for which it holds (default: 365)")
     add.set_defaults(run=_add)
 
-    token = _action(actions, "token", "a token with which a person or a script logs in over HTTP",
-                    "mapweave keys token anna")  # fmt: skip
+    token = _action(actions, "token", "a token with which a person or a script logs in over HTTP")
     token.add_argument("name", metavar="NAME", help="who has a key already, see `mapweave keys add`")
     token.add_argument("--days", type=float, default=90.0, help="for which it holds (default: 90)")
     token.set_defaults(run=_token)
 
-    listing = _action(actions, "list", "who has a key, and until when", "mapweave keys list")
+    listing = _action(actions, "list", "who has a key, and until when")
     listing.add_argument("--json", action="store_true", help="print one JSON object")
     listing.set_defaults(run=_list)
 
-    revoke = _action(
-        actions, "revoke", "admit an identity no more, at once", "mapweave keys revoke r3 --because stolen"
-    )
+    revoke = _action(actions, "revoke", "admit an identity no more, at once")
     revoke.add_argument("name", metavar="NAME")
     revoke.add_argument("--because", default="", metavar="TEXT", help="why; the router's log says it")
     revoke.add_argument("--tokens", action="store_true", help="only the tokens for HTTP; the key stays good")
     revoke.set_defaults(run=_revoke)
 
-    bundle = _action(actions, "bundle", "the one file to copy to a robot or person",
-                     "mapweave keys bundle r0 -o /media/stick/r0.key.toml")  # fmt: skip
+    bundle = _action(actions, "bundle", "the one file to copy to a robot or person")
     bundle.add_argument("name", metavar="NAME")
     bundle.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="where to")
     bundle.set_defaults(run=_bundle)
 
 
-def _action(actions: Any, name: str, words: str, example: str) -> argparse.ArgumentParser:
+def _action(actions: Any, name: str, words: str) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = actions.add_parser(
-        name, help=words, description=f"{words[0].upper()}{words[1:]}.", epilog=f"example: {example}"
+        name, help=words, description=f"{words[0].upper()}{words[1:]}."
     )
     parser.add_argument(
         "--keys", type=Path, default=Path("keys"), metavar="FOLDER", help="folder of the keys (default: keys)"

@@ -160,6 +160,7 @@ def test_an_agent_that_was_killed_goes_on_with_its_map(
         assert between.distance(truth[first].inverse() @ truth[node]) < 0.25
 
 
+@pytest.mark.slow
 def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, Pose2]]) -> None:
     life, _ = again
     kept, now = HybridMap(RetainedMap.of(life.journal, MapId(ROBOT, 1)).contents), life.pipeline.map
@@ -174,7 +175,6 @@ def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, 
         assert kept.edges[number].a_from_b.mean.distance(edge.a_from_b.mean) < 1e-5
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_resuming_again_is_the_same_to_the_last_bit(
     begun: Begun, again: tuple[Life, dict[NodeId, Pose2]], tmp_path: Path
@@ -203,6 +203,7 @@ def test_an_agent_that_was_killed_and_moved(begun: Begun, tmp_path: Path) -> Non
     check_resumed(begun, life, begun.truth | life.truth())
 
 
+@pytest.mark.slow
 def test_nothing_is_appended_where_nothing_is_recognised(begun: Begun, tmp_path: Path) -> None:
     """It starts in a room that it has never seen, turns there, and adds nothing."""
     rooms = [
@@ -234,7 +235,6 @@ def test_after_a_drive_to_a_goal_it_maps_on(begun: Begun, tmp_path: Path) -> Non
 # Kidnapped while it maps
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_path: Path) -> None:
     """It knows where it is, drives on, and is put down elsewhere between two ticks, turned around."""

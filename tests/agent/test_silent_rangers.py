@@ -73,7 +73,6 @@ def test_it_stops_and_reports_while_they_are_silent_and_then_goes_on(walls, miss
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_long_silence_does_not_count_against_what_the_robot_was_doing(walls):
     """The same commands as without the silence: behaviours have waited, not given up.
 

@@ -139,6 +139,7 @@ def test_a_failed_or_killed_run_is_reported() -> None:
     json.dumps(values, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """A scenario that cannot be built beside one that there is not: each is one line, nothing hangs."""
     wrong = {

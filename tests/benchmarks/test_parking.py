@@ -32,6 +32,7 @@ def test_starts_are_drawn_by_the_rule(scene):
         assert scene.plan.is_free(there.x, there.y, 0.2)
 
 
+@pytest.mark.slow
 def test_parking_is_judged_by_the_truth(scene):
     """The same start twice gives the same to the last bit, and success is what its record shows."""
     start = Pose2(-0.7, 0.2, 0.1)

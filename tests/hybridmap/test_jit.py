@@ -77,12 +77,14 @@ def test_without_numba_a_kernel_runs_as_it_is_written(tmp_path: Path, how: str) 
     assert run(tmp_path, how, tmp_path / "cache")["hits"] == -1
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_once_and_kept(tmp_path: Path) -> None:
     pytest.importorskip("numba")
     assert run(tmp_path, "with", tmp_path / "cache")["hits"] == 0
     assert run(tmp_path, "with", tmp_path / "cache")["hits"] == 1
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_without_a_cache_folder(tmp_path: Path) -> None:
     pytest.importorskip("numba")
     (tmp_path / "file").write_text("")

@@ -376,6 +376,7 @@ def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Besi
         beside.check(seed)
 
 
+@pytest.mark.slow
 def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
     """It puts one of its nodes 200 times a second."""
     worker = MergeWorker(LiveSchedule(), 1.0)

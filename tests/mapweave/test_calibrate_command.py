@@ -81,6 +81,7 @@ def test_a_drive_is_calibrated_under_the_robots_name(
     assert "pitch_deg is 80" in line
 
 
+@pytest.mark.slow
 def test_a_robot_is_watched_while_it_is_driven(
     recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -83,6 +83,7 @@ def test_scenarios_that_cannot_be_run(arguments, words, capfd, closed, tmp_path)
     assert not (tmp_path / "out" / "agents").exists()
 
 
+@pytest.mark.slow
 def test_a_batch_names_its_failures(capfd, tmp_path):
     path = tmp_path / "two.toml"
     path.write_text(

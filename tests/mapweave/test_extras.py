@@ -53,6 +53,7 @@ CASES: list[tuple[str, str, str]] = [
     ("keys init", "--keys {tmp}/keys", SERVER),
     ("keys init", "--keys {tmp}/lab --profile lab", "robots find the server at"),
     ("keys add", "r0 --keys {tmp}/lab", "copy this file"),
+    ("keys token", "r0 --keys {tmp}/lab", "token"),
     ("keys list", "--keys {tmp}/lab", "robot"),
     ("keys bundle", "r0 --keys {tmp}/lab -o {tmp}/r0.key.toml", "the key of r0"),
     ("keys revoke", "r0 --keys {tmp}/lab", "admitted no more"),
@@ -108,10 +109,11 @@ CASES: list[tuple[str, str, str]] = [
     ("map undo", "--map {merged}", "no manual constraint"),
     ("map retire", "r0.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map retire", "r0.1 --map {merged} --out {tmp}/less.mapweave", SERVER),
-    ("map link", "r0.1.1 r1.1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
-    ("map link", "r0.1.1 r0.1.3 --map {merged} --check", SERVER),
-    ("map undo", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
-    ("map undo", "--map {merged}", "no manual constraint holds"),
+    ("map portal add", "lift r0.1.1 r1.1.1 --kind lift --connect {closed}", WITHOUT_SERVER),
+    ("map portal list", "--connect {closed}", WITHOUT_SERVER),
+    ("map portal list", "--map {merged}", SERVER),
+    ("map portal remove", "lift --connect {closed}", WITHOUT_SERVER),
+    ("portal done", "r0 --connect {closed}", WITHOUT_SERVER),
     ("map pin", "--connect {closed}", WITHOUT_SERVER),
     ("plan add", "{tmp}/none.png --pair r0.1.1=1,2 --connect {closed}", "No such file"),
     ("plan show", "--connect {closed}", WITHOUT_SERVER),
@@ -169,6 +171,7 @@ def test_every_command_is_tried() -> None:
     assert {command for command, _, _ in CASES} == set(commands(runnable=True))
 
 
+@pytest.mark.slow
 def test_without_extras_a_command_works_or_names_what_it_needs(filled: dict[str, object]) -> None:
     lines = [f"{command} {arguments}".format(**filled) for command, arguments, _ in CASES]
     for (command, arguments, words), (status, out, err) in zip(CASES, outcomes(MODULES, lines), strict=True):

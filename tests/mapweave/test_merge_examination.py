@@ -118,6 +118,7 @@ def test_a_robot_that_cannot_localize_begins_another_map(
         assert len(HybridMap([change.body for change in hybrid_map]).nodes) >= 1
 
 
+@pytest.mark.slow
 def test_without_truth_nothing_is_scored_and_pieces_can_be_chosen(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

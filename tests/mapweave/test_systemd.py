@@ -98,6 +98,7 @@ def test_an_agent_is_ready_and_alive(manager, recording, monkeypatch, tmp_path) 
     assert [manager.recv(64), manager.recv(64)] == [b"READY=1", b"WATCHDOG=1"]
 
 
+@pytest.mark.slow
 def test_a_server_is_ready_and_alive(manager, tmp_path) -> None:
     command = [sys.executable, "-m", "mapweave", "server", "--listen", f"tcp/127.0.0.1:{free_port()}"]
     environment = os.environ | {"NOTIFY_SOCKET": manager.getsockname()}

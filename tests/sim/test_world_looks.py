@@ -117,6 +117,7 @@ def test_a_print_hangs_at_every_end_of_the_ring(seed: int) -> None:
         assert ((near[:, 1] < 0.06) & (near[:, 0] < 1.8)).any()
 
 
+@pytest.mark.slow
 def test_the_corridor_is_sparse_but_not_empty() -> None:
     """Along the corridor there is always something in view, and much less than in an office."""
     counts = feature_counts("corridor", 6, along=True)

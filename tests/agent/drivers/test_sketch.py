@@ -117,6 +117,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return program
 
 
+@pytest.mark.slow
 def test_the_sketch_drives_counts_and_stops_by_itself(program: Path, video: Path) -> None:
     master, slave = pty.openpty()
     tty.setraw(slave)

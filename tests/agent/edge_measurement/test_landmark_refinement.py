@@ -59,6 +59,7 @@ def drive(rng: np.random.Generator, node: Landmarks, true: np.ndarray) -> Locali
     return one
 
 
+@pytest.mark.slow
 def test_four_drives_make_depths_better_and_never_too_sure(monkeypatch):
     """Each drive begins with the refined node of the drive before: one depth a landmark.
 

@@ -157,7 +157,6 @@ def test_a_blind_filter_is_lost_slowly_and_found_again() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_pixels_worse_than_nominal_are_detected() -> None:
     """The image is blurred: pixels err three times as much as the tracker knows."""
     apart = []

@@ -54,6 +54,7 @@ def test_landmark_errors_match_their_covariances(runs: list[tuple[MappingRun, Ma
     assert low < np.mean([landmark_nees(run, filter_) for run, filter_ in runs]) < high
 
 
+@pytest.mark.slow
 def test_spoiled_tracks_do_not_bend_the_map(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     ratios = []
     for k, (run, filter_) in enumerate(runs[:6]):
@@ -93,7 +94,6 @@ def assert_covariance(covariance: np.ndarray) -> None:
     assert np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] > 0
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_the_covariance_stays_valid_for_ten_thousand_steps() -> None:
     """Symmetric to the last bit and positive, twenty times the paper's run."""

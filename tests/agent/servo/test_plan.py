@@ -107,6 +107,7 @@ def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription) -
     assert plan.length == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_the_lattice_is_bounded(robot: RobotDescription) -> None:
     """Ten metres once took 13 s and 1.4 GB, and there was no end to it."""
     rng = np.random.default_rng(1)

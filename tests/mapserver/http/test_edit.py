@@ -300,6 +300,7 @@ def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, t
     assert all("400" in words or "WebSocket" in words for words in refused), refused
 
 
+@pytest.mark.slow
 def test_a_plan_is_laid_under_the_map_on_the_page(
     browser: Browser, server: MapServer, tmp_path: Path
 ) -> None:

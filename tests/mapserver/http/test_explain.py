@@ -142,6 +142,7 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(
         eventually(lambda: f"{explanation.hops[0].a} and {explanation.hops[0].b}: " in page.run(RESULT))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_the_history_is_listed_newest_first_and_goes_on(
     served: Web, services: StubServices, tmp_path_factory: pytest.TempPathFactory

@@ -94,6 +94,7 @@ def test_errors_are_shown_on_the_page(page: Browser, services: StubServices, ima
     assert page.run("return document.querySelector('#answer b')") is None
 
 
+@pytest.mark.slow
 def test_a_busy_server_is_asked_again(page: Browser, services: StubServices, image: Path) -> None:
     services.refusal = Busy(0.2)
     page.type("#image", str(image))

@@ -37,6 +37,7 @@ def test_derivatives_are_those_of_finite_differences(model: LensModel, true: np.
         assert np.allclose(numeric, slopes[..., k], rtol=1e-4, atol=1e-4 * np.abs(numeric).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "true"), MODELS)
 def test_the_stated_uncertainty_is_the_error_over_draws(model: LensModel, true: np.ndarray) -> None:
     rng = np.random.default_rng(5)
