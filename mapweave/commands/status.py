@@ -120,7 +120,7 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
     status = robot.status
     age = "gone" if not robot.alive else f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
     if status is None:
-        return robot.robot, "", "", "", "", "", "", age, robot.over_quota
+        return robot.robot, "", "", "", "", "", "", age, robot.over_quota or robot.accusation
     doing = status.status
     mission = ""
     if (report := status.mission) is not None:
@@ -136,6 +136,7 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
         str(status.unsent),
         age,
         robot.over_quota
+        or robot.accusation
         or (f"{status.last_error} ({status.error_age:.0f} s ago)" if status.last_error else ""),
     )
 

@@ -175,6 +175,8 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         "r0", "go to r1.1.5 (kitchen) running 25%", "driving along the route: 0.4 m to node r1.1.5",
         "1.23,-5.00 180° in part 2", "12", "50%", "3", "7.0 s silent", "no map server answered (61 s ago)",
     )  # fmt: skip
+    lies = RobotEntry("r1", False, accusation="map r1.1 is implausible: its clock utc runs backwards")
+    assert cells(lies)[-1] == lies.accusation
     assert cells(RobotEntry("r1", False))[0] == "r1" and "gone" in cells(RobotEntry("r1", False))
     for width in (150, 240):
         lines = Console(width=width, file=(printed := io.StringIO()))
