@@ -290,7 +290,7 @@ def answers() -> dict[str, tuple[Any, ...]]:
             query.ExplainRequest((MAP, OTHER)),
             query.ExplainRequest(),
             explained(),
-            explanation.FleetExplanation((maps_explained(),)),
+            explanation.FleetExplanation((maps_explained(),), ("map r1.1 is set apart: copies",)),
             explanation.RouteExplanation(NODE, FAR, True, "by 1 edge", (hop,), (hop,), maps_explained()),
         ),
         "server/s0/constrain": tuple(ConstraintRequest(one, k == 2) for k, one in enumerate(constraints())),

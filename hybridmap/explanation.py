@@ -194,9 +194,15 @@ class MapsExplanation:
 
 @dataclass(frozen=True, slots=True)
 class FleetExplanation:
-    """Of some two maps each, why they are one or are not."""
+    """Of some two maps each, why they are one or are not.
+
+    Attributes:
+        maps: two each.
+        accusations: what is held against maps, the ones that are set apart among them.
+    """
 
     maps: Annotated[tuple[MapsExplanation, ...], Meta(max_length=MAX_MAPS_LISTED)]
+    accusations: Annotated[tuple[Words, ...], Meta(max_length=MAX_MAPS_LISTED)] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -178,7 +178,7 @@ class Explainer:
         settled = self._settled()
         explanation = explained(request, self._answers().router, self._settings.consistency, self._wary())
         if isinstance(explanation, FleetExplanation):
-            return FleetExplanation(tuple(_still(pair, settled) for pair in explanation.maps))
+            return replace(explanation, maps=tuple(_still(pair, settled) for pair in explanation.maps))
         return _still(explanation, settled)
 
     def history(self) -> tuple[MapEvent, ...]:

@@ -33,7 +33,8 @@ def explained(
     """
     merged = router.merged
     if request.ends is None:
-        return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED))
+        accusations = tuple(merged.accusations().values())[:MAX_MAPS_LISTED]
+        return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED), accusations)
     first, second = request.ends
     if isinstance(first, NodeId) and isinstance(second, NodeId):
         if request.route:

@@ -64,7 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
         maps = None if ends is None else (MapId(*ends[0][:2]), MapId(*ends[1][:2]))
         explanation = explained_maps(arguments, maps)
         values = json_values(explanation)
-        lines = [line for item in explanation.maps for line in maps_words(item)] or ["there are no two maps"]
+        lines = [line for item in explanation.maps for line in maps_words(item)]
+        lines = [*lines, *explanation.accusations] or ["there are no two maps"]
     print(json.dumps(values) if arguments.json else "\n".join(lines))
     return 0
 
@@ -101,7 +102,8 @@ def explained_maps(arguments: argparse.Namespace, ends: tuple[MapId, MapId] | No
 
     merged, _ = _merged(arguments)
     if ends is None:
-        return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED))
+        accusations = tuple(merged.accusations().values())[:MAX_MAPS_LISTED]
+        return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED), accusations)
     return FleetExplanation((explain_maps(merged, *ends),))
 
 

@@ -50,7 +50,12 @@ class Body:
 
     def __init__(self, bus: ZenohBus, robot: str = "r0") -> None:
         walls = PhotoWalls()
-        self._images = [walls.render(Pose2(float(x))) for x in WAY]
+        # No two cameras give the same bits.
+        noise = np.random.default_rng(list(robot.encode()))
+        images = [walls.render(Pose2(float(x))) for x in WAY]
+        self._images = [
+            np.clip(image + noise.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8) for image in images
+        ]
         self._tick = 0
         bus.serve(KEYS.robot_describe(robot), lambda request: request.reply(encode_description(DESCRIPTION)))
         bus.serve(KEYS.robot_step(robot), self._step)
