@@ -1,7 +1,7 @@
 """Draws `edit.png`: the page while a floor plan is laid under the map of three robots, in a real browser.
 
-A picture that is there stays, since a browser draws each a little differently. `python docs/site/page_picture.py`
-draws another one.
+A picture that is there stays, since a browser draws each a little differently.
+`python docs/site/page_picture.py` draws another one.
 """
 
 from __future__ import annotations
