@@ -40,30 +40,21 @@ class CommandGuard:
             floor: that an exploring robot knows; one without rangers keeps to what its camera has seen of it.
             pose: `map_from_robot`.
         """
-        safe, warning = self._by_distances(command, observation, description, driven, floor, pose)
+        warning, caution = "", self._caution
+        if caution is None:
+            safe, warning = guard(command, observation.proximity, description)
+        elif driven:
+            safe = caution.command(command, description.max_forward, follow=True)
+        else:
+            most = ALONG_EDGES
+            if isinstance(floor, CameraOccupancyGrid):
+                command, warning = guard(command, floor.readings(pose), with_readings(description))
+                direction = 0.0 if command.forward >= 0.0 else math.pi
+                most = speed_for(floor.known_ahead(pose, direction, 0.5))
+            safe = caution.command(command, most)
+            warning = "backing off from a touch" if caution.backing_off else warning
         if observation.bumped and safe.forward * self._direction > 0:
             return Command(0.0, safe.turn), "stopped: the bumper is pressed"
         if not observation.bumped and safe.forward:
             self._direction = math.copysign(1.0, safe.forward)
         return safe, warning
-
-    def _by_distances(
-        self,
-        command: Command,
-        observation: Observation,
-        description: RobotDescription,
-        driven: bool,
-        floor: OccupancyGrid | None,
-        pose: Pose2,
-    ) -> tuple[Command, str]:
-        if self._caution is None:
-            return guard(command, observation.proximity, description)
-        if driven:
-            return self._caution.command(command, description.max_forward, follow=True), ""
-        warning, most = "", ALONG_EDGES
-        if isinstance(floor, CameraOccupancyGrid):
-            command, warning = guard(command, floor.readings(pose), with_readings(description))
-            direction = 0.0 if command.forward >= 0.0 else math.pi
-            most = speed_for(floor.known_ahead(pose, direction, 0.5))
-        safe = self._caution.command(command, most)
-        return safe, "backing off from a touch" if self._caution.backing_off else warning
