@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from mapweave.agent.mission import Answer, Driven, Question
+from mapweave.agent.mission import Answer, Driven, Question, WhoIsNear
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.queries import decode_answer, encode_query
 from mapweave.agent.teleoperation import Teleoperation
@@ -190,6 +190,8 @@ class FleetClient:
             self._answered.put(self._answer(question))
 
     def _answer(self, question: Question) -> Answer:
+        if isinstance(question, WhoIsNear) and not self.server_in_reach():
+            return Answer(question.number, None, NO_ANSWER)
         try:
             key, payload = encode_query(self._keys, question, self._agent)
         except InvalidValue as unspeakable:
@@ -204,5 +206,7 @@ class FleetClient:
                 return Answer(question.number, decode_answer(question, reply.payload))
             except MapweaveError as refused:
                 error = str(refused)
-        self._trouble, self._trouble_at = one_line(error), time.monotonic()
+        if not isinstance(question, WhoIsNear):
+            # An older server does not answer that: the robot maps as without it.
+            self._trouble, self._trouble_at = one_line(error), time.monotonic()
         return Answer(question.number, None, error, retry_after)

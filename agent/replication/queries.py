@@ -6,8 +6,9 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 
-from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
+from mapweave.agent.mission import AnswerContent, MayIDrive, Question, WhatIsKnown, WhereAmI, WhoIsNear
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
     KnownAnswer,
@@ -47,13 +48,15 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
     if isinstance(question, MayIDrive):
         reserve = ReserveRequest(robot, question.start, question.start_from_robot, question.route)
         return sent_by(keys.any_reserve(), robot), encode(reserve)
+    if isinstance(question, WhoIsNear):
+        q = question
+        who = NearbyRequest(robot, q.starts, q.sigma, q.heading_sigma, q.radius, q.height, q.speed)
+        return sent_by(keys.any_nearby(), robot), encode(who)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
     return sent_by(keys.any_route(), robot), encode(request)
 
 
-def decode_answer(
-    question: Question, payload: bytes
-) -> RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer:
+def decode_answer(question: Question, payload: bytes) -> AnswerContent:
     """A server's answer to a question.
 
     Raises:
@@ -68,6 +71,8 @@ def decode_answer(
         return decode(payload, KnownAnswer)
     if isinstance(question, MayIDrive):
         return decode(payload, ReserveAnswer)
+    if isinstance(question, WhoIsNear):
+        return decode(payload, NearbyAnswer)
     route = decode(payload, RouteAnswer)
     for leg in route.legs:
         _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
