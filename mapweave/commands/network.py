@@ -34,7 +34,7 @@ def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
             help="Zenoh endpoints to listen at (default: tcp/127.0.0.1:7447, or as the keys say)",
         )  # fmt: skip
         group.add_argument(
-            "--connect", nargs="+", metavar="ENDPOINT", dest="routers",
+            "--connect", nargs="+", metavar="ROUTER", dest="routers",
             help="other routers to join; the robots of each reach the servers of all (default: none)",
         )  # fmt: skip
     else:
