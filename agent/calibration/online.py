@@ -252,8 +252,8 @@ class OnlineCalibration:
         change &= self._lasting(change, self._changed_since)
         if not change.any():
             return
-        # What is shown but differs less goes along: the estimates belong together. The wheels' scale, of which
-        # only lengths tell, brings nothing along.
+        # What is shown but differs less goes along: the estimates belong together. The wheels' scale brings
+        # nothing along: only lengths tell of it.
         belongs = change.any(where=np.arange(COUNT) != P.WHEEL_SCALE)
         along = belongs & estimate.shown & settled & (off > estimate.sigmas)
         along[named_only] = False

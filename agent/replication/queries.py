@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,6 +12,7 @@ from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
+    Certainty,
     KnownAnswer,
     KnownRequest,
     RelocalizeAnswer,
@@ -87,6 +89,36 @@ def decode_answer(question: Question, payload: bytes) -> AnswerContent:
         if frozenset((a, b)) in blocked:
             raise InvalidMessage(f"route: it leads from {a} to {b}, where the robot did not get through")
     return route
+
+
+def settles(answer: AnswerContent) -> bool:
+    """Whether no other server's answer is waited for.
+
+    One that is new, or gets its store again, does not know yet what others do. And a robot drives only where
+    every server lets it.
+    """
+    match answer:
+        case RelocalizeAnswer():
+            return answer.certainty in (Certainty.FOUND, Certainty.PLACE)
+        case RouteAnswer():
+            return bool(answer.legs)
+    return False
+
+
+def best(answers: Sequence[AnswerContent]) -> AnswerContent:
+    """The one of several servers' answers that a robot acts on; of equals the first."""
+
+    def rank(answer: AnswerContent) -> tuple[bool, float]:
+        match answer:
+            case ReserveAnswer():
+                return not answer.closed, answer.granted
+            case KnownAnswer():
+                return False, -len(answer.views)
+            case NearbyAnswer():
+                return False, -len(answer.robots)
+        return not settles(answer), 0.0
+
+    return min(answers, key=rank)
 
 
 def _check_near(pose: Pose2, name: str) -> None:
