@@ -55,8 +55,10 @@ SETTLED = 0.5
 LASTING = 1.5
 """A parameter is wrong if all solutions say so while the pairs grow by this factor: what a few have in common
 by chance, more do not bear out. Without, one of nine simulated robots got three false names within 23 s."""
-WORTH = 2.0
+WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
+WORTH[P.WHEEL_SCALE] = 1.0
+"""Two lengths that agree are used as soon as they are sure enough to name the wheels."""
 
 NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
 """Named, but not used by themselves. The wheels' scales and drift are what all else is measured by, and the
