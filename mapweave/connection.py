@@ -75,7 +75,7 @@ def _key_hint(holder: Credentials | None) -> str:
         return ""
     if holder.role is Role.ROBOT:
         return (
-            f"; or {holder.name} may not ask this: its key is a robot's, use that of a viewer or an operator; "
+            f"; or {holder.name} may not ask this: its key is a robot's, use a viewer's or an operator's; "
             "or it was revoked or has expired: `mapweave keys list` at the server and the server's log say so"
         )
     return (

@@ -106,7 +106,7 @@ def test_a_token_is_shown_once_and_its_hash_alone_is_kept(
 def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> None:
     """The router drops it without a word: it looks like a server that is not there."""
     robot = read_key_file(keys / "r0.key.toml").credentials
-    assert "its key is a robot's, use that of a viewer or an operator" in str(no_server("f1", robot))
+    assert "its key is a robot's, use a viewer's or an operator's" in str(no_server("f1", robot))
     assert "a robot's" not in str(no_server("f1", replace(robot, role=Role.VIEWER)))
 
 
