@@ -38,6 +38,9 @@ ABOVE = 0.05
 """What a body has above its camera, m: no robot says how high it is."""
 MOST_SHARE = 0.25
 """A region is not left out if by uncertainty alone it covers more of the image: the rest must do to map."""
+MOST_TOGETHER = 0.5
+"""Share of the image that all regions together may cover: the rest is used, however many robots a server says
+there are."""
 IN_FRONT = 3
 """So many landmarks of a region that are nearer than the robot, and most of it, show that something hides
 the robot."""
@@ -129,8 +132,13 @@ class RobotsInView:
             return np.zeros((0, 4))
         at, odom_then, robots = self._seen
         robot_from_then = self._odom_from_robot.inverse() @ odom_then
-        boxes = [self._region(robot_from_then, one, self._now - at, landmarks) for one in robots]
-        return np.array([box for box in boxes if box is not None]).reshape(-1, 4)
+        room = MOST_TOGETHER * self.description.camera.width * self.description.camera.height
+        boxes: list[Array] = []
+        for one in robots:
+            box = self._region(robot_from_then, one, self._now - at, landmarks)
+            if box is not None and (room := room - float(np.prod(box[2:] - box[:2]))) > 0.0:
+                boxes.append(box)
+        return np.array(boxes).reshape(-1, 4)
 
     def _region(
         self,
