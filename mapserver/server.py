@@ -30,7 +30,7 @@ from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
@@ -111,7 +111,7 @@ class MapServer:
         self._settings = s = settings or ServerSettings()
         self._schedule = clock = schedule or LiveSchedule()
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._store = Store(path)
+        self._store = SqliteStore(path)
         try:
             self._base = (base or BaseMap()).beside(self._store)
         except InvalidFile:
