@@ -19,6 +19,7 @@ MODULES = {
         "uvicorn",
         "wsproto",
     ),
+    "postgres": ("psycopg",),
     "sim": ("pybullet",),
     "eval": ("evo",),
     "viz": ("matplotlib",),
