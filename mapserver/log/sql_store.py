@@ -48,7 +48,7 @@ class SqlStore(Store):
 
     @abstractmethod
     def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
-        """The logs of these runs, as far as there are any; only this transaction changes them until the commit."""
+        """The logs of these runs that are stored; only this transaction changes them until the commit."""
 
     @abstractmethod
     def _lock_table(self, table: str) -> None:
