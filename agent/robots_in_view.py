@@ -34,6 +34,8 @@ OLDEST = 3.0
 """A place that is older is no longer used, s."""
 SIGMAS = 2.0
 """A robot is expected within so many standard deviations of its position."""
+CARRIED = 1.0
+"""Speed of a robot that takes no commands, m/s: a person walks with it."""
 ABOVE = 0.05
 """What a body has above its camera, m: no robot says how high it is."""
 MOST_SHARE = 0.25
@@ -108,8 +110,8 @@ class RobotsInView:
         sigma = math.sqrt(max(here.covariance[0, 0], here.covariance[1, 1]))
         turn = math.sqrt(here.covariance[2, 2])
         self._asked = self._now, self._odom_from_robot
-        height = d.camera.mount_height + ABOVE
-        return WhoIsNear(NUMBER, starts, min(sigma, 100.0), min(turn, 4.0), d.radius, height, d.max_forward)
+        height, speed = d.camera.mount_height + ABOVE, d.max_forward or CARRIED
+        return WhoIsNear(NUMBER, starts, min(sigma, 100.0), min(turn, 4.0), d.radius, height, speed)
 
     def _take(self, answer: Answer, at: float, odom_then: Pose2) -> None:
         if not isinstance(answer.content, NearbyAnswer):
@@ -120,7 +122,7 @@ class RobotsInView:
         # Until then the nearest cannot have come within reach.
         waits = [
             (math.hypot(one.robot_from_other.x, one.robot_from_other.y) - REACH)
-            / max(one.speed + self.description.max_forward, 0.1)
+            / max(one.speed + (self.description.max_forward or CARRIED), 0.1)
             - one.age
             for one in robots
         ]
