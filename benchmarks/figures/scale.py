@@ -169,7 +169,7 @@ Row = tuple[str, str, str, str]
 
 
 INTRODUCTION = """\
-`python -m benchmarks.figures` writes this page from the stored results behind [figures](figures.md), which name
+`python -m benchmarks.figures` writes this page from the results behind [figures](figures.md), which name
 commands and dates. Nobody has run 10 000 robots: *measured* is a figure of one robot, node or answer,
 *extrapolated* a formula over these, *chosen* an assumption that you replace by your own. That memory and
 processor grow linearly beyond what was measured is itself an extrapolation."""
@@ -180,8 +180,8 @@ TOGETHER = """\
 Then one merged map has to be shared: several front servers on one record take changes and answer, one or
 several merge."""
 OTHERS = """\
-Figures of front servers on one PostgreSQL and of shards on a Ray cluster are in [figures](figures.md) as far as
-they are measured; put these in place of the formulas."""
+Figures of front servers on one PostgreSQL and of shards on a Ray cluster are in [figures](figures.md), if
+these are measured; put them in place of the formulas."""
 WATCH = """\
 The [metrics](monitoring.md) show where the plan is wrong: `mapweave_ack_seconds` (fronts),
 `mapweave_queue_length{queue="comparisons"}` and `mapweave_merge_seconds` (merging),
