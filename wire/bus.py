@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A published message."""
+    """A published message.
+
+    Attributes:
+        key: under which it was published.
+        payload: its content.
+        attachment: what is sent beside it.
+        received: when it came, of the monotonic clock, s.
+    """
 
     key: str
     payload: bytes
     attachment: bytes = b""
+    received: float = field(default_factory=time.monotonic, compare=False)
 
 
 class Request(Protocol):
