@@ -3,9 +3,9 @@
     python -m benchmarks.chaos [--agents N] [--seconds S] [--seed N] [--store sqlite|URL] [--json]
 
 Real processes over TCP on loopback: agents (journal, replicator, fleet client), two map servers, two routers,
-and a link between each of them and each router that can be cut, slowed, frozen and half closed. The schedule is
-drawn with the seed and printed: at least 20 kill -9, a third as many SIGSTOP, two thirds as many links. With
-SQLite a server is also killed and its store deleted; it gets everything from the agents again.
+and a link between each of them and each router that can be cut, slowed, frozen and half closed. The schedule
+is drawn with the seed and printed: at least 20 kill -9, a third as many SIGSTOP, two thirds as many links.
+With SQLite a server is also killed and its store deleted; it gets everything from the agents again.
 
 Each agent writes its own log, flushed to the disk, of what it hands over and of what its journal has then
 committed: that is `sent`. When all is over the stores are read and compared with it. `undone` changes are
@@ -41,7 +41,7 @@ from benchmarks.chaos.recovery import RobotTimes, recoveries
 from benchmarks.chaos.robot_life import RobotLife
 from benchmarks.chaos.schedule import KILLS, LINKS, Disturbance, Kind, draw_schedule
 from mapweave.agent.replication.journal import Journal
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.scenarios.children import ChildFailed
 
 START = 60.0
@@ -101,8 +101,9 @@ def relocalize_gap(fleet: FleetProcesses, seed: int, progress: Progress) -> floa
     gaps = []
     with LostRobot(fleet.endpoints, views) as robot:
         for victim in victims:
-            for server in SERVERS:
-                wait_until(lambda s=server: robot.answered_by(s), START, f"{server} finds no place")  # type: ignore[misc]
+            wait_until(lambda: robot.recognised(SERVERS), START, "not both servers recognise a place")
+            if not gaps:
+                robot.start()
             progress.update(bar, description=f"a lost robot asks; {victim} is killed")
             began = time.monotonic()
             fleet.kill(victim)
@@ -132,6 +133,7 @@ def run(
         done = disturb(fleet, schedule, seconds, progress)
         gap = relocalize_gap(fleet, seed, progress)
         fleet.stop_mapping()
+        (folder / "disturbances.json").write_text(json.dumps(done))
         step = progress.add_task("all is acknowledged", total=None)
         wait_until(fleet.done, SETTLE, f"not all is acknowledged {SETTLE:g} s after the last disturbance")
         fleet.check()
@@ -140,7 +142,7 @@ def run(
             fleet.end(name)
         total = Account()
         places = list(dict.fromkeys(map(fleet.store_of, SERVERS)))
-        stores = [Store(Path(place)) for place in places]
+        stores = [SqliteStore(Path(place)) for place in places]
         for k, name in enumerate(names):
             journal = Journal(folder / f"{name}.sqlite")
             total += account(sent_changes(folder, k, seed), journal, stores)

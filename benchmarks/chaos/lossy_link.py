@@ -128,7 +128,8 @@ class Links:
                 data = await reader.read(PIECE)
                 await due.put((self._loop.time() + link.delay, data))
             await sending
-        except OSError:
+        except (OSError, RuntimeError):
+            # Broken, or half closed: nothing more can be written.
             pass
         finally:
             sending.cancel()
