@@ -66,12 +66,12 @@ def sent_changes(folder: Path, robot: int, seed: int) -> list[Change]:
     heads: dict[int, int] = {}
     for line in (folder / f"{life.map.agent}.truth").read_text().splitlines():
         match line.split():
-            case ["T", step, count, summary]:
-                handed[int(step)] = int(count), summary
-            case ["C", step, head, _]:
-                if int(step) < committed:
+            case ["T", number, count, summary]:
+                handed[int(number)] = int(count), summary
+            case ["C", number, head, _]:
+                if int(number) < committed:
                     raise BrokenLog(f"{life.map.agent}: {line}: step {committed} was committed before")
-                committed = int(step)
+                committed = int(number)
                 heads[committed] = int(head)
             case ["TORN", *_]:
                 raise BrokenLog(f"{life.map.agent}: half a step is in its journal")

@@ -5,7 +5,8 @@
 Real processes over TCP on loopback: agents (journal, replicator, fleet client), two map servers, two routers,
 and a link between each of them and each router that can be cut, slowed, frozen and half closed. The schedule
 is drawn with the seed and printed: at least 20 kill -9, a third as many SIGSTOP, two thirds as many links.
-With SQLite a server is also killed and its store deleted; it gets everything from the agents again.
+With SQLite a server is also killed and its store deleted; it gets everything from the agents again. With
+PostgreSQL both servers share a database, which is killed as well.
 
 Each agent writes its own log, flushed to the disk, of what it hands over and of what its journal has then
 committed: that is `sent`. When all is over the stores are read and compared with it. `undone` changes are
@@ -36,15 +37,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from benchmarks.chaos.account import Account, account, sent_changes
-from benchmarks.chaos.fleet_processes import ROUTERS, SERVERS, SQLITE, FleetProcesses
+from benchmarks.chaos.fleet_processes import DATABASE, ROUTERS, SERVERS, SQLITE, FleetProcesses
 from benchmarks.chaos.questions import LostRobot
 from benchmarks.chaos.recovery import RobotTimes, recoveries
 from benchmarks.chaos.robot_life import RobotLife
 from benchmarks.chaos.schedule import KILLS, LINKS, Disturbance, Kind, draw_schedule
 from mapweave.agent.replication.journal import Journal
-from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.log.opening import open_store
 from mapweave.scenarios.children import ChildFailed
+from synthetic.postgres_server import PostgresServer, binaries
 
+POSTGRESQL = "postgresql"
 START = 60.0
 """Longest wait until both servers answer, s."""
 SETTLE = 120.0
@@ -53,12 +56,12 @@ FLAP = 0.3
 """Of a link that is cut again and again, s."""
 LEAST_SECONDS = 10.0
 ATTACKS = (
-    (Kind.KILL, SERVERS[0]), (Kind.KILL, SERVERS[1]), (Kind.KILL, ROUTERS[0]), (Kind.STOP, SERVERS[0]),
-    (Kind.STOP, SERVERS[1]), (Kind.STOP, ROUTERS[1]),
+    (Kind.KILL, SERVERS[0], 4.0), (Kind.KILL, SERVERS[1], 4.0), (Kind.KILL, ROUTERS[0], 4.0),
+    (Kind.STOP, SERVERS[0], 4.0), (Kind.STOP, ROUTERS[1], 7.0),
 )  # fmt: skip
-"""On a fleet in which a robot asks where it is. It is at the second router since the first one was killed."""
-LONG = 7.0
-"""s that an attack lasts. The lease of a connection is 2.5 s, and a frozen endpoint is tried for 2 s."""
+"""On a fleet in which a robot asks where it is. It is at the second router since the first one was killed.
+The last of each is how long it lasts, s: a connection has a lease of 2.5 s, and a frozen endpoint is tried
+for 2 s."""
 
 Done = list[tuple[float, Kind, str]]
 
@@ -107,16 +110,17 @@ def relocalize_gaps(fleet: FleetProcesses, seed: int, progress: Progress) -> lis
     views = [RobotLife(k, seed).view for k in range(len(fleet.agents))]
     gaps: list[float] = []
     with LostRobot(fleet.endpoints, views) as robot:
-        for kind, victim in ATTACKS:
+        for kind, victim, lasts in ATTACKS:
             wait_until(lambda: robot.recognised(SERVERS), START, "not both servers recognise a place")
             if not gaps:
                 robot.start()
             progress.update(bar, description=f"a lost robot asks: {victim} {kind}")
             began = time.monotonic()
             fleet.begin(kind, victim)
-            time.sleep(LONG)
+            time.sleep(lasts)
             gaps.append(robot.longest_gap(began, time.monotonic()))
             fleet.end_disturbance(kind, victim)
+            progress.console.print(f"{victim} {kind}: {gaps[-1]:.2f} s without an answer", highlight=False)
             progress.advance(bar)
     progress.update(bar, description="a lost robot asked")
     return gaps
@@ -127,11 +131,16 @@ def run(
 ) -> dict[str, object]:
     """Start a fleet, disturb it, let it come to rest and count."""
     names = [f"r{k}" for k in range(agents)]
-    schedule = draw_schedule(seconds, names, SERVERS, ROUTERS, seed, store == SQLITE)
+    postgres = start_postgres(folder) if store == POSTGRESQL else None
+    address = store if postgres is None else postgres.database()
+    groups = (names, SERVERS, ROUTERS, *(() if postgres is None else [(DATABASE,)]))
+    schedule = draw_schedule(seconds, groups, seed, store == SQLITE)
     for one in schedule:
         progress.console.print(str(one), highlight=False)
     with ExitStack() as stack:
-        fleet = stack.enter_context(FleetProcesses(folder, agents, seed, store))
+        if postgres is not None:
+            stack.callback(postgres.stop)
+        fleet = stack.enter_context(FleetProcesses(folder, agents, seed, address, postgres))
         for name in (*ROUTERS, *SERVERS, *fleet.agents):
             fleet.start(name)
         step = progress.add_task("the fleet starts", total=None)
@@ -149,7 +158,7 @@ def run(
             fleet.end(name)
         total = Account()
         places = list(dict.fromkeys(map(fleet.store_of, SERVERS)))
-        stores = [SqliteStore(Path(place)) for place in places]
+        stores = [open_store(place) for place in places]
         for k, name in enumerate(names):
             journal = Journal(folder / f"{name}.sqlite")
             total += account(sent_changes(folder, k, seed), journal, stores)
@@ -167,6 +176,21 @@ def run(
         "kills": sum(kind in KILLS for kind in kinds), "lost_stores": kinds.count(Kind.LOSE_STORE),
         "stops": kinds.count(Kind.STOP), "cuts": sum(kind in LINKS for kind in kinds),
     }  # fmt: skip
+
+
+def start_postgres(folder: Path) -> PostgresServer:
+    """A cluster in a folder that its own user may read, and whose commits are on the disk when they return.
+
+    Raises:
+        ChildFailed: there is no PostgreSQL.
+    """
+    if binaries() is None:
+        raise ChildFailed("there is no PostgreSQL: neither Debian's package postgresql nor PyPI's pgserver")
+    place = folder / DATABASE
+    place.mkdir()
+    for part in (folder, place):
+        part.chmod(0o755)
+    return PostgresServer(place, "-c", "fsync=on")
 
 
 def acknowledged(folder: Path, names: Sequence[str]) -> bool:
@@ -192,8 +216,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="of mapping and disturbances")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--store", default=SQLITE, help="sqlite, a file for each server, or the URL of one for both"
-    )
+        "--store", default=SQLITE,
+        help="sqlite: a file a server; postgresql: one database for both, which is started here and killed; or "
+        "the URL of one",
+    )  # fmt: skip
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep journals, stores and logs here")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     options = parser.parse_args()
@@ -212,7 +238,8 @@ def main() -> None:
             sys.exit(f"seed {options.seed}: {failed}")
         finally:
             if options.keep is not None:
-                shutil.copytree(folder, options.keep, dirs_exist_ok=True)
+                without = shutil.ignore_patterns(DATABASE)
+                shutil.copytree(folder, options.keep, ignore=without, dirs_exist_ok=True)
     table = Table("", "", title="chaos", show_header=False)
     for key, value in report.items():
         table.add_row(key, str(value))

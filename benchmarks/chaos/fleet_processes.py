@@ -28,8 +28,9 @@ from benchmarks.chaos.schedule import Kind
 from benchmarks.fleet.drives import name_of
 from mapweave.processes import parent_watchdog
 from mapweave.scenarios.children import ChildFailed, free_port
+from synthetic.postgres_server import PostgresServer
 
-SERVERS, ROUTERS = ("s0", "s1"), ("z0", "z1")
+SERVERS, ROUTERS, DATABASE = ("s0", "s1"), ("z0", "z1"), "pg"
 INTERVAL = 0.25
 """Between two steps of a robot, s."""
 SQLITE = "sqlite"
@@ -40,7 +41,9 @@ PATIENCE = 20.0
 class FleetProcesses:
     """All processes of one run, and their links. A context manager."""
 
-    def __init__(self, folder: Path, agents: int, seed: int, store: str) -> None:
+    def __init__(
+        self, folder: Path, agents: int, seed: int, store: str, postgres: PostgresServer | None = None
+    ) -> None:
         """Choose ports and open the links; nothing runs yet.
 
         Args:
@@ -48,7 +51,9 @@ class FleetProcesses:
             agents: how many.
             seed: of what they map.
             store: "sqlite" for a file for each server, else the URL of the one that both use.
+            postgres: runs it, and may be killed.
         """
+        self._postgres = postgres
         self.folder, self._store = folder, store
         self.agents = tuple(name_of(k) for k in range(agents))
         self._links_thread = Links().__enter__()
@@ -85,6 +90,9 @@ class FleetProcesses:
 
     def start(self, name: str) -> None:
         """Start a process, again or for the first time."""
+        if name == DATABASE and self._postgres is not None:
+            self._postgres.start()
+            return
         with (self.folder / f"{name}.log").open("ab") as output:
             self._running[name] = subprocess.Popen(
                 self._commands[name], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT,
@@ -93,6 +101,9 @@ class FleetProcesses:
 
     def kill(self, name: str) -> None:
         """End a process at once, without a word."""
+        if name == DATABASE and self._postgres is not None:
+            self._postgres.kill()
+            return
         process = self._running.pop(name)
         process.kill()
         process.communicate()

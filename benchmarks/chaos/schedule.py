@@ -57,12 +57,7 @@ class Disturbance:
 
 
 def draw_schedule(
-    seconds: float,
-    agents: Sequence[str],
-    servers: Sequence[str],
-    routers: Sequence[str],
-    seed: int,
-    stores_can_be_lost: bool,
+    seconds: float, groups: Sequence[Sequence[str]], seed: int, stores_can_be_lost: bool
 ) -> list[Disturbance]:
     """Disturbances spread over the time; kills make up half of them.
 
@@ -70,16 +65,15 @@ def draw_schedule(
 
     Args:
         seconds: of mapping.
-        agents: by name.
-        servers: likewise.
-        routers: likewise.
+        groups: names of processes: agents, servers, routers, and others that are only killed.
         seed: of the draw.
         stores_can_be_lost: whether a server's store is deleted, too.
     """
     rng = np.random.default_rng([seed, 77])
     kills = max(LEAST_KILLS, round(seconds / 3.0))
-    # Each of the three kinds of process gets its share of the kills, in any order.
-    victims = [(agents, servers, routers)[k % 3] for k in range(kills)]
+    agents, servers, routers, *_ = groups
+    # Each kind of process gets its share of the kills, in any order.
+    victims = [groups[k % len(groups)] for k in range(kills)]
     kinds = [Kind.KILL] * kills
     if stores_can_be_lost:
         for k in [k for k, group in enumerate(victims) if group is servers][1::3]:
@@ -92,7 +86,7 @@ def draw_schedule(
         victims.append((agents, agents, servers)[k % 3])
     order = rng.permutation(len(kinds))
     slot = seconds / len(kinds)
-    free = dict.fromkeys((*agents, *servers, *routers), 0.0)
+    free = dict.fromkeys((name for group in groups for name in group), 0.0)
     out: list[Disturbance] = []
     for k, index in enumerate(order):
         kind, at = kinds[index], (k + rng.uniform(0.0, 0.9)) * slot

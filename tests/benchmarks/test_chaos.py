@@ -25,6 +25,7 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import element_of, encode_change
 
 STEPS = 40
+GROUPS = (("r0", "r1"), ("s0", "s1"), ("z0", "z1"))
 
 
 @pytest.fixture
@@ -134,11 +135,11 @@ def test_recovery_ends_with_the_last_acknowledgement(tmp_path: Path) -> None:
 
 def test_a_schedule_is_that_of_its_seed_and_kills_often_enough() -> None:
     def draw(seed: int) -> list[object]:
-        return list(draw_schedule(10.0, ["r0", "r1"], ["s0", "s1"], ["z0", "z1"], seed, True))
+        return list(draw_schedule(10.0, GROUPS, seed, True))
 
     assert draw(1) == draw(1) != draw(2)
     for seed in range(20):
-        schedule = draw_schedule(60.0, ["r0", "r1"], ["s0", "s1"], ["z0", "z1"], seed, True)
+        schedule = draw_schedule(60.0, GROUPS, seed, True)
         assert sum(one.kind in KILLS for one in schedule) >= LEAST_KILLS
         for name in ("r0", "s1", "z0"):
             mine = [one for one in schedule if one.target == name]
