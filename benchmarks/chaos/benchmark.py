@@ -217,8 +217,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--store", default=SQLITE,
-        help="sqlite: a file a server; postgresql: one database for both, which is started here and killed; or "
-        "the URL of one",
+        help="sqlite: a file a server; postgresql: one database for both, which is started here and killed; "
+        "or the URL of one",
     )  # fmt: skip
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep journals, stores and logs here")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
