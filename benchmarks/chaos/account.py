@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from benchmarks.chaos.agent_process import STAMP, digest
-from benchmarks.chaos.robot_life import RobotLife
+from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.node import NodeId
@@ -55,35 +55,35 @@ class BrokenLog(Exception):
 
 
 def sent_changes(folder: Path, robot: int, seed: int) -> list[Change]:
-    """The changes that a robot has committed, in order, by its own log and its deterministic life.
+    """The changes that a robot has committed, in order, by its own log and its deterministic script.
 
     Raises:
-        BrokenLog: half a step was committed, or a digest or length is not that of its life.
+        BrokenLog: half a step was committed, or a digest or length is not that of its script.
     """
-    life = RobotLife(robot, seed)
+    script = ScriptedRobot(robot, seed)
     committed = 0
     handed: dict[int, tuple[int, str]] = {}
     heads: dict[int, int] = {}
-    for line in (folder / f"{life.map.agent}.truth").read_text().splitlines():
+    for line in (folder / f"{script.map.agent}.truth").read_text().splitlines():
         match line.split():
             case ["T", number, count, summary]:
                 handed[int(number)] = int(count), summary
             case ["C", number, head, _]:
                 if int(number) < committed:
-                    raise BrokenLog(f"{life.map.agent}: {line}: step {committed} was committed before")
+                    raise BrokenLog(f"{script.map.agent}: {line}: step {committed} was committed before")
                 committed = int(number)
                 heads[committed] = int(head)
             case ["TORN", *_]:
-                raise BrokenLog(f"{life.map.agent}: half a step is in its journal")
+                raise BrokenLog(f"{script.map.agent}: half a step is in its journal")
     changes: list[Change] = []
     for step in range(1, committed + 1):
-        bodies = life.step()
+        bodies = script.step()
         if handed[step] != (len(bodies), digest(bodies)):
-            raise BrokenLog(f"{life.map.agent}: step {step} is not that of its life")
+            raise BrokenLog(f"{script.map.agent}: step {step} is not that of its script")
         first = len(changes) + 1
-        changes += [Change(life.map, first + k, step * STAMP, body) for k, body in enumerate(bodies)]
+        changes += [Change(script.map, first + k, step * STAMP, body) for k, body in enumerate(bodies)]
         if heads.get(step, len(changes)) != len(changes):
-            raise BrokenLog(f"{life.map.agent}: the journal was {heads[step]} long at step {step}")
+            raise BrokenLog(f"{script.map.agent}: the journal was {heads[step]} long at step {step}")
     return changes
 
 

@@ -5,7 +5,7 @@
 Beside the journal it keeps a log that the journal knows nothing of, one line an event, each on the disk
 before the robot goes on:
 
-    T STEP CHANGES DIGEST      it is about to hand these changes of a step of its life to the replicator
+    T STEP CHANGES DIGEST      it is about to hand these changes of a step of its script to the replicator
     C STEP HEAD TIME           the journal has them: the log is now HEAD changes long
 
 A change counts as sent from its C on. A process that was killed between the two begins by looking: what its
@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.chaos.robot_life import RobotLife
+from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.journal import Journal
@@ -43,9 +43,9 @@ from mapweave.wire.zenoh_bus import ZenohBus
 
 FLEET = "chaos"
 STAMP = 1_000_000
-"""ns between two steps of a life."""
+"""ns between two steps of a script."""
 ENOUGH = "mapped"
-"""File that tells robots to map no more and to end when all is acknowledged."""
+"""File with which robots map no more, and end when all is acknowledged."""
 
 
 @dataclass(frozen=True)
@@ -105,10 +105,10 @@ def digest(bodies: Sequence[ChangeBody]) -> str:
 
 
 def main() -> None:
-    """Map until told to stop, or killed."""
+    """Map until stopped or killed."""
     orders = Orders(**json.loads(sys.argv[1]))
-    life, folder, keys = RobotLife(orders.robot, orders.seed), Path(orders.folder), Keys(FLEET)
-    name = life.map.agent
+    script, folder, keys = ScriptedRobot(orders.robot, orders.seed), Path(orders.folder), Keys(FLEET)
+    name = script.map.agent
     stop = threading.Event()
     parent_watchdog.hold(stop)
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
@@ -119,7 +119,7 @@ def main() -> None:
     step = position = 0
     bodies: list[ChangeBody] = []
     while position < head:
-        bodies = life.step()
+        bodies = script.step()
         step, position = step + 1, position + len(bodies)
     if position != head:
         truth.write(f"TORN {step} {head}")
@@ -133,7 +133,7 @@ def main() -> None:
     )
     try:
         while not stop.is_set() and not (folder / ENOUGH).exists():
-            bodies = life.step()
+            bodies = script.step()
             step += 1
             truth.write(f"T {step} {len(bodies)} {digest(bodies)}")
             replicator.submit(bodies, step * STAMP)

@@ -40,8 +40,8 @@ from benchmarks.chaos.account import Account, account, sent_changes
 from benchmarks.chaos.fleet_processes import DATABASE, ROUTERS, SERVERS, SQLITE, FleetProcesses
 from benchmarks.chaos.questions import LostRobot
 from benchmarks.chaos.recovery import RobotTimes, recoveries
-from benchmarks.chaos.robot_life import RobotLife
 from benchmarks.chaos.schedule import KILLS, LINKS, Disturbance, Kind, draw_schedule
+from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.replication.journal import Journal
 from mapweave.mapserver.log.opening import open_store
 from mapweave.scenarios.children import ChildFailed
@@ -107,7 +107,7 @@ def disturb(
 def relocalize_gaps(fleet: FleetProcesses, seed: int, progress: Progress) -> list[float]:
     """The longest times without an answer while each of `ATTACKS` lasts, s."""
     bar = progress.add_task("a lost robot asks", total=len(ATTACKS))
-    views = [RobotLife(k, seed).view for k in range(len(fleet.agents))]
+    views = [ScriptedRobot(k, seed).view for k in range(len(fleet.agents))]
     gaps: list[float] = []
     with LostRobot(fleet.endpoints, views) as robot:
         for kind, victim, lasts in ATTACKS:

@@ -21,7 +21,7 @@ class Kind(StrEnum):
     CUT = "links cut"
     SLOW = "links slow"
     FROZEN = "links frozen"
-    """Nothing comes through, and nobody is told."""
+    """Nothing comes through, and no end learns of it."""
     FLAP = "links cut again and again"
     HALF = "links half closed"
 

@@ -16,8 +16,8 @@ import pytest
 from benchmarks.chaos.account import Account, BrokenLog, account, sent_changes
 from benchmarks.chaos.agent_process import STAMP, digest
 from benchmarks.chaos.recovery import NEVER, RobotTimes, recoveries
-from benchmarks.chaos.robot_life import RobotLife
 from benchmarks.chaos.schedule import KILLS, LEAST_KILLS, Kind, draw_schedule
+from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import Change
 from mapweave.mapserver.log.entry import Entry
@@ -31,18 +31,18 @@ GROUPS = (("r0", "r1"), ("s0", "s1"), ("z0", "z1"))
 @pytest.fixture
 def fleet(tmp_path: Path) -> tuple[list[Change], Journal, SqliteStore]:
     """A robot's log, its journal, and a store that has it all."""
-    life = RobotLife(0, 5)
+    script = ScriptedRobot(0, 5)
     journal, store = Journal(tmp_path / "r0.sqlite", "r0"), SqliteStore(tmp_path / "s0.sqlite")
     journal.open_map(1)
     lines, head = [], 0
     for step in range(1, STEPS + 1):
-        bodies = life.step()
-        head += len(journal.append(life.map, bodies, step * STAMP))
+        bodies = script.step()
+        head += len(journal.append(script.map, bodies, step * STAMP))
         lines += [f"T {step} {len(bodies)} {digest(bodies)}", f"C {step} {head} {step / 10}"]
     (tmp_path / "r0.truth").write_text("\n".join(lines))
     sent = sent_changes(tmp_path, 0, 5)
-    entries = [Entry.read(life.map, one.sequence, encode_change(one)) for one in sent]
-    store.apply(life.map, journal.log_id(life.map), entries)
+    entries = [Entry.read(script.map, one.sequence, encode_change(one)) for one in sent]
+    store.apply(script.map, journal.log_id(script.map), entries)
     return sent, journal, store
 
 

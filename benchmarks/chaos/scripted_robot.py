@@ -17,7 +17,7 @@ LEAST = 4
 """Nodes and edges that are left before one is retired."""
 
 
-class RobotLife:
+class ScriptedRobot:
     """Nodes with the edges that lead to them; some are measured again, some are retired.
 
     Attributes:
