@@ -77,11 +77,17 @@ class Intake:
             self._current.forget_ahead()
         self._current = agent_log
 
+    def recount(self) -> None:
+        """Another server has taken some of its changes: count again before the next."""
+        self._stale = True
+
     def fitting(self, entries: Sequence[Entry]) -> tuple[int, str]:
         """How many of these changes, in order, the robot's quota of nodes has room for, and why not more.
 
         Those that fit count as kept from now on.
         """
+        if self._stale:
+            self._count()
         count, reason = self._fitting(entries)
         if reason:
             # People may have retired a map meanwhile.
@@ -107,6 +113,7 @@ class Intake:
         return len(entries), ""
 
     def _count(self) -> None:
+        self._stale = False
         kept, retired = self._store.kept(self._agent), self._retired()
         counts = [count for map_id, count in kept.items() if map_id not in retired]
         self._nodes = sum(nodes for nodes, _ in counts)
