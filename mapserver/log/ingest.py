@@ -249,7 +249,8 @@ class Ingest:
             if isinstance(item, Piece):
                 return self._take_piece(item)
             if isinstance(item, News):
-                return self._take_news(item)
+                self._take_news(item)
+                return None
             if item.attachment:
                 return self._take_change(item)
             return self._take_head(item)
