@@ -159,7 +159,9 @@ class MapServer:
             self._store if self._store.shared else None,
         )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
-        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear, self._quotas)
+        self._roster = Roster(
+            self._bus, self._keys, clock.monotonic, self._hear, self._quotas, self._ingest.lags
+        )
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
