@@ -343,7 +343,9 @@ class Ingest:
                 if agent_log.log_id != log_id or watermark <= agent_log.watermark:
                     continue
                 self._intakes.of(map_id.agent).recount()
-                self._pass_on(up_to(watermark, self._store.replay(map_id, agent_log.watermark)))
+                for change in up_to(watermark, self._store.replay(map_id, agent_log.watermark)):
+                    self._pass_on([change])
+                    agent_log.settled(Applied((), (), change.sequence))
                 agent_log.settled(Applied((), (), watermark))
                 agent_log.refusals = tuple(self._store.refusals(map_id))
                 for refusal in agent_log.refusals[:1]:
@@ -419,21 +421,21 @@ class Ingest:
             agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)
             self._refuse(agent_log.map, agent_log.log_id, reason)
             return
-        fits, full = self._intakes.of(agent_log.map.agent).fitting(entries)
-        if full:
-            if not fits:
-                self._rest(agent_log, full)
-                return
-            covered = None if covered is None else entries[fits].sequence - 1
-            entries = entries[:fits]
         try:
+            fits, full = self._intakes.of(agent_log.map.agent).fitting(entries)
+            if full:
+                if not fits:
+                    self._rest(agent_log, full)
+                    return
+                covered = None if covered is None else entries[fits].sequence - 1
+                entries = entries[:fits]
             applied = self._store.apply(agent_log.map, agent_log.log_id, entries, covered)
+            changes = tuple(unseen(self._store, agent_log, applied))
         except (InvalidFile, InvalidValue) as error:
             # Nothing is lost: it is not acknowledged, so the agent keeps it and it is pulled later.
             self._commit_failed(agent_log, error)
             return
         self._failure = ""
-        changes = unseen(self._store, agent_log, applied)
         received = agent_log.settled(applied)
         self._pulls.answers(agent_log.map.agent)
         for refusal in applied.refusals:
@@ -478,7 +480,11 @@ class Ingest:
     def _tell_newest(self, request: Request) -> None:
         """Which numbers an agent must not give to a new map: it may have lost its disk."""
         _, agent = self._keys.parse_ack(request.key)
-        maps = (*self._store.maps(), *self._taken)
+        try:
+            maps = (*self._store.maps(), *self._taken)
+        except InvalidFile as error:
+            request.refuse(str(error))
+            return
         epochs = (known.epoch for known in maps if known.agent == agent)
         request.reply(NewestMap(max(epochs, default=0)).encode())
 

@@ -26,7 +26,7 @@ from mapweave.opened_map import open_map
 from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
 from tests.mapserver.log.acknowledged_fleet import AGENT, KEYS, ROBOTS, SERVER, life
-from tests.postgres import PostgresServer
+from tests.postgres import PostgresServer, started
 from tests.waiting import eventually
 
 Log = list[tuple[int, bytes]]
@@ -182,3 +182,35 @@ def test_decisions_on_one_server_reach_the_other(
     for server in servers:
         server.__exit__(None, None, None)
     assert content_hash(open_map(address).content) == before
+
+
+def test_robots_keep_what_they_have_while_postgresql_is_away(journals: list[Journal]) -> None:
+    """Also a robot that the server has not known before."""
+    servers = started()
+    postgres = next(servers)
+    hub = MemoryHub()
+    server = FrontServer(hub, postgres.database(), "s0")
+    rng = np.random.default_rng(3)
+    maps = [journal.open_map(1) for journal in journals]
+    robots = [
+        Replicator(MemoryBus(hub), KEYS, journal, map_id, ("s0",), AGENT)
+        for journal, map_id in zip(journals, maps, strict=True)
+    ]
+    robots[0].submit(life(maps[0], rng, 10), 1)
+    assert robots[0].wait_acknowledged(30)
+    postgres.kill()
+    for robot, map_id in zip(robots, maps, strict=True):
+        robot.submit(life(map_id, rng, 10), 2)
+    eventually(lambda: "the map store cannot be used" in server.ingest.failure)
+    asked = MemoryBus(hub)
+    (answer,) = asked.ask(KEYS.ack("s0", "r1"), b"", 10.0)
+    assert "the map store cannot be used" in answer.error, "it cannot know which maps there are"
+    assert not any(robot.wait_acknowledged(0.0) for robot in robots)
+    postgres.start()
+    for robot in robots:
+        assert robot.wait_acknowledged(60)
+    assert server.logs() == logs_of(journals)
+    for robot in robots:
+        robot.close()
+    server.close()
+    servers.close()
