@@ -16,6 +16,7 @@ from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.node_comparisons import Compare, compare
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import Job, Schedule
@@ -46,6 +47,7 @@ class MergeWorker:
         merge: MergeSettings | None = None,
         keeper: VerificationCacheKeeper | None = None,
         history: MapHistory | None = None,
+        compare: Compare = compare,
     ) -> None:
         """Start with no map.
 
@@ -56,12 +58,13 @@ class MergeWorker:
             merge: how maps are merged.
             keeper: of the verification cache.
             history: records what joins and parts.
+            compare: compares nodes.
         """
         self._schedule = schedule
         self._keeper = keeper
         self._history = history or MapHistory()
         self._share = share
-        self._merger = Merger(places, merge)
+        self._merger = Merger(places, merge, compare)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False

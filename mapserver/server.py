@@ -28,11 +28,14 @@ from mapweave.mapserver.annotator import AnnotationRecord, Annotator
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
+from mapweave.mapserver.cluster.cluster import Cluster
+from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
+from mapweave.mapserver.merging.node_comparisons import compare
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
 from mapweave.mapserver.mission_relay import MissionRelay
@@ -61,11 +64,13 @@ class ServerSettings:
         admission_control: how questions that take long are shared out.
         merge: how maps are merged.
         quotas: what it takes of one robot.
+        cluster: among whose processes the place index is split.
     """
 
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
+    cluster: ClusterSettings = field(default_factory=ClusterSettings)
 
 
 STATUS_EVERY = 0.5
@@ -116,10 +121,15 @@ class MapServer:
         except InvalidFile:
             self._store.close()
             raise
-        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()])
+        self._cluster = Cluster(s.cluster) if s.cluster.ray else None
+        spread = self._cluster.index if self._cluster else None
+        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()], spread)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
-        self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
+        self._worker = MergeWorker(
+            clock, MERGE_SHARE, self._places, s.merge, findings, self._history,
+            self._cluster.compare if self._cluster else compare,
+        )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
         self._pins, self._floors = self._annotations.annotations.pins, self._annotations.annotations.floors
@@ -135,6 +145,8 @@ class MapServer:
     def __enter__(self) -> MapServer:
         """Begin to serve."""
         worker, clock = self._worker, self._schedule
+        if self._cluster:
+            self._cluster.start()
         worker.start()
         base = self._base
         self._ingest = Ingest(
@@ -183,6 +195,8 @@ class MapServer:
         self._admission.close()
         self._ingest.close()
         self._broadcast.close()
+        if self._cluster:
+            self._cluster.close()
         self._worker.close()
         self._places.close()
         self._store.close()
@@ -218,6 +232,7 @@ class MapServer:
             "node_puts": traffic.node_puts,
             "summary": merged.summary(),
             "version": version("mapweave"),
+            "cluster": self._cluster.index.status if self._cluster else "",
             **self._admission.counters(),
         }
 

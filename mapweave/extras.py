@@ -19,6 +19,7 @@ MODULES = {
         "uvicorn",
         "wsproto",
     ),
+    "cluster": ("ray",),
     "sim": ("pybullet",),
     "eval": ("evo",),
     "viz": ("matplotlib",),

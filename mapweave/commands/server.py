@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,6 +19,7 @@ from mapweave.commands.network import (
     settings_of,
     stop_on_signals,
 )
+from mapweave.extras import need
 
 DATA = Path("out/server")
 DEMO_HTTP = "8080"
@@ -54,6 +56,12 @@ def add_to(commands: Any) -> None:
         help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
         "0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip
+    parser.add_argument(
+        "--ray", metavar="auto|ADDRESS",
+        help="split the place index among the processes of a Ray cluster, which also compare nodes: its "
+        "address, or auto for the one that runs on this machine, which is started if there is none (default: "
+        "off)",
+    )  # fmt: skip
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -79,6 +87,11 @@ def run(arguments: argparse.Namespace) -> int:
     name = check_name(arguments.name or network.server)
     router, folder = router_settings(network, name)
     keys = Keys(router.fleet)
+    cluster = replace(settings.cluster, ray=arguments.ray or settings.cluster.ray)
+    if cluster.ray:
+        need("cluster")
+        if arguments.lockstep:
+            raise SettingsError("--lockstep is repeatable, and a cluster is not: leave out one of them")
     if arguments.demo and arguments.data is not None:
         raise SettingsError("--demo keeps nothing: leave out --data")
     people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
@@ -89,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
-        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas)
+        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas, cluster)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
             data = arguments.data or DATA
