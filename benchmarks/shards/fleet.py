@@ -15,7 +15,7 @@ from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
@@ -55,7 +55,7 @@ class BuildingFleet:
     def write(self, store: Path, robots: Sequence[int]) -> None:
         """Write the logs of some robots to a store."""
         store.parent.mkdir(parents=True, exist_ok=True)
-        database = Store(store)
+        database = SqliteStore(store)
         for robot in robots:
             log = self.logs[robot]
             map_id = log[0][0]
