@@ -31,11 +31,13 @@ from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.opening import open_store
+from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, News
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.metrics import Metrics, Sources
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
+from mapweave.mapserver.mission_relay import KEPT as MISSIONS
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.plan_service import PlanService
@@ -138,6 +140,7 @@ class MapServer:
         )
         self._blockages = Blockages()
         self._quotas = Quotas(s.quotas, clock.monotonic)
+        self._traffic, self._lost = self._store.traffic(), self._damaged()
 
     def __enter__(self) -> MapServer:
         """Begin to serve."""
@@ -181,6 +184,7 @@ class MapServer:
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
         clock.every(EVERY, self._places.save_if_worthwhile)
+        self._store.follow(self._follow)
         return self
 
     def __exit__(
@@ -219,12 +223,18 @@ class MapServer:
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
         merged = self._worker.answers.merged
-        traffic = self._store.traffic()
+        failure = self._ingest.failure
+        try:
+            self._traffic, self._lost = self._store.traffic(), self._damaged()
+        except InvalidFile as error:
+            failure = str(error)
+        traffic = self._traffic
         return {
             **merged.counts(),
+            **({"leads": self._store.leads} if self._store.shared else {}),
             "over_quota": ", ".join(self._quotas.over())[:1000],
-            "damaged": self._damaged(),
-            "event": self._ingest.failure or self._worker.event,
+            "damaged": self._lost,
+            "event": failure or self._worker.event,
             "settled": self._worker.settled,
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,
@@ -374,6 +384,18 @@ class MapServer:
             self._quotas.over, self._damaged, lambda: {"ingest": ingest.waiting, **worker.queues()},
             lambda: bool(ingest.failure), lambda: worker.settled,
         )  # fmt: skip
+
+    def _follow(self, news: News) -> None:
+        """Take over what another server has written to the store; in the store's thread."""
+        self._ingest.follow(news)
+        if news.names(CONSTRAINTS) and self._constraints.reload():
+            self._constrain()
+        if news.names(ANNOTATIONS) and self._annotations.reload():
+            self._apply_annotations(self._annotations.annotations)
+        if news.names(MISSIONS):
+            self._missions.reload()
+        if news.names(HISTORY) and not self._store.leads:
+            self._history.reload()
 
     def _damaged(self) -> int:
         """Changes that are damaged on the disk."""

@@ -355,7 +355,7 @@ def test_without_keys_a_router_listens_on_its_own_machine_alone(endpoint: str) -
 
 
 def test_routers_with_passwords_do_not_join(tmp_path: Path) -> None:
-    """Who connects would not know whom to."""
+    """Who connects would not know to which router."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0", 7447)
     with pytest.raises(SettingsError, match="with certificates, not with the passwords"):
         folder.router("s0", (), ["tcp/127.0.0.1:7448"])
