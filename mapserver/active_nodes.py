@@ -11,7 +11,7 @@ import numpy as np
 from mapweave.hybridmap.constraint_subject import RetiredWindow
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.plausibility import fragments
+from mapweave.mapserver.plausibility import fragments, unreliable_robots
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.wire_limits import FARTHEST
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -78,15 +78,19 @@ class ActiveNodes:
 
 
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
-    """Nodes of maps with wrong geometry and of implausible maps that show places of other maps.
+    """Nodes of maps with wrong geometry, of implausible maps and of fragments that show places of other maps.
 
     Each is at the same place as the node that it is linked to, seen by a robot whose map has it elsewhere: it
-    is no second place where a robot could be. Unlinked nodes of such a map are still used.
+    is no second place where a robot could be. Unlinked nodes of such a map are still used, unless its robot
+    has left very many: so many views of one place would be all that a question is compared with.
     """
-    wrong = {*merged.wrong, *merged.implausible}
-    for refusal in merged.refused if wrong else ():
+    wrong = {*merged.wrong, *merged.implausible, *fragments(merged.maps)}
+    unreliable = unreliable_robots(merged.maps, merged.wrong)
+    for some in unreliable.values():
+        yield from (node for map_id in some for node in merged.maps[map_id].nodes)
+    for refusal in merged.refused if wrong or unreliable else ():
         if refusal.link is not None and not refusal.link.within:
-            ends = [node for node in refusal.pair if node.map in wrong]
+            ends = [node for node in refusal.pair if node.map in wrong or node.agent in unreliable]
             if len(ends) == 1:
                 yield ends[0]
 
