@@ -1,4 +1,4 @@
-"""Shuffled maps: true views of places that others know, in an arrangement in which nobody else has them.
+"""Shuffled maps: true views of places that others know, in an arrangement that no other map has.
 
 A second place that looks the same looks the same from several nodes, and they agree how the two places lie to
 each other. In a shuffled map each node shows a place of its own, and no two agree.
@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.hybridmap.node import NodeId
-from mapweave.hybridmap.pose import Array
 from mapweave.merge.outlier_rejection.bent_maps import BENT_HEADING, BENT_XY
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
@@ -31,18 +31,18 @@ def is_shuffled(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> boo
         placed: piece of map.
         fixed: piece of map.
     """
-    shares = in_company(links, placed, fixed)
-    return len(shares) >= LEAST_PLACED and float(shares.mean()) < MOST_IN_COMPANY
+    confirmed = in_company(links, placed, fixed)
+    return len(confirmed) >= LEAST_PLACED and float(confirmed.mean()) < MOST_IN_COMPANY
 
 
-def in_company(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> Array:
+def in_company(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> NDArray[np.bool_]:
     """(N,) for each node that is placed by two links or more: whether another one agrees with it."""
     own: dict[NodeId, list[Link]] = {}
     for link in links:
         own.setdefault(link.a, []).append(link)
     best = [max(some, key=lambda link: link.weight) for some in own.values() if len(some) > 1]
     if not best:
-        return np.zeros(0)
+        return np.zeros(0, np.bool_)
     there = compose_poses(
         fixed.graph.means[fixed.graph.index([link.b for link in best])],
         inverse_poses(np.stack([link.a_from_b.mean.vector for link in best])),
@@ -53,4 +53,4 @@ def in_company(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> Arra
         off = compose_poses(inverse_poses(there), compose_poses(placement[None], inside))
         agree[k] = (np.hypot(off[:, 0], off[:, 1]) < BENT_XY) & (np.abs(off[:, 2]) < BENT_HEADING)
     np.fill_diagonal(agree, False)
-    return (agree | agree.T).any(axis=1).astype(np.float64)
+    return np.asarray((agree | agree.T).any(axis=1))

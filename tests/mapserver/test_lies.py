@@ -178,7 +178,8 @@ def test_a_person_links_two_maps_of_one_recording() -> None:
     merger.constrain(ManualConstraints([linked]))
     merged = merger.merged()
     assert not merged.set_apart
-    assert merged.relative(again[0].id, NodeId(*LAST, 1)).mean.distance(Pose2()) < 0.05
+    one, other = (merged.pose(node) for node in (again[0].id, NodeId(*LAST, 1)))
+    assert merged.joined(again[0].id.map, LAST) and one.distance(other) < 0.05
     merger.constrain(ManualConstraints([linked, replace(linked, holds=False)]))
     assert merger.merged().set_apart.keys() == {LAST}
 
@@ -233,7 +234,7 @@ def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_r
     assert {MapId(LAST.agent, 1)} <= {node.map for node in merger.merged().components[0]}
     relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
     assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
-    # Alone, and in one map: nobody else says that the second room is there.
+    # Alone, and in one map: no other robot says that the second room is there.
     steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
     nodes = take_map(WORLD, FIRST, [*TOUR, *TOUR], np.random.default_rng(5))[0]
     for number, body in enumerate(driven(FIRST, nodes, [*steps, Pose2(20.0), *steps]), start=1):
