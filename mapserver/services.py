@@ -11,6 +11,7 @@ from functools import partial
 from mapweave.hybridmap.errors import Busy, InvalidMessage, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
+from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.query import (
     KnownRequest,
@@ -25,6 +26,7 @@ from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.mission_relay import MissionRelay
+from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.packed_map import PackedMap
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
@@ -65,6 +67,7 @@ class Services:
         places: Callable[[], Places],
         images: Callable[[], Mapping[str, bytes]],
         quotas: Quotas,
+        observe: Callable[[float, Future[RelocalizeAnswer]], None] = lambda seconds, done: None,
     ) -> None:
         """Begin to answer.
 
@@ -85,9 +88,11 @@ class Services:
             places: named places of the newest merged map. May wait for it.
             images: of the plans, for the map's file.
             quotas: of robots.
+            observe: called with the time from each question for a place to its answer, s, and the answer.
         """
         self._places = places
         self._quotas = quotas
+        self._observe = observe
         self._clock = clock
         self._answers = answers
         self._admission = admission
@@ -97,6 +102,7 @@ class Services:
         self._roster = roster
         self._relays = relays
         self._reservations = Reservations()
+        self._nearby = Nearby()
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
             lambda: places().annotations, images,
@@ -106,6 +112,7 @@ class Services:
             keys.route(name): guarded(self._route),
             keys.known(name): guarded(self._known),
             keys.reserve(name): self._reserve_in_name,
+            keys.nearby(name): self._nearby_in_name,
         }
         self._closing: list[Closing] = [
             *(bus.serve(question, answer) for question, answer in of_robots.items()),
@@ -150,15 +157,27 @@ class Services:
         return handle
 
     def _relocalize_later(self, request: Request) -> None:
-        work, robot = partial(self._relocalize, request.payload), robot_of(request.key)
-        done = self._admission.submit(work, hash(request.payload), asker=robot)
-        done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
+        look, robot = partial(decode_view, request.payload), robot_of(request.key)
+        done = self.locate(look, hash(request.payload), robot)
+        done.add_done_callback(lambda done: guarded(lambda _: encode(within_range(done.result())))(request))
 
-    def _relocalize(self, payload: bytes) -> bytes:
-        view = decode_view(payload)
-        return encode(within_range(self.locate(view)))
+    def locate(self, look: Callable[[], View], ticket: int, asker: str = "") -> Future[RelocalizeAnswer]:
+        """Ask where a view was taken, from any thread; see `AdmissionControl.submit`.
 
-    def locate(self, view: View) -> RelocalizeAnswer:
+        Args:
+            look: makes the view; called by a worker.
+            ticket: the same if the same image comes again.
+            asker: a robot; empty for people.
+
+        Raises:
+            Busy: too many ask.
+        """
+        began = self._clock()
+        done = self._admission.submit(lambda: self._located(look()), ticket, asker=asker)
+        done.add_done_callback(lambda done: self._observe(self._clock() - began, done))
+        return done
+
+    def _located(self, view: View) -> RelocalizeAnswer:
         """Where a view was taken, with the names of the places; on the floor that the robot knows, if any."""
         answers, places = self._answers(), self._places()
         elsewhere: frozenset[MapId] = frozenset()
@@ -194,6 +213,15 @@ class Services:
         self._reservations.ask(replace(request, route=()), router, self._clock())
         number, closure = closed
         return encode(ReserveAnswer(number, "", None, f"the way ahead is {rule_words(closure)}", True))
+
+    def _nearby_in_name(self, request: Request) -> None:
+        guarded(lambda payload: self._around(payload, robot_of(request.key)))(request)
+
+    def _around(self, payload: bytes, robot: str) -> bytes:
+        request = decode(payload, NearbyRequest)
+        if robot not in ("", request.robot):
+            raise InvalidMessage(f"{robot} does not say where {request.robot} is")
+        return encode(self._nearby.ask(request, self._answers().merged, self._clock()))
 
     def _known(self, payload: bytes) -> bytes:
         request = decode(payload, KnownRequest)

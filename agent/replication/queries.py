@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
+from mapweave.agent.mission import AnswerContent, MayIDrive, Question, WhatIsKnown, WhereAmI, WhoIsNear
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
+    Certainty,
     KnownAnswer,
     KnownRequest,
     RelocalizeAnswer,
@@ -47,13 +50,15 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
     if isinstance(question, MayIDrive):
         reserve = ReserveRequest(robot, question.start, question.start_from_robot, question.route)
         return sent_by(keys.any_reserve(), robot), encode(reserve)
+    if isinstance(question, WhoIsNear):
+        q = question
+        who = NearbyRequest(robot, q.starts, q.sigma, q.heading_sigma, q.radius, q.height, q.speed)
+        return sent_by(keys.any_nearby(), robot), encode(who)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
     return sent_by(keys.any_route(), robot), encode(request)
 
 
-def decode_answer(
-    question: Question, payload: bytes
-) -> RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer:
+def decode_answer(question: Question, payload: bytes) -> AnswerContent:
     """A server's answer to a question.
 
     Raises:
@@ -68,6 +73,8 @@ def decode_answer(
         return decode(payload, KnownAnswer)
     if isinstance(question, MayIDrive):
         return decode(payload, ReserveAnswer)
+    if isinstance(question, WhoIsNear):
+        return decode(payload, NearbyAnswer)
     route = decode(payload, RouteAnswer)
     for leg in route.legs:
         _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
@@ -82,6 +89,36 @@ def decode_answer(
         if frozenset((a, b)) in blocked:
             raise InvalidMessage(f"route: it leads from {a} to {b}, where the robot did not get through")
     return route
+
+
+def settles(answer: AnswerContent) -> bool:
+    """Whether no other server's answer is waited for.
+
+    One that is new, or gets its store again, does not know yet what others do. And a robot drives only where
+    every server lets it.
+    """
+    match answer:
+        case RelocalizeAnswer():
+            return answer.certainty in (Certainty.FOUND, Certainty.PLACE)
+        case RouteAnswer():
+            return bool(answer.legs)
+    return False
+
+
+def best(answers: Sequence[AnswerContent]) -> AnswerContent:
+    """The one of several servers' answers that a robot acts on; of equals the first."""
+
+    def rank(answer: AnswerContent) -> tuple[bool, float]:
+        match answer:
+            case ReserveAnswer():
+                return not answer.closed, answer.granted
+            case KnownAnswer():
+                return False, -len(answer.views)
+            case NearbyAnswer():
+                return False, -len(answer.robots)
+        return not settles(answer), 0.0
+
+    return min(answers, key=rank)
 
 
 def _check_near(pose: Pose2, name: str) -> None:

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from mapweave.commands.network import (
+    add_log_format,
     add_network,
     key_renewal,
     network_of,
@@ -22,8 +23,14 @@ def add_to(commands: Any) -> None:
         help="run the router alone, without a map server",
         description="Run the Zenoh router for robots and tools, without a map server. It needs only the "
         "base installation. Maps are not merged; robots keep them on their own disks and send them when a "
-        "map server can be reached.",
+        "map server can be reached. A map server elsewhere joins it with --connect.",
     )
+    parser.add_argument(
+        "--print-config", action="store_true",
+        help="print the configuration as JSON5 for a zenohd, which takes the same, and end; with --keys it "
+        "contains the private key",
+    )  # fmt: skip
+    add_log_format(parser)
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -32,10 +39,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Route until stopped."""
     from mapweave.terminal import log_with_time, stamped
     from mapweave.wire.zenoh_bus import ZenohBus
+    from mapweave.wire.zenoh_config import router_file
 
-    log_with_time()
+    log_with_time(arguments.log_format)
     network = network_of(arguments, settings_of(arguments))
     settings, keys = router_settings(network, network.server)
+    if arguments.print_config:
+        print(router_file(settings))
+        return 0
     stop = stop_on_signals()
     bus = ZenohBus(settings)
     try:
