@@ -58,7 +58,9 @@ class ActiveNodes:
         )
         windows = (constraint.about for constraint in merged.constraints.in_force)
         self._windows = tuple(about for about in windows if isinstance(about, RetiredWindow))
-        self._hidden = self._inactive.union(merged.superseded)
+        # What an inactive node has replaced is still needed.
+        replaced = (node for node, one in merged.superseded.items() if one.by not in self._inactive)
+        self._hidden = self._inactive.union(replaced)
 
     def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
         """At most k active nodes with their similarity to a view, best first."""
