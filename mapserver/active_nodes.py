@@ -88,8 +88,9 @@ def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
     is no second place where a robot could be. Unlinked nodes of such a map are still used, unless its robot
     has left very many: so many views of one place would be all that a question is compared with.
     """
-    wrong = {*merged.wrong, *merged.implausible, *fragments(merged.maps)}
-    unreliable = unreliable_robots(merged.maps, merged.wrong)
+    maps = {map_id: one for map_id, one in merged.maps.items() if map_id not in merged.constraints.retired}
+    wrong = {*merged.wrong, *merged.implausible, *fragments(maps)}
+    unreliable = unreliable_robots(maps, merged.wrong)
     for some in unreliable.values():
         yield from (node for map_id in some for node in merged.maps[map_id].nodes)
     for refusal in merged.refused if wrong or unreliable else ():

@@ -6,6 +6,7 @@ show, and is not joined with them, it makes no answer ambiguous (mapweave.mapser
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -52,15 +53,19 @@ def fragments(maps: Mapping[MapId, HybridMap]) -> list[MapId]:
 
 
 def unreliable_robots(maps: Mapping[MapId, HybridMap], wrong: Collection[MapId]) -> dict[str, set[MapId]]:
-    """Robots of which very many maps are wrong, or too small for a test: which those are.
+    """Robots with very many maps, and most of their nodes in them, that are wrong or too small: these maps.
 
     No test finds every wrong map, and each is one more place where a robot seems to be.
     """
     bad: dict[str, set[MapId]] = {}
+    balance = Counter[str]()
     for map_id, hybrid_map in maps.items():
         if map_id in wrong or len(hybrid_map.nodes) < LEAST_NODES:
             bad.setdefault(map_id.agent, set()).add(map_id)
-    return {robot: some for robot, some in bad.items() if len(some) > MOST_FRAGMENTS}
+            balance[map_id.agent] += len(hybrid_map.nodes)
+        else:
+            balance[map_id.agent] -= len(hybrid_map.nodes)
+    return {robot: some for robot, some in bad.items() if len(some) > MOST_FRAGMENTS and balance[robot] > 0}
 
 
 def scattered(maps: Mapping[MapId, HybridMap]) -> dict[MapId, str]:

@@ -12,6 +12,7 @@ import pytest
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Linked
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.limits import MAX_NUMBER
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEventKind
@@ -22,7 +23,7 @@ from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.log.entry import unmeasurable
 from mapweave.mapserver.merging.copies import Copies, copied_landmarks
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.plausibility import MOST_FRAGMENTS
+from mapweave.mapserver.plausibility import MOST_FRAGMENTS, unreliable_robots
 from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.wire.codec import decode_change
@@ -214,6 +215,23 @@ def test_fragments_make_no_answer_ambiguous() -> None:
     assert list(merged.implausible) == [LAST]
     relocalizer = Answers.of(merger, merged, merger.node).relocalizer
     assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+
+
+def test_many_bad_maps_speak_against_a_robot_unless_most_of_its_nodes_are_sound() -> None:
+    nodes = take_map(WORLD, LAST, [*TOUR] * 7, np.random.default_rng(8))[0]
+
+    def held(size: int) -> HybridMap:
+        out = HybridMap()
+        for node in nodes[:size]:
+            out.apply(NodePut(node))
+        return out
+
+    small = {MapId("z", epoch): held(3) for epoch in range(1, MOST_FRAGMENTS + 2)}
+    assert unreliable_robots(small, ()) == {"z": {*small}}
+    assert not unreliable_robots(dict(list(small.items())[:-1]), ())
+    large = {MapId("z", 50): held(3 * len(small))}
+    assert not unreliable_robots(small | large, ())
+    assert unreliable_robots(small | large, [*large]) == {"z": {*small, *large}}
 
 
 def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_rooms_does() -> None:
