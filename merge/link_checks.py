@@ -48,6 +48,12 @@ def checked_link(
     """
     asked = constraint.about
     assert isinstance(asked, Linked), "a link"
+    # A map that was set apart as a copy is taken in by the link.
+    merged = replace(
+        merged,
+        maps={**merged.copies, **merged.maps},
+        set_apart={m: reason for m, reason in merged.set_apart.items() if m not in merged.copies},
+    )
     for end in (asked.a, asked.b):
         merged.check(end)
     against = constraints.against(asked.a, asked.b)
