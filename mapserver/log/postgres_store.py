@@ -158,7 +158,18 @@ class PostgresStore(SqlStore):
         query = query.replace("?", "%s")
         if self._writing == threading.get_ident():
             return self._writer.connection.execute(query, values, binary=True).fetchall()
-        with self._read_lock, self._reader.guard():
+        with self._read_lock:
+            was_open = self._reader.is_open
+            try:
+                return self._fetch(query, values)
+            except InvalidFile:
+                if not was_open or self._reader.is_open:
+                    raise
+                # The session was lost, perhaps long before: another one may be had at once.
+                return self._fetch(query, values)
+
+    def _fetch(self, query: str, values: Sequence[object]) -> list[Any]:
+        with self._reader.guard():
             return self._reader.connection.execute(query, values, binary=True).fetchall()
 
     @contextmanager
