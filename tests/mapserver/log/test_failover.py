@@ -12,8 +12,9 @@ import pytest
 from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import Run
+from synthetic.postgres_server import ROLE, PostgresServer, binaries
 from tests.mapserver.log.test_store import MAP, entry
-from tests.postgres import ROLE, PostgresServer, binaries, started
+from tests.postgres import started
 from tests.waiting import eventually
 
 
