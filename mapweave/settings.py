@@ -9,6 +9,7 @@ from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
+from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.quotas import QuotaSettings
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.settings_file import build, read_toml
@@ -46,6 +47,7 @@ class Settings:
         admission_control: how a map server shares out the questions that take long.
         quotas: what a map server takes of one robot at most.
         merge: how maps are merged.
+        cluster: of machines that help a map server.
     """
 
     network: NetworkSettings = field(default_factory=NetworkSettings)
@@ -54,6 +56,7 @@ class Settings:
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
+    cluster: ClusterSettings = field(default_factory=ClusterSettings)
 
 
 def load_settings(path: Path | None) -> Settings:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,6 +21,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.extras import need
 
 DATA = Path("out/server")
 DEMO_HTTP = "8080"
@@ -61,6 +63,12 @@ def add_to(commands: Any) -> None:
         help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
         "0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip
+    parser.add_argument(
+        "--ray", metavar="auto|ADDRESS",
+        help="split the place index among the processes of a Ray cluster, which also compare nodes: its "
+        "address, or auto for the one that runs on this machine, which is started if there is none (default: "
+        "off)",
+    )  # fmt: skip
     add_log_format(parser)
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
@@ -88,6 +96,11 @@ def run(arguments: argparse.Namespace) -> int:
     name = check_name(arguments.name or network.server)
     router, folder = server_settings(network, name)
     keys = Keys(router.fleet)
+    cluster = replace(settings.cluster, ray=arguments.ray or settings.cluster.ray)
+    if cluster.ray:
+        need("cluster")
+        if arguments.lockstep:
+            raise SettingsError("--lockstep is repeatable, and a cluster is not: leave out one of them")
     if arguments.demo and (arguments.data is not None or arguments.store is not None):
         raise SettingsError("--demo keeps nothing: leave out --data and --store")
     if arguments.store is not None and not is_postgres(arguments.store):
@@ -100,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
-        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas)
+        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas, cluster)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
             data = arguments.data or DATA
