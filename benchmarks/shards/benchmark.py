@@ -244,7 +244,10 @@ def kill(kind: str, server: Server, cluster: RayNodes) -> None:
         os.kill(server.gateway(), signal.SIGKILL)
     else:
         titles = {"shard": ("ray::ShardServer",), "worker": ("ray::answer_work", "ray::IDLE")}[kind]
-        os.kill(next(pid for title in titles for pid in cluster.processes(title)), signal.SIGKILL)
+        found = [pid for title in titles for pid in cluster.processes(title)]
+        if not found:
+            raise SystemExit(f"there is no {kind} to kill")
+        os.kill(found[0], signal.SIGKILL)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
