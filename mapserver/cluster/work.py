@@ -46,6 +46,11 @@ class WorkPool:
         self._call, self._workers = call, workers
         self._not_before = 0.0
 
+    @property
+    def _silent(self) -> bool:
+        """Whether workers have not answered of late."""
+        return time.monotonic() < self._not_before
+
     def compare(self, pairs: Sequence[tuple[Node, Node]]) -> list[Verdict]:
         """Compare pairs of nodes; see `mapweave.mapserver.merging.node_comparisons.compare`."""
         if len(pairs) <= PAIRS:  # a single worker would be no faster
@@ -58,7 +63,7 @@ class WorkPool:
         """The results, in order."""
         asked: list[tuple[Any, Future[bytes] | None]] = []
         while True:
-            workers = self._workers() if time.monotonic() >= self._not_before else 0
+            workers = 0 if self._silent else self._workers()
             for argument in islice(arguments, max(max(AHEAD * workers, 1) - len(asked), 0)):
                 sent = self._call(pickle.dumps((name, argument))) if workers else None
                 asked.append((argument, sent))
@@ -70,10 +75,11 @@ class WorkPool:
     def _result(self, name: str, argument: Any, sent: Future[bytes] | None) -> Any:
         if sent is not None:
             try:
-                return pickle.loads(sent.result(PATIENCE))
+                return pickle.loads(sent.result(0.0 if self._silent else PATIENCE))
             except TimeoutError:
-                self._not_before = time.monotonic() + TRUCE
-                log.warning("no worker of the cluster answers in %g s: nodes are compared here", PATIENCE)
+                if not self._silent:
+                    self._not_before = time.monotonic() + TRUCE
+                    log.warning("no worker of the cluster answers in %g s: nodes are compared here", PATIENCE)
             except Exception as error:  # noqa: BLE001 - whatever it is, it is done here
                 log.debug("no answer from the cluster: %s", error)
         return FUNCTIONS[name](argument)
