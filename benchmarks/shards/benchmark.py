@@ -45,7 +45,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.zenoh_bus import ZenohBus
 
-KILLS = ("shard", "worker", "gateway", "server", "head")
+KILLS = ("worker", "shard", "gateway", "server", "head")
 LATE = 2
 """Robots that join later."""
 AFTER = 4.0
@@ -244,18 +244,18 @@ def kill(kind: str, server: Server, cluster: RayNodes) -> None:
         os.kill(server.gateway(), signal.SIGKILL)
     else:
         titles = {"shard": ("ray::ShardServer",), "worker": ("ray::answer_work", "ray::IDLE")}[kind]
-        found = [pid for title in titles for pid in cluster.processes(title)]
-        if not found:
-            raise SystemExit(f"there is no {kind} to kill")
+        found: list[int] = []
+        # Ray starts a worker when there is work.
+        wait_until(lambda: found.extend(p for title in titles for p in cluster.processes(title)) or found)
         os.kill(found[0], signal.SIGKILL)
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], object]) -> None:
     """Wait for a condition; end the benchmark if it does not come true."""
     end = time.monotonic() + PATIENCE
     while not condition():
         if time.monotonic() > end:
-            raise SystemExit(f"answers are not whole again after {PATIENCE:g} s")
+            raise SystemExit(f"no whole answers, or no process to kill, for {PATIENCE:g} s")
         time.sleep(0.05)
 
 

@@ -27,8 +27,8 @@ WORK = -1
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 15.0
 """s between two attempts to reach a cluster; it doubles."""
 SILENCE = 30.0
-"""s without any answer to what was asked, after which the child is started again: Ray notices after more than a
-minute that its head is gone."""
+"""s without any answer to what was asked, after which the child is started again: Ray notices only after more
+than a minute that its head is gone."""
 PROCESS = "mapweave.mapserver.cluster.gateway_process"
 
 
