@@ -23,7 +23,8 @@ class NetworkSettings:
         fleet: name that robots, server and simulator share.
         endpoints: Zenoh endpoints of routers, tried in order; when one fails a robot goes on with the next.
             A server or router listens at all of them.
-        routers: of a server or router: endpoints of other routers that it joins.
+        routers: of a router: the endpoint of another one that it joins. Of a server: likewise if `endpoints`
+            are given, where it listens; else endpoints of routers, tried in order, of which it is a client.
         server: name of the map server that must have a change before the agent may forget it.
         keys: key file of this robot or person; for a server or router the folder of `mapweave keys init`.
     """

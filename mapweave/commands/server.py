@@ -16,9 +16,10 @@ from mapweave.commands.network import (
     add_network,
     key_renewal,
     network_of,
-    router_settings,
+    server_settings,
     settings_of,
     stop_on_signals,
+    warn_without_router,
 )
 from mapweave.extras import need
 
@@ -93,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     name = check_name(arguments.name or network.server)
-    router, folder = router_settings(network, name)
+    router, folder = server_settings(network, name)
     keys = Keys(router.fleet)
     cluster = replace(settings.cluster, ray=arguments.ray or settings.cluster.ray)
     if cluster.ray and arguments.lockstep:
@@ -132,8 +133,11 @@ def run(arguments: argparse.Namespace) -> int:
             if base is not None:
                 print(stamped(f"with {base}"), flush=True)
             stack.enter_context(server)
-            where = ", ".join(router.listen)
-            print(stamped(f"map server {name} of fleet {keys.fleet} listens at {where}"), flush=True)
+            where = "listens at " + ", ".join(router.listen)
+            if router.mode == "client":
+                where = "is at the routers " + ", ".join(router.endpoints)
+                warn_without_router(bus, name)
+            print(stamped(f"map server {name} of fleet {keys.fleet} {where}"), flush=True)
             if people is not None:
                 stack.enter_context(people.serve(server))
                 print(stamped(f"for people: {people.url}"), flush=True)
