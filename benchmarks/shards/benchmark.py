@@ -244,10 +244,13 @@ def kill(kind: str, server: Server, cluster: RayNodes) -> None:
         os.kill(server.gateway(), signal.SIGKILL)
     else:
         titles = {"shard": ("ray::ShardServer",), "worker": ("ray::answer_work", "ray::IDLE")}[kind]
-        found: list[int] = []
+
+        def found() -> list[int]:
+            return [pid for title in titles for pid in cluster.processes(title)]
+
         # Ray starts a worker when there is work.
-        wait_until(lambda: found.extend(p for title in titles for p in cluster.processes(title)) or found)
-        os.kill(found[0], signal.SIGKILL)
+        wait_until(found)
+        os.kill(found()[0], signal.SIGKILL)
 
 
 def wait_until(condition: Callable[[], object]) -> None:
