@@ -28,6 +28,8 @@ from mapweave.mapserver.annotator import AnnotationRecord, Annotator
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
+from mapweave.mapserver.cluster.cluster import Cluster
+from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.opening import open_store
@@ -64,11 +66,13 @@ class ServerSettings:
         admission_control: how questions that take long are shared out.
         merge: how maps are merged.
         quotas: what it takes of one robot.
+        cluster: among whose processes the place index is split.
     """
 
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
+    cluster: ClusterSettings = field(default_factory=ClusterSettings)
 
 
 STATUS_EVERY = 0.5
@@ -122,13 +126,15 @@ class MapServer:
         except InvalidFile:
             self._store.close()
             raise
-        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()])
+        self._cluster = Cluster(s.cluster)
+        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()], self._cluster.index)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._metrics = Metrics()
         self._worker = MergeWorker(
-            clock, MERGE_SHARE, self._places, s.merge, findings, self._history, self._metrics.merged
-        )
+            clock, MERGE_SHARE, self._places, s.merge, findings, self._history, self._cluster.compare,
+            self._metrics.merged,
+        )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
         self._pins, self._floors = self._annotations.annotations.pins, self._annotations.annotations.floors
@@ -145,6 +151,7 @@ class MapServer:
     def __enter__(self) -> MapServer:
         """Begin to serve."""
         worker, clock = self._worker, self._schedule
+        self._cluster.start()
         worker.start()
         base = self._base
         self._ingest = Ingest(
@@ -199,6 +206,7 @@ class MapServer:
         self._admission.close()
         self._ingest.close()
         self._broadcast.close()
+        self._cluster.close()
         self._worker.close()
         self._places.close()
         self._store.close()
@@ -240,6 +248,7 @@ class MapServer:
             "node_puts": traffic.node_puts,
             "summary": merged.summary(),
             "version": version("mapweave"),
+            "cluster": self._cluster.status,
             **self._admission.counters(),
         }
 

@@ -48,7 +48,7 @@ from mapweave.scenarios.children import ChildFailed
 from synthetic.postgres_server import PostgresServer, binaries
 
 POSTGRESQL = "postgresql"
-START = 60.0
+START = 120.0
 """Longest wait until both servers answer, s."""
 SETTLE = 120.0
 """Longest wait until all is acknowledged when nothing is disturbed any more, s."""
@@ -72,7 +72,7 @@ def wait_until(condition: Callable[[], bool], patience: float, what: str) -> Non
     while not condition():
         if time.monotonic() > end:
             raise ChildFailed(what)
-        time.sleep(0.05)
+        time.sleep(0.3)
 
 
 def disturb(

@@ -1,13 +1,7 @@
-r"""The processes of a fleet: agents, two servers, two routers between them; killed, frozen, started again.
+"""The processes of a fleet: agents, two servers, two routers between them; killed, frozen, started again.
 
-    agent --- link --- router ---------- router
-                          \             /
-                           link       link
-                             \       /
-                             server s0, and server s1 likewise
-
-Each agent and each server has a link of its own to each router (`benchmarks.chaos.lossy_link`). The routers
-join each other, and agents go to the other one when theirs is away.
+Agents and servers are clients of two routers that are joined. Each has a link of its own to each of them
+(`benchmarks.chaos.lossy_link`), is at one of them, and goes to the other one when that is away.
 """
 
 from __future__ import annotations
@@ -57,7 +51,7 @@ class FleetProcesses:
         self.folder, self._store = folder, store
         self.agents = tuple(name_of(k) for k in range(agents))
         self._links_thread = Links().__enter__()
-        self._ports = {name: free_port() for name in (*ROUTERS, *SERVERS)}
+        self._ports = {name: free_port() for name in ROUTERS}
         self.links: dict[str, list[Link]] = {
             name: [self._links_thread.open(self._ports[router]) for router in ROUTERS]
             for name in (*self.agents, *SERVERS)
@@ -193,20 +187,20 @@ class FleetProcesses:
     def _endpoint(self, name: str) -> str:
         return f"tcp/127.0.0.1:{self._ports[name]}"
 
-    def _joined(self, name: str) -> list[str]:
-        return [link.endpoint for link in self.links[name]]
+    def _routers_of(self, name: str) -> list[str]:
+        """Half of the fleet has the one router first, half the other."""
+        endpoints = [link.endpoint for link in self.links[name]]
+        return endpoints if name[-1] in "02468" else endpoints[::-1]
 
     def _agent(self, robot: int, seed: int) -> Sequence[str]:
-        # Half of the fleet has the one router first, half the other.
-        endpoints = self._joined(name_of(robot))[:: 1 if robot % 2 else -1]
-        orders = Orders(robot, tuple(endpoints), str(self.folder), SERVERS, INTERVAL, seed)
+        endpoints = tuple(self._routers_of(name_of(robot)))
+        orders = Orders(robot, endpoints, str(self.folder), SERVERS, INTERVAL, seed)
         return [sys.executable, "-m", "benchmarks.chaos.agent_process", json.dumps(asdict(orders))]
 
     def _server(self, name: str) -> Sequence[str]:
         command = [
             sys.executable, "-m", "mapweave", "server", "--name", name, "--fleet", FLEET,
-            "--data", str(self.folder / name), "--listen", self._endpoint(name),
-            "--connect", *self._joined(name),
+            "--data", str(self.folder / name), "--connect", *self._routers_of(name),
         ]  # fmt: skip
         return command if self._store == SQLITE else [*command, "--store", self._store]
 

@@ -56,8 +56,17 @@ class Links:
 
     def __exit__(self, *_: object) -> None:
         """End all connections."""
+
+        async def end() -> None:
+            others = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in others:
+                task.cancel()
+            await asyncio.gather(*others, return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(end(), self._loop).result(10.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
+        self._loop.close()
 
     def open(self, target: int) -> Link:
         """A link to a port of this machine."""
