@@ -87,13 +87,11 @@ class PlaceDatabase:
             before: pairs of nodes in which it was; of these also those that were left out are compared.
         """
         overlaps_by_node = self._index.overlaps(node, node_of)
-        for candidate_id in {node_id for pair in before for node_id in pair} & self._left_out:
-            candidate = node_of(candidate_id)
-            if candidate is not None and candidate_id != node.id:
-                codes, candidate_codes = (bounded(node_id).landmarks.codes for node_id in (node, candidate))
-                value = voting.pair_overlap(codes, candidate_codes, ALIKE)
-                if value >= LEAST_OVERLAP:
-                    overlaps_by_node[candidate_id] = value
+        left_out = {node_id for pair in before for node_id in pair} & self._left_out - {node.id}
+        known = [candidate for node_id in left_out if (candidate := node_of(node_id)) is not None]
+        codes, *others = (bounded(compared).landmarks.codes for compared in (node, *known))
+        values = voting.pair_overlaps(codes, others, ALIKE, LEAST_OVERLAP)
+        overlaps_by_node |= {c.id: value for c, value in zip(known, values, strict=True) if value}
         return overlaps_by_node
 
     # Update.

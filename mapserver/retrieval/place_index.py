@@ -207,14 +207,13 @@ class PlaceIndex:
         return overlaps_by_node
 
     def _voted(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
-        s, codes = self._settings, node.landmarks.codes
-        overlaps_by_node: dict[NodeId, float] = {}
-        for candidate_id, _ in self._ranked(codes, s.compared, [node.id]):
-            candidate = node_of(candidate_id)
-            if candidate is not None:
-                candidate_codes = bounded(candidate).landmarks.codes
-                overlaps_by_node[candidate_id] = voting.pair_overlap(codes, candidate_codes, ALIKE)
-        return {candidate: value for candidate, value in overlaps_by_node.items() if value >= LEAST_OVERLAP}
+        codes = node.landmarks.codes
+        ranked = self._ranked(codes, self._settings.compared, [node.id])
+        known = [candidate for node_id, _ in ranked if (candidate := node_of(node_id)) is not None]
+        values = voting.pair_overlaps(
+            codes, [bounded(candidate).landmarks.codes for candidate in known], ALIKE, LEAST_OVERLAP
+        )
+        return {candidate.id: value for candidate, value in zip(known, values, strict=True) if value}
 
     def settle(self) -> None:
         """Wait until cells that are being learned are in use."""
