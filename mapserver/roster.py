@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 from mapweave.hybridmap.agent_status import (
     MAX_ACCUSATION,
@@ -22,6 +23,20 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode
+
+
+class Presence(NamedTuple):
+    """What is known of a robot without looking at the map.
+
+    Attributes:
+        alive: whether its agent is there.
+        age: since its last status, s; None if none has come.
+        unsent: changes that no server has acknowledged, by its own count.
+    """
+
+    alive: bool
+    age: float | None
+    unsent: int
 
 
 class Roster:
@@ -68,6 +83,18 @@ class Roster:
         """The last status of a robot; None if none has come."""
         with self._turn:
             return self._heard[robot][0] if robot in self._heard else None
+
+    def presence(self) -> Mapping[str, Presence]:
+        """All robots that are heard of, by name: `MAX_ROBOTS` at most."""
+        now = self._clock()
+        with self._turn:
+            known = {name for name, maps in self._alive.items() if maps} | self._heard.keys()
+            found = {}
+            for name in sorted(known)[:MAX_ROBOTS]:
+                status, at = self._heard.get(name, (None, now))
+                age, unsent = (None, 0) if status is None else (max(now - at, 0.0), status.unsent)
+                found[name] = Presence(bool(self._alive.get(name)), age, unsent)
+        return found
 
     def robots(self, places: Places) -> FleetStatus:
         """All robots, with where they are in a merged map."""

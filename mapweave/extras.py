@@ -13,6 +13,7 @@ MODULES = {
         "faiss",
         "gtsam",
         "numba",
+        "prometheus_client",
         "python_multipart",
         "scipy",
         "starlette",

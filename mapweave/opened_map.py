@@ -20,8 +20,9 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log import store
+from mapweave.mapserver.log import sqlite_store
 from mapweave.mapserver.log.salvage import Salvage, salvage
+from mapweave.mapserver.log.store import HISTORY
 from mapweave.mapserver.own_maps import maps_of
 from mapweave.mapserver.plan_images import kept_images
 from mapweave.storage.database_reader import MAGIC as SQLITE
@@ -149,10 +150,10 @@ def source_of(path: Path) -> MapSource:
         raise InvalidFile(f"{path}: cannot be read ({error})") from None
     if kind == journal.APPLICATION_ID:
         return MapSource.JOURNAL
-    if kind != store.APPLICATION_ID:
+    if kind != sqlite_store.APPLICATION_ID:
         raise InvalidFile(f"{path}: {OTHER}")
-    if version != store.VERSION:
-        raise InvalidFile(f"{path}: map store of format {version}, this program uses {store.VERSION}")
+    if version != sqlite_store.VERSION:
+        raise InvalidFile(f"{path}: map store of format {version}, this program uses {sqlite_store.VERSION}")
     return MapSource.STORE
 
 
@@ -169,9 +170,7 @@ def _of_journal(path: Path) -> OpenedMap:
 def _of_store(path: Path) -> OpenedMap:
     salvaged = salvage(path)
     constraints, bad = _read(salvaged.constraints, ManualConstraint)
-    history, worse = _read(
-        [salvaged.results[store.HISTORY]] if store.HISTORY in salvaged.results else [], KeptHistory
-    )
+    history, worse = _read([salvaged.results[HISTORY]] if HISTORY in salvaged.results else [], KeptHistory)
     annotations, worst = _read(salvaged.annotations, Annotation)
     content = MapFile(
         "agent",

@@ -182,6 +182,14 @@ class ReadOnlyServer:
         """
         self._refuse("there are no robots to send")
 
+    def metrics(self) -> bytes:
+        """Refuse: nothing changes, so there is nothing to measure.
+
+        Raises:
+            InvalidValue: always.
+        """
+        self._refuse("a map file has no metrics")
+
     def portal_done(self, robot: str, by: str) -> str:
         """Refuse.
 
