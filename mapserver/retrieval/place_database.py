@@ -97,8 +97,8 @@ class PlaceDatabase:
     # Update.
 
     def announce(self, node: Node) -> None:
-        """Let a node be found before it is put; any thread may do so."""
-        self._index.add(node)
+        """Let a node be found before it is put; any thread may do so, and waits for nothing."""
+        self._index.announce(node)
 
     def observe(self, node: Node) -> None:
         """Take note of a node before it is put: what its robot saw long before is no longer of today."""
