@@ -22,7 +22,7 @@ from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
 from mapweave.mapserver.log.ingest_counters import IngestCounters
 from mapweave.mapserver.log.known_logs import Lag
 from mapweave.mapserver.merging.merger_counters import MergerCounters
-from mapweave.mapserver.roster import Presence
+from mapweave.mapserver.roster import NO_LAG, Presence
 
 ACK_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 """s; asked for is a 99th percentile below 0.5."""
@@ -209,12 +209,11 @@ class _Reader(Collector):
         yield _gauge("lag_max_seconds", "The largest lag of any robot.",
                      max((lag.seconds for lag in lags.values()), default=0.0))  # fmt: skip
         yield _gauge("robot_alive", "Whether the robot's agent is there.", alive, "robot")
-        none = Lag(0, 0.0)
-        lag = {name: lags.get(name, none).seconds for name in robots}
+        lag = {name: lags.get(name, NO_LAG).seconds for name in robots}
         yield _gauge(
             "robot_lag_seconds", "For how long a change of it is known of and not here.", lag, "robot"
         )
-        missing = {name: float(lags.get(name, none).missing) for name in robots}
+        missing = {name: float(lags.get(name, NO_LAG).missing) for name in robots}
         yield _gauge(
             "robot_changes_missing", "Changes of it that are known of and not here.", missing, "robot"
         )

@@ -30,7 +30,7 @@ from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
-from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
@@ -84,23 +84,25 @@ class MapServer:
         self,
         bus: Bus,
         keys: Keys,
-        path: Path,
+        address: Path | str,
         name: str,
         settings: ServerSettings | None = None,
         schedule: Schedule | None = None,
         base: BaseMap | None = None,
+        cache: Path | None = None,
     ) -> None:
         """Open the store and take up where it was left.
 
         Args:
             bus: the connection.
             keys: of the fleet.
-            path: of the store; its folder is made.
+            address: of the store: a file, whose folder is made, or the address of a PostgreSQL database.
             name: of this server in the fleet.
             settings: how it shares its time.
             schedule: runs its work and gives the time; threads and the machine's clock by default. It
                 starts and ends with the server.
             base: a map that is there from the start, beside the store.
+            cache: folder for what is kept beside a store in PostgreSQL; made if it is not there.
 
         Raises:
             InvalidFile: the store is damaged or is none, or has another map of a name that is in the base.
@@ -110,8 +112,9 @@ class MapServer:
         self._name = name
         self._settings = s = settings or ServerSettings()
         self._schedule = clock = schedule or LiveSchedule()
+        path = address if isinstance(address, Path) else (cache or Path()) / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._store = SqliteStore(path)
+        self._store = open_store(address, name)
         try:
             self._base = (base or BaseMap()).beside(self._store)
         except InvalidFile:
@@ -150,9 +153,12 @@ class MapServer:
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,
             lambda: self._annotations.annotations, self._path, base.images,
+            self._store if self._store.shared else None,
         )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
-        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear, self._quotas)
+        self._roster = Roster(
+            self._bus, self._keys, clock.monotonic, self._hear, self._quotas, self._ingest.lags
+        )
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,

@@ -20,6 +20,7 @@ MODULES = {
         "uvicorn",
         "wsproto",
     ),
+    "postgres": ("psycopg",),
     "sim": ("pybullet",),
     "eval": ("evo",),
     "viz": ("matplotlib",),

@@ -47,6 +47,14 @@ class SqlStore(Store):
         """Inside a transaction."""
 
     @abstractmethod
+    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
+        """The logs of these runs that are stored; only this transaction changes them until the commit."""
+
+    @abstractmethod
+    def _lock_table(self, table: str) -> None:
+        """Only this transaction changes it until the commit."""
+
+    @abstractmethod
     def _put(self, table: str, values: Sequence[object]) -> None:
         """Inside a transaction: put a row into a table, in the place of one with the same key."""
 
@@ -84,7 +92,8 @@ class SqlStore(Store):
         """Take the next changes of many logs in one transaction; see `Store`."""
         try:
             with self._transaction():
-                return [self._apply(run) for run in runs]
+                logs = self._begin(runs)
+                return [self._apply(run, logs) for run in runs]
         except InvalidFile as error:
             return [InvalidFile(str(error)) for _ in runs]
 
@@ -104,8 +113,8 @@ class SqlStore(Store):
     def damaged(self, map_id: MapId | None = None) -> list[Gap]:
         """Changes that were found damaged and are not restored yet, of one map or of all."""
         query = (
-            "SELECT agent, epoch, first, last FROM damaged WHERE ? IS NULL OR (agent = ? AND epoch = ?) "
-            "ORDER BY agent, epoch, first"
+            "SELECT agent, epoch, first, last FROM damaged "
+            "WHERE CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?) ORDER BY agent, epoch, first"
         )
         agent, epoch = map_id or (None, None)
         rows = self._read(query, (agent, agent, epoch))
@@ -127,7 +136,7 @@ class SqlStore(Store):
                     if covered < gap.last:
                         self._put("damaged", (*map_id, covered + 1, gap.last))
             for entry in entries:
-                self._take(map_id, entry, changes, refusals)
+                self._take(map_id, entry, changes, refusals, restored=True)
         for refusal in refusals:
             log.warning("refused %s %d: %s", map_id, refusal.sequence, refusal.reason)
         if any(self._may_undo(change) for change in changes):
@@ -141,7 +150,9 @@ class SqlStore(Store):
 
     def kept(self, agent: str) -> dict[MapId, tuple[int, int]]:
         """Nodes and landmarks of each map of a robot."""
-        query = "SELECT epoch, count(*), sum(landmarks) FROM node WHERE agent = ? GROUP BY epoch"
+        query = (
+            "SELECT epoch, count(*), CAST(sum(landmarks) AS BIGINT) FROM node WHERE agent = ? GROUP BY epoch"
+        )
         return {MapId(agent, epoch): (nodes, total) for epoch, nodes, total in self._read(query, (agent,))}
 
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
@@ -159,13 +170,13 @@ class SqlStore(Store):
     def traffic(self, map_id: MapId | None = None) -> Traffic:
         """What a map has cost on the wire, or all maps together if none is named."""
         query = (
-            "SELECT count(*), coalesce(sum(wire_bytes), 0) FROM change "
-            "WHERE kind = ? AND (? IS NULL OR (agent = ? AND epoch = ?))"
+            "SELECT count(*), CAST(coalesce(sum(wire_bytes), 0) AS BIGINT) FROM change "
+            "WHERE kind = ? AND (CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?))"
         )
         agent, epoch = map_id or (None, None)
         node_puts, node_bytes = self._read(query, (NodePut.__name__, agent, agent, epoch))[0]
         edge_puts, edge_bytes = self._read(query, (EdgePut.__name__, agent, agent, epoch))[0]
-        count = "SELECT count(*) FROM node WHERE ? IS NULL OR (agent = ? AND epoch = ?)"
+        count = "SELECT count(*) FROM node WHERE CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?)"
         nodes = self._read(count, (agent, agent, epoch))[0][0]
         return Traffic(nodes, node_puts, node_bytes, edge_puts, edge_bytes)
 
@@ -195,10 +206,11 @@ class SqlStore(Store):
         rows = self._read("SELECT value FROM result WHERE name = ?", (name,))
         return bytes(rows[0][0]) if rows else None
 
-    def _apply(self, run: Run) -> Applied | MapweaveError:
-        stored_id, watermark = self.log_id(run.map_id), self.watermark(run.map_id)
-        if stored_id is not None and stored_id != run.log_id and watermark > 0:
+    def _apply(self, run: Run, logs: dict[MapId, Position]) -> Applied | MapweaveError:
+        stored_id, watermark = logs.get(run.map_id, (run.log_id, 0))
+        if stored_id != run.log_id and watermark > 0:
             return name_taken(run.map_id)
+        before = watermark
         changes: list[Change] = []
         refusals: list[Refusal] = []
         for entry in run.entries:
@@ -210,19 +222,28 @@ class SqlStore(Store):
             watermark = entry.sequence
         watermark = max(watermark, run.covered or 0)
         self._put("log", (*run.map_id, str(run.log_id), watermark))
-        return Applied(tuple(changes), tuple(refusals), watermark)
+        logs[run.map_id] = Position(run.log_id, watermark)
+        return Applied(tuple(changes), tuple(refusals), watermark, before)
 
     def _record(self, table: str) -> list[bytes]:
         return [bytes(body) for (body,) in self._read(f"SELECT body FROM {table} ORDER BY number")]
 
     def _add_to_record(self, table: str, body: bytes, most: int) -> None:
         with self._transaction():
+            self._lock_table(table)
             count, newest = self._read(f"SELECT count(*), coalesce(max(number), 0) FROM {table}")[0]
             if count >= most:
                 raise InvalidValue(f"the record of {table.replace('_', ' ')}s is full: {most}")
             self._put(table, (newest + 1, body))
 
-    def _take(self, map_id: MapId, entry: Entry, changes: list[Change], refusals: list[Refusal]) -> None:
+    def _take(
+        self,
+        map_id: MapId,
+        entry: Entry,
+        changes: list[Change],
+        refusals: list[Refusal],
+        restored: bool = False,
+    ) -> None:
         """Store a change, or store it aside with the reason."""
         reason = entry.change if isinstance(entry.change, str) else self._objection(entry.change)
         if isinstance(entry.change, str) or reason:
@@ -232,9 +253,9 @@ class SqlStore(Store):
             self._put("refused", (*map_id, entry.sequence, reason, b"" if many else entry.message))
         else:
             changes.append(entry.change)
-            self._insert(entry, entry.change)
+            self._insert(entry, entry.change, restored)
 
-    def _insert(self, entry: Entry, change: Change) -> None:
+    def _insert(self, entry: Entry, change: Change, restored: bool) -> None:
         _, stamp_ns, body = unwrap_body(entry.message)
         kind, number = type(change.body).__name__, element_of(change.body).number
         values = (*change.map, entry.sequence, stamp_ns, kind, number, len(entry.message), body)
@@ -242,8 +263,8 @@ class SqlStore(Store):
         later = (
             "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND sequence > ? AND number = ? AND kind = ?"
         )
-        if isinstance(change.body, NodePut) and not self._read(
-            later, (*change.map, entry.sequence, number, kind)
+        if isinstance(change.body, NodePut) and not (
+            restored and self._read(later, (*change.map, entry.sequence, number, kind))
         ):
             self._put("node", (*change.map, number, len(change.body.node.landmarks)))
 

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
 from mapweave.mapserver.log.sql_store import SqlStore
-from mapweave.mapserver.log.store import ID, fresh_id
+from mapweave.mapserver.log.store import ID, Run, fresh_id
 from mapweave.storage.database import Database
 
 log = logging.getLogger(__name__)
@@ -29,6 +31,8 @@ ADVICE = (
 
 class SqliteStore(SqlStore):
     """All logs in one SQLite file, which belongs to one process."""
+
+    shared = False
 
     def __init__(self, path: Path) -> None:
         """Open the store, or make one. Rows that are damaged are taken out, see `damaged`.
@@ -62,6 +66,14 @@ class SqliteStore(SqlStore):
     def _transaction(self) -> Iterator[None]:
         with self._lock, self._database.transaction():
             yield
+
+    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
+        query = "SELECT log_id, watermark FROM log WHERE agent = ? AND epoch = ?"
+        found = ((map_id, self._read(query, map_id)) for map_id in {run.map_id for run in runs})
+        return {map_id: Position(int(rows[0][0]), rows[0][1]) for map_id, rows in found if rows}
+
+    def _lock_table(self, table: str) -> None:
+        """Nothing: the whole file is this process's."""
 
     def _write(self, query: str, values: Sequence[object]) -> None:
         self._database.connection.execute(query, values)

@@ -50,9 +50,11 @@ class Store(Protocol):
 
     Attributes:
         id: random, drawn when the store was made, see mapweave.wire.log_messages.Ack.
+        shared: whether other servers may write to it, too.
     """
 
     id: int
+    shared: bool
 
     def maps(self) -> list[MapId]:
         """All maps of which something is known."""

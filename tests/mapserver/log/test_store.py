@@ -1,9 +1,9 @@
-"""The store: exactly once, in order, and nothing that is half done."""
+"""Both stores: exactly once, in order, and nothing that is half done."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,13 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.opening import open_store
+from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Run, Store
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.log_messages import Refusal
+from tests.postgres import PostgresServer
 
 MAP, OTHER = MapId("r0", 1), MapId("r1", 1)
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)
@@ -50,14 +53,18 @@ def broken(sequence: int) -> Entry:
     return Entry.read(MAP, sequence, b"\xc1garbage")
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "s0.sqlite"
+@pytest.fixture(params=["sqlite", "postgres"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
+    """Where a store is made."""
+    if request.param == "sqlite":
+        return tmp_path / "s0.sqlite"
+    postgres: PostgresServer = request.getfixturevalue("postgres")
+    return postgres.database()
 
 
 @pytest.fixture
-def store(path: Path) -> Iterator[SqliteStore]:
-    store = SqliteStore(path)
+def store(place: Path | str) -> Iterator[Store]:
+    store = open_store(place)
     yield store
     store.close()
 
@@ -85,12 +92,14 @@ def test_an_answer_for_a_range_may_have_holes(store: Store) -> None:
     assert sequences(store) == [2, 5]
 
 
-def test_all_is_there_after_a_restart(path: Path) -> None:
-    store = SqliteStore(path)
+def test_all_is_there_after_a_restart(place: Path | str) -> None:
+    store = open_store(place)
+    store_id = store.id
     store.apply(MAP, 2**64 - 1, [entry(1, node_put(1, 3)), broken(2), entry(3)])
     store.apply(OTHER, 5, [])
     store.close()
-    store = SqliteStore(path)
+    store = open_store(place)
+    assert store.id == store_id
     assert store.maps() == [MAP, OTHER]
     assert (store.watermark(MAP), store.log_id(MAP)) == (3, 2**64 - 1)
     replayed = list(store.replay(MAP))
@@ -187,13 +196,31 @@ def test_any_input_makes_a_log(tmp_path_factory: pytest.TempPathFactory, batches
     store.close()
 
 
-def test_a_transaction_that_fails_leaves_nothing(store: SqliteStore) -> None:
-    store.apply(MAP, 5, [entry(1)])
-    # As if the disk were full at the third change of a batch.
-    store._database.connection.execute(
-        "CREATE TRIGGER full BEFORE INSERT ON change WHEN NEW.sequence = 4 "
-        "BEGIN SELECT RAISE(ABORT, 'database or disk is full'); END"
+def fill_the_disk(store: Store) -> Callable[[], None]:
+    """As if the disk were full at the fourth change of a log; returns what makes room."""
+    if isinstance(store, SqliteStore):
+        run = store._database.connection.execute
+        run(
+            "CREATE TRIGGER full BEFORE INSERT ON change WHEN NEW.sequence = 4 "
+            "BEGIN SELECT RAISE(ABORT, 'database or disk is full'); END"
+        )
+        return lambda: run("DROP TRIGGER full")
+    assert isinstance(store, PostgresStore)
+    rows = store._reader.connection
+    rows.execute(
+        "CREATE FUNCTION refuse() RETURNS trigger LANGUAGE plpgsql AS "
+        "$$ BEGIN RAISE disk_full USING MESSAGE = 'database or disk is full'; END $$"
     )
+    rows.execute(
+        "CREATE TRIGGER room BEFORE INSERT ON change FOR EACH ROW WHEN (NEW.sequence = 4) "
+        "EXECUTE FUNCTION refuse()"
+    )
+    return lambda: rows.execute("DROP TRIGGER room ON change")
+
+
+def test_a_transaction_that_fails_leaves_nothing(store: Store) -> None:
+    store.apply(MAP, 5, [entry(1)])
+    make_room = fill_the_disk(store)
     with pytest.raises(InvalidFile, match="disk is full"):
         store.apply(MAP, 5, [entry(2), broken(3), entry(4)])
     third = MapId("r2", 1)
@@ -201,7 +228,7 @@ def test_a_transaction_that_fails_leaves_nothing(store: SqliteStore) -> None:
     assert [(type(one), "disk is full" in str(one)) for one in results] == [(InvalidFile, True)] * 3
     assert (store.watermark(MAP), store.refused(), sequences(store)) == (1, 0, [1])
     assert store.maps() == [MAP], "nothing of the other runs either"
-    store._database.connection.execute("DROP TRIGGER full")
+    make_room()
     assert store.apply(MAP, 5, [entry(2), broken(3), entry(4)]).watermark == 4
 
 
