@@ -56,7 +56,11 @@ def words_of(refusal: Refusal) -> str:
 
 
 class Ingest:
-    """Keeps a store complete. One thread applies changes; a few more wait for agents' answers."""
+    """Keeps a store complete. One thread applies changes; a few more wait for agents' answers.
+
+    Attributes:
+        busy: whether what has come is being committed now.
+    """
 
     def __init__(
         self,
@@ -116,7 +120,7 @@ class Ingest:
         self._work: Inbox[Sample | Pulled | Piece] = Inbox()
         self._declared: list[Closing] = []
         self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
-        self._stopping, self._failure = False, ""
+        self._stopping, self.busy, self._failure = False, False, ""
         maps = self._store.maps()
         stored = (change for map_id in maps for change in self._store.replay(map_id))
         for map_id in maps:
@@ -182,7 +186,9 @@ class Ingest:
         while not self._stopping:
             now = time.monotonic()
             touched: dict[MapId, AgentLog] = {}
-            for robot, items in self._work.take(AT_ONE_TURN, self._pulls.due(now) - now):
+            turn = self._work.take(AT_ONE_TURN, self._pulls.due(now) - now)
+            self.busy = True
+            for robot, items in turn:
                 for item in items:
                     agent_log = self._take(robot, item)
                     if agent_log is not None:
@@ -194,6 +200,7 @@ class Ingest:
                     self._put_pulled(later)
                 self._pulls.note(agent_log, now)
             self._count(pulls=self._puller.start())
+            self.busy = False
 
     def _take(self, robot: str, item: Sample | Pulled | Piece) -> AgentLog | None:
         """Process one item of the inbox. Returns the log that may go on now."""
