@@ -49,6 +49,14 @@ def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML; the command line overrides it")
 
 
+def add_log_format(parser: argparse.ArgumentParser) -> None:
+    """How a process that runs on writes its log."""
+    parser.add_argument(
+        "--log-format", choices=["text", "json"], default="text",
+        help="lines of the log: words, or one JSON object each (default: text)",
+    )  # fmt: skip
+
+
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The settings file with the command line over it."""
     from mapweave.settings import load_settings

@@ -11,6 +11,7 @@ from typing import Any
 
 from mapweave.commands.map_input import SOURCES, map_source, opened
 from mapweave.commands.network import (
+    add_log_format,
     add_network,
     key_renewal,
     network_of,
@@ -59,6 +60,7 @@ def add_to(commands: Any) -> None:
         help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
         "0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip
+    add_log_format(parser)
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -77,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
-    log_with_time()
+    log_with_time(arguments.log_format)
     for part in ("mapweave.mapserver", "mapweave.wire"):
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
