@@ -38,6 +38,8 @@ INTERVAL = 10.0
 """Between two nodes of a robot, s."""
 REPORTS = 2.0
 """Status reports of a robot in a second, as `mapweave agent` sends them."""
+CONNECTING = 30.0
+"""Longest wait for a session, s."""
 PATIENCE = 60.0
 """Longest wait for acknowledgements behind the last change, s."""
 
@@ -105,6 +107,9 @@ class Agent:
         keys = Keys(FLEET)
         slow = orders.disturbance == "slow"
         self._bus = (MuteBus if slow else ZenohBus)(BusSettings(endpoints=(orders.endpoint,)))
+        # The sessions of a process share a few threads of Zenoh: opened all at once, some of them stay deaf.
+        if not self._bus.wait_connected(CONNECTING):
+            raise SystemExit(f"{name} does not get a connection")
         journal = SlowTimedJournal if slow else TimedJournal
         self.journal = journal(Path(orders.folder) / f"{name}.sqlite", name)
         self._map = self.journal.open_map(1)

@@ -21,7 +21,7 @@ SLOW = 1.0
 FLOOD = 1000.0
 """Changes a second of a flooding agent: twenty times its quota."""
 FREEZE_AFTER, THAW_BEFORE = 2.0, 1.0
-"""From the start of mapping until an agent is frozen, and from its waking up until the end, s."""
+"""From the start of mapping until an agent is frozen, and from when it goes on until the end, s."""
 
 
 class MuteBus(ZenohBus):
@@ -75,7 +75,7 @@ class Freeze:
     end: float
 
     def start(self) -> None:
-        """Freeze it later, and wake it up again, in a thread of its own."""
+        """Freeze it later, and let it go on again, in a thread of its own."""
         threading.Thread(target=self._run, name="freeze", daemon=True).start()
 
     def _run(self) -> None:

@@ -18,6 +18,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
 
 from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, MapweaveError
@@ -43,7 +44,7 @@ from mapweave.wire.log_messages import Head, Mark, Refusal
 log = logging.getLogger(__name__)
 
 AT_ONE_TURN = 64
-"""Messages that are processed, and committed together, before pieces of logs are asked for: some 30 ms."""
+"""Messages that are processed and committed together: some 30 ms."""
 QUOTA_PAUSE = 10.0
 """s after which a log is tried again that the robot's quota has no room for."""
 MOST_AHEAD = 10_000_000
@@ -108,14 +109,13 @@ class Ingest:
         self._quotas, self._unmerged = quotas or Quotas(clock=time.monotonic), unmerged
         self._on_change, self._note_refusal, self._observe_ack = on_change, note_refusal, observe_ack
         self._counters = IngestCounters()
-        self._settings = settings or IngestSettings()
+        self._settings = s = settings or IngestSettings()
         self._logs = KnownLogs()
         self._intakes = Intakes(store, self._quotas, retired)
         self._group = GroupCommit(store, self._intakes)
         self._acks = Acknowledgements(bus, keys, server_name, store, taken)
         self._pieces = Pieces()
-        timeout = self._settings.ask_timeout
-        self._puller = Puller(bus, keys, self._intakes, self._unmerged, timeout, self._put_pulled)
+        self._puller = Puller(bus, keys, self._intakes, unmerged, s.ask_timeout, self._put_pulled)
         self._pulls = self._puller.schedule
         self._work: Inbox[Sample | Pulled | Piece] = Inbox()
         self._declared: list[Closing] = []
@@ -148,8 +148,8 @@ class Ingest:
         ]
 
     def counters(self) -> IngestCounters:
-        """Counters since the start."""
-        return self._counters
+        """Counters since the start, from any thread."""
+        return replace(self._counters)
 
     def lags(self) -> dict[str, Lag]:
         """How far the store is behind each robot, by name; from any thread."""
@@ -199,7 +199,7 @@ class Ingest:
                 if later := self._pieces.end(agent_log, now):
                     self._put_pulled(later)
                 self._pulls.note(agent_log, now)
-            self._count(pulls=self._puller.start())
+            self._counters.add(pulls=self._puller.start())
             self.busy = False
 
     def _take(self, robot: str, item: Sample | Pulled | Piece) -> AgentLog | None:
@@ -213,7 +213,7 @@ class Ingest:
                 return self._take_change(item)
             return self._take_head(item)
         except InvalidMessage as error:
-            self._count(damaged=1)
+            self._counters.add(damaged=1)
             self._intakes.of(robot).spend(1, 0)
             damaged = self._counters.damaged
             # Each power of two: a flood must not become a flood of log lines.
@@ -222,7 +222,7 @@ class Ingest:
             return None
 
     def _take_change(self, sample: Sample) -> AgentLog | None:
-        self._count(messages=1, message_bytes=len(sample.payload))
+        self._counters.add(messages=1, message_bytes=len(sample.payload))
         map_id = self._keys.parse_change(sample.key)
         mark = Mark.decode(sample.attachment)
         agent_log = self._log(map_id, mark.log_id)
@@ -231,14 +231,14 @@ class Ingest:
         self._believe(agent_log, mark.sequence)
         intake = self._intakes.of(map_id.agent)
         if mark.sequence <= agent_log.watermark or mark.sequence in agent_log.ahead:
-            self._count(doubled=1)
+            self._counters.add(doubled=1)
             return agent_log
         if not intake.change(len(sample.payload), self._unmerged(map_id.agent)):
             return agent_log
         fits = len(sample.payload) <= MAX_CHANGE_BYTES
         entry = Entry.read(map_id, mark.sequence, sample.payload if fits else b"")
         if isinstance(entry.change, str):
-            self._count(damaged=1)
+            self._counters.add(damaged=1)
             log.info("%s %d came damaged (%s), pulling it", map_id, mark.sequence, entry.change)
         else:
             intake.keep_ahead_of(agent_log)
@@ -263,7 +263,7 @@ class Ingest:
     def _take_pulled(self, pulled: Pulled) -> AgentLog | None:
         agent_log, first = pulled.log, pulled.asked.first
         piece, damaged = pulled.piece()
-        self._count(pulled=len(piece.rows), damaged=damaged)
+        self._counters.add(pulled=len(piece.rows), damaged=damaged)
         self._intakes.of(agent_log.map.agent).spend(len(piece.rows), sum(len(row) for _, row in piece.rows))
         self._pulls.ends(agent_log.map.agent, answered=piece.covered >= first)
         if self._logs.get(agent_log.map) is not agent_log:
@@ -320,7 +320,7 @@ class Ingest:
             for refusal in result.refusals:
                 log.warning("refused %s %d: %s", run.log.map, refusal.sequence, refusal.reason)
                 self._note_refusal(run.log.map, words_of(refusal))
-            self._count(applied=len(result.changes), refused=len(result.refusals))
+            self._counters.add(applied=len(result.changes), refused=len(result.refusals))
             self._pass_on(result.changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.
         for run, received in settled:
@@ -340,7 +340,7 @@ class Ingest:
         self._failure = ""
         agent_log.damaged = self._store.damaged(agent_log.map)
         log.warning("changes %d to %d of %s are whole again", first, covered, agent_log.map)
-        self._count(restored=len(entries))
+        self._counters.add(restored=len(entries))
         self._pass_on(changes)
 
     def _log(self, map_id: MapId, log_id: int) -> AgentLog | None:
@@ -381,7 +381,7 @@ class Ingest:
 
     def _commit_failed(self, agent_log: AgentLog, error: MapweaveError) -> None:
         agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)
-        self._count(failures=1)
+        self._counters.add(failures=1)
         if str(error) != self._failure:
             log.error("%s", error)
         self._failure = str(error)
@@ -398,6 +398,3 @@ class Ingest:
     def _put_pulled(self, pulled: Pulled | Piece) -> None:
         """Something that was pulled waits for its robot's turn; from any thread."""
         self._work.put(pulled.log.map.agent, pulled, bounded=False)
-
-    def _count(self, **more: int) -> None:
-        self._counters = self._counters.plus(**more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -80,14 +81,14 @@ def test_a_run_that_cannot_be_stored_holds_up_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = SqliteStore(tmp_path / "s.sqlite")
-    insert = store._insert
+    put = store._put
 
-    def stumble(entry: Entry, change: object) -> None:
-        insert(entry, change)  # type: ignore[arg-type]
-        if getattr(change, "map", None) == MAPS[1]:
+    def stumble(table: str, values: Sequence[object]) -> None:
+        put(table, values)
+        if table == "change" and values[0] == MAPS[1].agent:
             raise OverflowError("Python int too large to convert to SQLite INTEGER")
 
-    monkeypatch.setattr(store, "_insert", stumble)
+    monkeypatch.setattr(store, "_put", stumble)
     results = group(store).commit([run(map_id, [1, 2]) for map_id in MAPS])
     assert [isinstance(result, Applied) for result in results] == [True, False, True, True]
     assert "OverflowError" in str(results[1]) and "r1" in str(results[1])
