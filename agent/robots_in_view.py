@@ -34,10 +34,15 @@ OLDEST = 3.0
 """A place that is older is no longer used, s."""
 SIGMAS = 2.0
 """A robot is expected within so many standard deviations of its position."""
+CARRIED = 1.0
+"""Speed of a robot that takes no commands, m/s: a person walks with it."""
 ABOVE = 0.05
 """What a body has above its camera, m: no robot says how high it is."""
 MOST_SHARE = 0.25
 """A region is not left out if by uncertainty alone it covers more of the image: the rest must do to map."""
+MOST_TOGETHER = 0.5
+"""Share of the image that all regions together may cover: the rest is used, however many robots a server says
+there are."""
 IN_FRONT = 3
 """So many landmarks of a region that are nearer than the robot, and most of it, show that something hides
 the robot."""
@@ -105,8 +110,8 @@ class RobotsInView:
         sigma = math.sqrt(max(here.covariance[0, 0], here.covariance[1, 1]))
         turn = math.sqrt(here.covariance[2, 2])
         self._asked = self._now, self._odom_from_robot
-        height = d.camera.mount_height + ABOVE
-        return WhoIsNear(NUMBER, starts, min(sigma, 100.0), min(turn, 4.0), d.radius, height, d.max_forward)
+        height, speed = d.camera.mount_height + ABOVE, d.max_forward or CARRIED
+        return WhoIsNear(NUMBER, starts, min(sigma, 100.0), min(turn, 4.0), d.radius, height, speed)
 
     def _take(self, answer: Answer, at: float, odom_then: Pose2) -> None:
         if not isinstance(answer.content, NearbyAnswer):
@@ -117,7 +122,7 @@ class RobotsInView:
         # Until then the nearest cannot have come within reach.
         waits = [
             (math.hypot(one.robot_from_other.x, one.robot_from_other.y) - REACH)
-            / max(one.speed + self.description.max_forward, 0.1)
+            / max(one.speed + (self.description.max_forward or CARRIED), 0.1)
             - one.age
             for one in robots
         ]
@@ -129,8 +134,13 @@ class RobotsInView:
             return np.zeros((0, 4))
         at, odom_then, robots = self._seen
         robot_from_then = self._odom_from_robot.inverse() @ odom_then
-        boxes = [self._region(robot_from_then, one, self._now - at, landmarks) for one in robots]
-        return np.array([box for box in boxes if box is not None]).reshape(-1, 4)
+        room = MOST_TOGETHER * self.description.camera.width * self.description.camera.height
+        boxes: list[Array] = []
+        for one in robots:
+            box = self._region(robot_from_then, one, self._now - at, landmarks)
+            if box is not None and (room := room - float(np.prod(box[2:] - box[:2]))) > 0.0:
+                boxes.append(box)
+        return np.array(boxes).reshape(-1, 4)
 
     def _region(
         self,

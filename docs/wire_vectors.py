@@ -279,7 +279,9 @@ def answers() -> dict[str, tuple[Any, ...]]:
     return {
         "server/s0/relocalize": (
             query.RelocalizeAnswer(query.Certainty.FOUND, (where,), "41 landmarks agree"),
-            query.RelocalizeAnswer(query.Certainty.UNKNOWN, (), "no place agrees", (similar,)),
+            query.RelocalizeAnswer(
+                query.Certainty.UNKNOWN, (), "no place agrees", (similar,), "1 of 4 shards did not answer"
+            ),
         ),
         "server/s0/route": (route, query.RouteAnswer(legs, "2 nodes"), query.RouteAnswer(legs, "", LIFT)),
         "server/s0/known": (query.KnownRequest(MAP, 1.25, -2.5, 8.5), query.KnownAnswer(views, "2 views")),

@@ -18,6 +18,7 @@ from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.merger_counters import MergerCounters
+from mapweave.mapserver.merging.node_comparisons import Compare, compare
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import Job, Schedule
@@ -48,6 +49,7 @@ class MergeWorker:
         merge: MergeSettings | None = None,
         keeper: VerificationCacheKeeper | None = None,
         history: MapHistory | None = None,
+        compare: Compare = compare,
         observe: Callable[[float], None] = lambda seconds: None,
     ) -> None:
         """Start with no map.
@@ -59,6 +61,7 @@ class MergeWorker:
             merge: how maps are merged.
             keeper: of the verification cache.
             history: records what joins and parts.
+            compare: compares nodes.
             observe: called with the time that a merge has taken, s.
         """
         self._schedule = schedule
@@ -66,7 +69,7 @@ class MergeWorker:
         self._history = history or MapHistory()
         self._observe = observe
         self._share = share
-        self._merger = Merger(places, merge)
+        self._merger = Merger(places, merge, compare)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False

@@ -17,6 +17,9 @@ MAP_SIGMA = 0.05
 """Standard deviation of a robot's map against another's in the merged map, m: of answers in simulated offices
 half are off by less than 0.015 m, and a tenth by more than 0.05 m. Of each pair the pose graph knows it, but
 that costs more than all the rest of the answer."""
+CELL = 16.0
+"""Side of the cells by which robots are found, m: what is not in a cell beside a robot's needs more than the 5
+s between two questions to come near, at 1 m/s each."""
 MOST_ROBOTS = 4096
 """Robots that are remembered: without keys, names cost nothing."""
 
@@ -36,6 +39,11 @@ class _Sighting(NamedTuple):
     pose: Pose2
     request: NearbyRequest
 
+    @property
+    def cell(self) -> tuple[NodeId, int, int]:
+        """Where it is found."""
+        return self.frame, math.floor(self.pose.x / CELL), math.floor(self.pose.y / CELL)
+
 
 class Nearby:
     """The last two places of each robot. Thread-safe."""
@@ -44,6 +52,7 @@ class Nearby:
         """No robot has asked."""
         self._turn = threading.Lock()
         self._seen: dict[str, tuple[_Sighting, ...]] = {}
+        self._cells: dict[tuple[NodeId, int, int], set[str]] = {}
 
     def ask(self, request: NearbyRequest, merged: MergedMap, now: float) -> NearbyAnswer:
         """Keep where a robot is, and say who is around it.
@@ -64,17 +73,34 @@ class Nearby:
         assert component is not None, "placed"
         here = _Sighting(now, merged.graphs[component].anchor, merged.pose(node) @ node_from_robot, request)
         with self._turn:
-            kept = self._seen.pop(request.robot, ())
+            others = self._others(here)
+            kept = self._forget(request.robot)
             if len(self._seen) >= MOST_ROBOTS:
-                del self._seen[next(iter(self._seen))]
+                self._forget(next(iter(self._seen)))
             self._seen[request.robot] = (*kept[-1:], here)
-            seen_of = {name: seen for name, seen in self._seen.items() if name != request.robot}
-            before = [[one for one in seen if one.at < now] for seen in seen_of.values()]
-        newest = [seen[-1] for seen in before if seen]
-        others = [one for one in newest if one.frame == here.frame and now - one.at <= KEPT]
+            self._cells.setdefault(here.cell, set()).add(request.robot)
         around = sorted(others, key=lambda other: (here.pose.distance(other.pose), other.request.robot))
         robots = tuple(_seen_from(here, other) for other in around[:MAX_NEARBY])
-        return NearbyAnswer(robots, "" if robots else "no other robot of this part of the map has asked")
+        return NearbyAnswer(robots, "" if robots else "no other robot of this part of the map is near")
+
+    def _others(self, here: _Sighting) -> list[_Sighting]:
+        """Where the robots of the cells around one were when they last asked before now."""
+        frame, i, j = here.cell
+        cells = ((frame, i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1))
+        names = {name for cell in cells for name in self._cells.get(cell, ())} - {here.request.robot}
+        before = [[one for one in self._seen[name] if one.at < here.at] for name in names]
+        newest = [seen[-1] for seen in before if seen]
+        return [one for one in newest if one.frame == frame and here.at - one.at <= KEPT]
+
+    def _forget(self, robot: str) -> tuple[_Sighting, ...]:
+        """Take a robot out; what was kept of it."""
+        seen = self._seen.pop(robot, ())
+        if seen:
+            cell = seen[-1].cell
+            self._cells[cell].discard(robot)
+            if not self._cells[cell]:
+                del self._cells[cell]
+        return seen
 
 
 def _seen_from(here: _Sighting, other: _Sighting) -> NearbyRobot:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import MapId, check_name
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.store import Store
@@ -48,6 +49,10 @@ class Acknowledgements:
 
     def _tell_newest(self, request: Request) -> None:
         _, agent = self._keys.parse_ack(request.key)
-        maps = (*self._store.maps(), *self._taken)
+        try:
+            maps = (*self._store.maps(), *self._taken)
+        except InvalidFile as error:
+            request.refuse(str(error))
+            return
         epochs = (known.epoch for known in maps if known.agent == agent)
         request.reply(NewestMap(max(epochs, default=0)).encode())

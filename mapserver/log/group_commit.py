@@ -49,7 +49,11 @@ class GroupCommit:
         self._store, self._intakes = store, intakes
 
     def fitting(self, run: NextRun) -> NextRun:
-        """What the robot's quota has room for of a run."""
+        """What the robot's quota has room for of a run.
+
+        Raises:
+            InvalidFile: the store cannot be read.
+        """
         fits, full = self._intakes.of(run.log.map.agent).fitting(run.entries)
         if not full:
             return run

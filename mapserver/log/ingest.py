@@ -25,7 +25,8 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, MapweaveError
 from mapweave.hybridmap.node import MapId, check_name
 from mapweave.mapserver.log.acknowledgements import Acknowledgements
 from mapweave.mapserver.log.agent_log import AgentLog
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import Entry, words_of
+from mapweave.mapserver.log.following import Follower, settled, unseen
 from mapweave.mapserver.log.group_commit import GroupCommit, NextRun
 from mapweave.mapserver.log.inbox import Inbox
 from mapweave.mapserver.log.ingest_counters import IngestCounters
@@ -34,12 +35,12 @@ from mapweave.mapserver.log.intake import Intakes
 from mapweave.mapserver.log.known_logs import KnownLogs, Lag
 from mapweave.mapserver.log.pulled import Piece, Pieces, Pulled
 from mapweave.mapserver.log.puller import Puller
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.store import News, Store
 from mapweave.mapserver.quotas import Quotas
 from mapweave.wire.bus import Bus, Closing, Sample
 from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.keys import Keys, robot_of
-from mapweave.wire.log_messages import Head, Mark, Refusal
+from mapweave.wire.log_messages import Head, Mark
 
 log = logging.getLogger(__name__)
 
@@ -49,11 +50,6 @@ QUOTA_PAUSE = 10.0
 """s after which a log is tried again that the robot's quota has no room for."""
 MOST_AHEAD = 10_000_000
 """Changes that a server may lack of a log: a robot makes about one a second, and a year has 3e7."""
-
-
-def words_of(refusal: Refusal) -> str:
-    """Which change is refused, and why."""
-    return f"change {refusal.sequence} is refused ({refusal.reason})"
 
 
 class Ingest:
@@ -117,12 +113,16 @@ class Ingest:
         self._pieces = Pieces()
         self._puller = Puller(bus, keys, self._intakes, unmerged, s.ask_timeout, self._put_pulled)
         self._pulls = self._puller.schedule
-        self._work: Inbox[Sample | Pulled | Piece] = Inbox()
+        self._work: Inbox[Sample | Pulled | Piece | News] = Inbox()
+        self._follower = Follower(
+            store, self._logs, self._intakes, self._pulls, s.pull, self._pass_on, note_refusal
+        )
         self._declared: list[Closing] = []
         self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
         self._stopping, self.busy, self._failure = False, False, ""
-        maps = self._store.maps()
-        stored = (change for map_id in maps for change in self._store.replay(map_id))
+        positions = self._store.positions()
+        maps = sorted(positions)
+        stored = (change for m in maps for change in settled(store, m, positions[m]))
         for map_id in maps:
             for refusal in self._store.refusals(map_id)[:1]:
                 self._note_refusal(map_id, words_of(refusal))
@@ -130,15 +130,9 @@ class Ingest:
             replay(stored)
         for change in stored:
             self._on_change(change)
-        for map_id in maps:
-            watermark, log_id = self._store.watermark(map_id), self._store.log_id(map_id) or 0
-            refusals = tuple(self._store.refusals(map_id))
-            agent_log = AgentLog(
-                map_id, log_id, self._settings.pull, watermark, watermark, refusals=refusals,
-                damaged=self._store.damaged(map_id),
-            )  # fmt: skip
-            self._logs.add(agent_log)
-            self._pulls.answers(map_id.agent)
+        self._logs.restore(store, positions, s.pull)
+        for agent_log in self._logs.values():
+            self._pulls.answers(agent_log.map.agent)
             self._pulls.note(agent_log, time.monotonic())
         self._thread.start()
         self._declared = [
@@ -165,6 +159,10 @@ class Ingest:
         """Why the disk does not take changes at present; empty if it does."""
         return self._failure
 
+    def follow(self, news: News) -> None:
+        """Pass on what other servers have written to the store; from any thread, in the ingest's own."""
+        self._work.put("", news, bounded=False)
+
     def close(self) -> None:
         """Stop listening; received changes are applied, missing ones will be pulled next time."""
         for declared in self._declared:
@@ -188,11 +186,9 @@ class Ingest:
             touched: dict[MapId, AgentLog] = {}
             turn = self._work.take(AT_ONE_TURN, self._pulls.due(now) - now)
             self.busy = True
-            for robot, items in turn:
-                for item in items:
-                    agent_log = self._take(robot, item)
-                    if agent_log is not None:
-                        touched[agent_log.map] = agent_log
+            for robot, item in [(robot, item) for robot, items in turn for item in items]:
+                if (agent_log := self._take(robot, item)) is not None:
+                    touched[agent_log.map] = agent_log
             self._settle([run for one in touched.values() if (run := self._next_run(one)) is not None])
             for agent_log in touched.values():
                 now = time.monotonic()
@@ -202,13 +198,16 @@ class Ingest:
             self._counters.add(pulls=self._puller.start())
             self.busy = False
 
-    def _take(self, robot: str, item: Sample | Pulled | Piece) -> AgentLog | None:
+    def _take(self, robot: str, item: Sample | Pulled | Piece | News) -> AgentLog | None:
         """Process one item of the inbox. Returns the log that may go on now."""
         try:
             if isinstance(item, Pulled):
                 return self._take_pulled(item)
             if isinstance(item, Piece):
                 return self._take_piece(item)
+            if isinstance(item, News):
+                self._follower.take(item)
+                return None
             if item.attachment:
                 return self._take_change(item)
             return self._take_head(item)
@@ -300,7 +299,11 @@ class Ingest:
             agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)
             self._acks.refuse(agent_log.map, agent_log.log_id, reason)
             return None
-        run = self._group.fitting(run)
+        try:
+            run = self._group.fitting(run)
+        except InvalidFile as error:
+            self._commit_failed(agent_log, error)
+            return None
         if run.full and not run.entries:
             self._rest(agent_log, run.full)
             return None
@@ -308,22 +311,26 @@ class Ingest:
 
     def _settle(self, runs: Sequence[NextRun]) -> None:
         """Commit, pass on, acknowledge: in this order."""
-        settled: list[tuple[NextRun, list[float]]] = []
+        done: list[tuple[NextRun, list[float]]] = []
         for run, result in zip(runs, self._group.commit(runs) if runs else [], strict=True):
-            if isinstance(result, MapweaveError):
+            try:
+                if isinstance(result, MapweaveError):
+                    raise result
+                changes = tuple(unseen(self._store, run.log, result))
+            except MapweaveError as error:
                 # Nothing is lost: it is not acknowledged, so the agent keeps it and it is pulled later.
-                self._commit_failed(run.log, result)
+                self._commit_failed(run.log, error)
                 continue
             self._failure = ""
-            settled.append((run, run.log.settled(result)))
+            done.append((run, run.log.settled(result)))
             self._pulls.answers(run.log.map.agent)
             for refusal in result.refusals:
                 log.warning("refused %s %d: %s", run.log.map, refusal.sequence, refusal.reason)
                 self._note_refusal(run.log.map, words_of(refusal))
             self._counters.add(applied=len(result.changes), refused=len(result.refusals))
-            self._pass_on(result.changes)
+            self._pass_on(changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.
-        for run, received in settled:
+        for run, received in done:
             self._acks.acknowledge(run.log)
             for at in received:
                 self._observe_ack(time.monotonic() - at)

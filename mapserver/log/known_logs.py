@@ -7,7 +7,9 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log.agent_log import AgentLog
+from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
+from mapweave.mapserver.log.entry import Position
+from mapweave.mapserver.log.store import Store
 
 MOST_UNKNOWN = 1024
 """Logs of which nothing has come but beacons; of more, the one that is silent longest is forgotten."""
@@ -44,6 +46,14 @@ class KnownLogs(Mapping[MapId, AgentLog]):
     def __len__(self) -> int:
         """How many."""
         return len(self._logs)
+
+    def restore(self, store: Store, positions: Mapping[MapId, Position], settings: PullSettings) -> None:
+        """Add those of a store, as far as they are settled."""
+        for map_id, (log_id, watermark) in sorted(positions.items()):
+            refusals, damaged = tuple(store.refusals(map_id)), store.damaged(map_id)
+            self.add(
+                AgentLog(map_id, log_id, settings, watermark, watermark, refusals=refusals, damaged=damaged)
+            )
 
     def add(self, agent_log: AgentLog) -> None:
         """Add a log, or put it in the place of another of the same name."""

@@ -95,6 +95,13 @@ def test_what_is_too_uncertain_aside_behind_or_far_leaves_the_image_as_it_is() -
     assert len(Eyes(other(1.5, 0.0), other(3.0, 1.0)).seen) == 2
 
 
+def test_half_of_the_image_is_left_whatever_a_server_says() -> None:
+    claimed = [other(2.0, -1.0 + 0.125 * k, 0.05) for k in range(16)]
+    regions = Eyes(*claimed).seen
+    area = float(np.prod(regions[:, 2:] - regions[:, :2], axis=1).sum())
+    assert 1 < len(regions) < 16 and area < 0.5 * CAMERA.width * CAMERA.height
+
+
 def test_the_region_goes_with_the_robots_own_motion() -> None:
     turned = Eyes(other(2.0, 0.0, speed=0.0))
     (box,) = turned.step(0.1, Odometry(0.0, math.radians(10.0)))

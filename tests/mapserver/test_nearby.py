@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
-from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
+from mapweave.hybridmap.nearby import MAX_NEARBY, NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.nearby import KEPT, MAP_SIGMA, Nearby
+from mapweave.mapserver.nearby import CELL, KEPT, MAP_SIGMA, Nearby
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from tests.agent.scripted_fleet import bare
 
@@ -68,6 +68,27 @@ def test_maps_that_are_not_joined_and_what_is_old_give_nothing(merged: MergedMap
     assert [one.robot for one in nearby.ask(request("r0", 0, Pose2()), merged, KEPT + 0.5).robots] == ["r3"]
     lost = NearbyRequest("r4", ((NodeId("z", 1, 1), Pose2()),), 0.0, 0.0, 0.1, 0.1, 0.1)
     assert "merged map yet" in nearby.ask(lost, merged, 2.0).reason
+
+
+def test_near_robots_are_those_that_a_search_of_all_finds(merged: MergedMap) -> None:
+    """Over the cells' borders, after moves, and with more robots than are remembered."""
+    random, nearby, at = np.random.default_rng(0), Nearby(), dict[str, Pose2]()
+    for tick in range(400):
+        robot, pose = f"r{random.integers(60)}", Pose2(*random.uniform(-40, 40, 2).tolist(), 0.0)
+        answer = nearby.ask(request(robot, 0, pose), merged, 0.01 * tick)
+        at.pop(robot, None)
+        near = sorted(at, key=lambda name: (pose.distance(at[name]), name))
+        expected = [name for name in near if pose.distance(at[name]) < CELL][:MAX_NEARBY]
+        assert [one.robot for one in answer.robots][: len(expected)] == expected
+        at[robot] = pose
+
+
+def test_robots_without_end_are_not_remembered(merged: MergedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapweave.mapserver.nearby.MOST_ROBOTS", 5)
+    nearby = Nearby()
+    for k in range(40):
+        answer = nearby.ask(request(f"r{k}", 0, Pose2(0.1 * k)), merged, 0.1 * k)
+        assert [one.robot for one in answer.robots] == [f"r{n}" for n in range(k - 1, max(k - 6, -1), -1)]
 
 
 def test_the_order_of_those_that_ask_at_once_changes_no_answer(merged: MergedMap) -> None:
