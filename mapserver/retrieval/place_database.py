@@ -54,8 +54,12 @@ class NodeIndex(Protocol):
         """Whether a node is in the index."""
         ...
 
+    def announce(self, node: Node) -> None:
+        """Add a node, or replace it; any thread may do so, and a search does not hold it up."""
+        ...
+
     def add(self, node: Node) -> None:
-        """Add a node, or replace it; any thread may do so."""
+        """Add a node, or replace it."""
         ...
 
     def extend(self, nodes: Iterable[Node]) -> None:
@@ -141,7 +145,7 @@ class PlaceDatabase:
     # Update.
 
     def announce(self, node: Node) -> None:
-        """Let a node be found before it is put; any thread may do so, and waits for nothing."""
+        """Let a node be found before it is put; any thread may do so, and no search holds it up."""
         self._index.announce(node)
 
     def observe(self, node: Node) -> None:

@@ -175,7 +175,7 @@ class PlaceIndex:
         Args:
             codes: (N, 32) of the features.
         """
-        with self._lock:
+        with self._current():
             if len(codes) == 0 or len(self._landmarks) == 0:
                 empty = np.zeros((len(codes), 0))
                 return NearestLandmarks(empty.astype(np.float32), empty.astype(np.int64), ())
