@@ -10,7 +10,7 @@ is. Journals lie in memory, as they are other machines' disks; the server's stor
 
 With `--disturb` three more agents hold the server up as well as they can: a slow one, none of whose changes
 comes by itself and whose log takes a second to answer, one that is frozen in the middle, and one that sends a
-thousand changes a second. The figures are those of the others.
+thousand changes and beacons a second. The figures are those of the others.
 
 By number of agents: `connected_s` until all have handed over their first node; `acked_per_s`; `ack_p50_ms`
 and `ack_p99_ms` from handing a change over to the journal's note that the server has it; `burst_p99_ms` and
@@ -44,7 +44,7 @@ from rich.table import Table
 
 from benchmarks.fleet import floor_process
 from benchmarks.fleet.agents_process import FLEET, INTERVAL, PATIENCE, Orders
-from benchmarks.fleet.disturbance import KINDS, Freeze
+from benchmarks.fleet.disturbance import KINDS, THAW_BEFORE, Freeze
 from benchmarks.fleet.drives import drive, name_of
 from benchmarks.fleet.process_usage import cpu_seconds, resident_mb, total
 from mapweave.hybridmap.agent_status import FleetStatus
@@ -168,15 +168,17 @@ def measure_fleet(
         server, pids = children.pid("server"), [generator.pid for generator in generators]
         time.sleep(max(0.0, begin - time.monotonic()))
         before = (*cpu_seconds(server), total(pids))
+        words: dict[str, str] = {}
         while time.monotonic() < end:
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
             progress.update(step, completed=time.monotonic() - begin)
+            if disturbers and not words and time.monotonic() > end - 2 * THAW_BEFORE:
+                words = shown(bus)
         took = time.monotonic() - begin
         own, zenoh, generated = (
             (b - a) / took for a, b in zip(before, (*cpu_seconds(server), total(pids)), strict=True)
         )
         rss = resident_mb(server)
-        words = held_back(bus)
         asking.join()
         progress.update(step, description=f"{agents} agents wait for acknowledgements", total=None)
         results = [json.loads(generator.line()) for generator in generators]
@@ -210,13 +212,14 @@ def measure_fleet(
     return figures, {}
 
 
-def held_back(bus: ZenohBus) -> dict[str, str]:
-    """What the server says of robots that are over their quotas, as `mapweave status` shows it."""
+def shown(bus: ZenohBus) -> dict[str, str]:
+    """What the server says of robots that are behind or over their quotas, as `mapweave status` shows it."""
+    words = {}
     for reply in bus.ask(Keys(FLEET).any_robots(), b"", 10.0):
-        if not reply.error:
-            entries = decode(reply.payload, FleetStatus).robots
-            return {entry.robot: entry.over_quota for entry in entries if entry.over_quota}
-    return {}
+        for entry in () if reply.error else decode(reply.payload, FleetStatus).robots:
+            behind = f"{entry.missing} changes missing for {entry.lag:.1f} s" if entry.missing else ""
+            words[entry.robot] = ", ".join(filter(None, (behind, entry.over_quota)))
+    return words
 
 
 def milliseconds(times: np.ndarray, percent: float) -> float:

@@ -12,14 +12,14 @@ from typing import Protocol
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.node import MapId
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import Mark
+from mapweave.wire.log_messages import Head, Mark
 from mapweave.wire.zenoh_bus import ZenohBus
 
 KINDS = ("slow", "frozen", "flooding")
 SLOW = 1.0
 """Of a slow agent to answer a question for its log, s. None of its changes comes by itself."""
 FLOOD = 1000.0
-"""Changes a second of a flooding agent: twenty times its quota."""
+"""Changes a second of a flooding agent, and as many beacons: twenty times its quota of each."""
 FREEZE_AFTER, THAW_BEFORE = 2.0, 1.0
 """From the start of mapping until an agent is frozen, and from when it goes on until the end, s."""
 
@@ -42,22 +42,22 @@ class SlowJournal(Journal):
         return super().rows(map_id, first, last)
 
 
-def flood(bus: ZenohBus, keys: Keys, journal: Journal, map_id: MapId, until: float) -> threading.Thread:
-    """Publish the newest change of a map again and again, in a thread of its own."""
+def flood(bus: ZenohBus, keys: Keys, journal: Journal, map_id: MapId, until: float) -> None:
+    """Publish the newest change of a map and its beacon again and again, in a thread of its own."""
     log_id = journal.log_id(map_id)
 
     def publish() -> None:
         began, count = time.monotonic(), 0
         while time.monotonic() < until:
             ((sequence, change),) = journal.rows(map_id, journal.head(map_id), journal.head(map_id))
+            beacon = Head(log_id, sequence, {}).encode()
             for _ in range(int((time.monotonic() - began) * FLOOD) - count):
                 bus.publish(keys.change(map_id), change, Mark(sequence, log_id).encode())
+                bus.publish(keys.head(map_id), beacon)
                 count += 1
             time.sleep(0.02)
 
-    thread = threading.Thread(target=publish, name="flood", daemon=True)
-    thread.start()
-    return thread
+    threading.Thread(target=publish, name="flood", daemon=True).start()
 
 
 class Process(Protocol):
