@@ -114,10 +114,7 @@ class MergeWorker:
         self._schedule.observe(change.stamp_ns)
         if isinstance(change.body, NodePut):
             self._fresh[change.body.node.id] = change.body.node
-            try:
-                self._merger.places.announce(change.body.node)
-            except Exception:  # it is tried once more when its turn comes
-                log.exception("change %s of %s cannot be found yet", change.sequence, change.map)
+            self._merger.places.announce(change.body.node)
         with self._counting:
             self._waiting.put(change.map.agent, change, bounded=False)
         self._post(self._take_next)

@@ -19,8 +19,8 @@ from prometheus_client.registry import Collector
 
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
-from mapweave.mapserver.log.ingest import Lag
 from mapweave.mapserver.log.ingest_counters import IngestCounters
+from mapweave.mapserver.log.known_logs import Lag
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.roster import NO_LAG, Presence
 

@@ -17,7 +17,7 @@ from mapweave.hybridmap.agent_status import (
 )
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.ingest import Lag
+from mapweave.mapserver.log.known_logs import Lag
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
 from mapweave.merge.explanation.map_standing import MapStanding, map_standings

@@ -24,6 +24,10 @@ IdleJob = Callable[[], float | None]
 """Does a piece of work that can wait. Returns how long to pause, s; None: nothing is left to do."""
 QUIET = 0.02
 """Idle work begins when nothing was posted for so long, s: a burst is taken in as a whole."""
+GIVEN_WAY = 0.02
+"""Longest wait of a job for what is more urgent, s: jobs take 4 ms, so a sixth of their speed is left."""
+GLANCE = 0.002
+"""Time between two looks whether it goes on, s."""
 OVERDUE = 2.0
 """Idle work that could not begin for so long since jobs kept coming goes before them, s."""
 
@@ -66,6 +70,10 @@ class Schedule(Protocol):
         """Called before a question is answered: in lock-step all that was posted is done first."""
         ...
 
+    def give_way(self, busy: Callable[[], bool]) -> None:
+        """Hold the background's work back as long as something more urgent goes on, a little for each job."""
+        ...
+
     def start(self) -> None:
         """Start. Idempotent."""
         ...
@@ -91,6 +99,7 @@ class LiveSchedule:
         self._jobs: deque[Job] = deque()
         self._idle: IdleJob | None = None
         self._idle_wanted = False
+        self._busy: Callable[[], bool] = lambda: False
         self._rest_until = self._quiet_at = self._waiting_since = -math.inf
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="background", daemon=True)
@@ -136,6 +145,10 @@ class LiveSchedule:
     def catch_up(self) -> None:
         """Nothing: questions are answered from the last merged map, and merging goes on in parallel."""
 
+    def give_way(self, busy: Callable[[], bool]) -> None:
+        """The background's thread takes the interpreter from all others: it sleeps meanwhile."""
+        self._busy = busy
+
     def start(self) -> None:
         """Start the threads."""
         if not self._thread.is_alive() and not self._closing.is_set():
@@ -154,6 +167,9 @@ class LiveSchedule:
 
     def _work(self) -> None:
         while (step := self._next()) is not None:
+            end = time.monotonic() + GIVEN_WAY
+            while self._busy() and time.monotonic() < end and not self._closing.is_set():
+                time.sleep(GLANCE)
             _run(step)
 
     def _next(self) -> Job | None:
@@ -257,6 +273,9 @@ class LockstepSchedule:
                 if job.due <= self.monotonic():
                     job.due = self.monotonic() + job.period
                     _run(job.job)
+
+    def give_way(self, busy: Callable[[], bool]) -> None:
+        """Nothing: work runs when it is its turn."""
 
     def start(self) -> None:
         """Nothing: work runs with the next question."""

@@ -160,6 +160,7 @@ class MapServer:
             self._quotas, lambda: self._constraints.constraints.retired, worker.unmerged, worker.note_refusal,
             self._metrics.acknowledged,
         )  # fmt: skip
+        clock.give_way(lambda: self._ingest.busy)
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,
             lambda: self._annotations.annotations, self._path, base.images,

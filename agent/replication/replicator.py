@@ -33,7 +33,7 @@ class ReplicationSettings:
     """How changes are carried.
 
     Attributes:
-        beacon_interval: between two beacons of a map of which servers lack something, s.
+        beacon_interval: from a change to the beacon of a map of which servers lack something, s.
         answer_bytes: a log answer ends after so many bytes, since a link may be slow.
         retry_interval: after a failed commit (disk full), s.
     """
@@ -67,7 +67,11 @@ class ReplicationStatus:
 
 
 SETTLED_BEACONS = 20
-"""Of so many beacons, a map that servers have sends one: a server that is new, or has lost it, learns so."""
+"""In the time of so many beacons, a map that servers have sends one: a server that is new, or has lost it,
+learns so."""
+RAREST = 4
+"""A beacon on which nothing follows is sent again after twice the time, up to so many times the interval: the
+beacons of a fleet that a server cannot keep up with must not hold it up further."""
 
 
 class Replicator:
@@ -113,7 +117,8 @@ class Replicator:
         # Only the thread touches these.
         self._pending: list[Draft] = []
         self._retry_at = 0.0
-        self._beacons = 0
+        self._pause = self._settings.beacon_interval
+        self._next_beacon = self._everyone_at = 0.0
         for m in self._logs:
             journal.prune(m, self._servers)
         self._work: queue.SimpleQueue[list[Draft] | Sample | Request | bool | None] = queue.SimpleQueue()
@@ -193,12 +198,11 @@ class Replicator:
         return sum(state.unsettled(self._servers) for state in self._logs.values())
 
     def _run(self) -> None:
-        next_beacon = time.monotonic()
         stop = False
         while not stop:
             questions: list[Request] = []
             try:
-                item = self._work.get(timeout=max(0.0, self._next_turn(next_beacon) - time.monotonic()))
+                item = self._work.get(timeout=max(0.0, self._next_turn() - time.monotonic()))
                 while True:
                     if item is None:
                         stop = True
@@ -208,7 +212,8 @@ class Replicator:
                         self._take_ack(item)
                     elif isinstance(item, bool):
                         # A server that has come may have lost its store, or be new.
-                        self._beacons, next_beacon = 0, min(next_beacon, time.monotonic())
+                        self._everyone_at = 0.0
+                        self._beacon_after(0.0)
                     else:
                         questions.append(item)
                     item = self._work.get_nowait()
@@ -219,9 +224,8 @@ class Replicator:
                 self._commit()
             for question in questions:
                 self._answer(question)
-            if now >= next_beacon:
-                self._send_beacons()
-                next_beacon = now + self._settings.beacon_interval
+            if now >= self._next_beacon:
+                self._send_beacons(now)
         if self._pending:
             log.error("%s: %d changes never reached the disk", self._map, len(self._pending))
 
@@ -230,8 +234,13 @@ class Replicator:
         if alive:
             self._work.put(True)
 
-    def _next_turn(self, next_beacon: float) -> float:
-        return min(next_beacon, self._retry_at) if self._pending else next_beacon
+    def _next_turn(self) -> float:
+        return min(self._next_beacon, self._retry_at) if self._pending else self._next_beacon
+
+    def _beacon_after(self, seconds: float) -> None:
+        """Something has happened: the next beacon comes so soon, and those behind it at the usual times."""
+        self._pause = self._settings.beacon_interval
+        self._next_beacon = min(self._next_beacon, time.monotonic() + seconds)
 
     def _commit(self) -> None:
         """Disk first, then the network: a change that was sent is safe."""
@@ -256,16 +265,25 @@ class Replicator:
             self._changed.notify_all()
         for sequence, change in encoded:
             self._bus.publish(self._keys.change(self._map), change, self._mark(sequence))
+        self._beacon_after(self._settings.beacon_interval)
 
     def _mark(self, sequence: int) -> bytes:
         return Mark(sequence, self._current.log_id).encode()
 
-    def _send_beacons(self) -> None:
-        everyone = self._beacons % SETTLED_BEACONS == 0
-        self._beacons += 1
+    def _send_beacons(self, now: float) -> None:
+        everyone = now >= self._everyone_at
+        if everyone:
+            self._everyone_at = now + SETTLED_BEACONS * self._settings.beacon_interval
+        unsettled = False
         for state in self._logs.values():
-            if everyone or state.unsettled(self._servers):
+            lacking = state.unsettled(self._servers) > 0
+            unsettled |= lacking
+            if everyone or lacking:
                 self._bus.publish(self._keys.head(state.map), state.head().encode())
+        self._next_beacon = self._everyone_at
+        if unsettled:
+            self._next_beacon = min(now + self._pause, self._next_beacon)
+            self._pause = min(2 * self._pause, RAREST * self._settings.beacon_interval)
 
     def _take_ack(self, sample: Sample) -> None:
         try:
@@ -304,6 +322,8 @@ class Replicator:
             }
             self._last_ack = time.monotonic()
             self._changed.notify_all()
+        if state.unsettled(self._servers):
+            self._beacon_after(self._settings.beacon_interval)
 
     def _sharing(self, server: str, ack: Ack) -> list[str]:
         """Other servers with the same store: what one acknowledges, all of them have.

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.fleet.disturbance import MuteBus, SlowJournal, flood
 from benchmarks.fleet.drives import drive, name_of
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
@@ -37,6 +38,8 @@ INTERVAL = 10.0
 """Between two nodes of a robot, s."""
 REPORTS = 2.0
 """Status reports of a robot in a second, as `mapweave agent` sends them."""
+CONNECTING = 30.0
+"""Longest wait for a session, s."""
 PATIENCE = 60.0
 """Longest wait for acknowledgements behind the last change, s."""
 
@@ -54,6 +57,7 @@ class Orders:
         seconds: of mapping at a node each `INTERVAL`.
         burst: changes of the whole fleet within the second behind that.
         seed: of the drives.
+        disturbance: what its agents do to the server, one of `KINDS`; empty: nothing.
     """
 
     endpoint: str
@@ -64,6 +68,7 @@ class Orders:
     seconds: float
     burst: int
     seed: int
+    disturbance: str = ""
 
 
 class TimedJournal(Journal):
@@ -84,6 +89,10 @@ class TimedJournal(Journal):
         self.noted += [time.monotonic()] * (watermark - len(self.noted))
 
 
+class SlowTimedJournal(TimedJournal, SlowJournal):
+    """The same, on a slow disk."""
+
+
 class Agent:
     """One robot's link.
 
@@ -96,8 +105,13 @@ class Agent:
         """Connect, and open the journal."""
         name = name_of(number)
         keys = Keys(FLEET)
-        self._bus = ZenohBus(BusSettings(endpoints=(orders.endpoint,)))
-        self.journal = TimedJournal(Path(orders.folder) / f"{name}.sqlite", name)
+        slow = orders.disturbance == "slow"
+        self._bus = (MuteBus if slow else ZenohBus)(BusSettings(endpoints=(orders.endpoint,)))
+        # The sessions of a process share a few threads of Zenoh: opened all at once, some of them stay deaf.
+        if not self._bus.wait_connected(CONNECTING):
+            raise SystemExit(f"{name} does not get a connection")
+        journal = SlowTimedJournal if slow else TimedJournal
+        self.journal = journal(Path(orders.folder) / f"{name}.sqlite", name)
         self._map = self.journal.open_map(1)
         self._replicator = Replicator(self._bus, keys, self.journal, self._map, (SERVER,))
         self._client = FleetClient(self._bus, keys, self._map, MissionControl(name))
@@ -122,6 +136,10 @@ class Agent:
         """From handing over to the noted acknowledgement, s, of what was handed over then; inf without."""
         noted = [*self.journal.noted, *[float("inf")] * len(self.submitted)]
         return [b - a for a, b in zip(self.submitted, noted, strict=False) if begin <= a < end]
+
+    def flood(self, until: float) -> None:
+        """Send more than it may."""
+        flood(self._bus, Keys(FLEET), self.journal, self._map, until)
 
     def close(self) -> None:
         """Disconnect."""
@@ -170,6 +188,8 @@ def main() -> None:
     wait_until_acknowledged(agents)
     print("ready", flush=True)
     begin = float(sys.stdin.readline())
+    if orders.disturbance == "flooding":
+        agents[0].flood(begin + orders.seconds)
     run_schedule(agents, orders, begin)
     end = begin + orders.seconds
     wait_until_acknowledged(agents)

@@ -1,6 +1,6 @@
 """How many robots one map server carries: what acknowledgements and answers take, and what that costs.
 
-    python -m benchmarks.fleet [--agents N ...] [--seconds S] [--burst N] [--seed N] [--json]
+    python -m benchmarks.fleet [--agents N ...] [--seconds S] [--burst N] [--disturb] [--seed N] [--json]
 
 A real `mapweave server` process with its router, over Zenoh on loopback. Each agent has a session, journal,
 replicator and fleet client of its own, as on a robot; a process holds up to 125 of them. Each agent maps a
@@ -8,10 +8,16 @@ room of its own: a node of 150 landmarks and its edge every 10 s, and two status
 comes a burst: so many changes within one second. Meanwhile one more session asks five times a second where it
 is. Journals lie in memory, as they are other machines' disks; the server's store is on this machine's disk.
 
-By number of agents: `acked_per_s`; `ack_p50_ms` and `ack_p99_ms` from handing a change over to the journal's
-note that the server has it; `burst_p99_ms` and `burst_s`, until all of the burst is acknowledged;
-`relocalize_p95_ms`; `unacked` changes at the end. Of one core: `server_cpu`, `router_cpu` (Zenoh's threads in
-the server's process) and `generator_cpu` (all agents). `floor_*` is a bare Zenoh question, answered after a
+With `--disturb` three more agents hold the server up as well as they can: a slow one, none of whose changes
+comes by itself and whose log takes a second to answer, one that is frozen in the middle, and one that sends a
+thousand changes and beacons a second. The figures are those of the others.
+
+By number of agents: `connected_s` until all have handed over their first node; `acked_per_s`; `ack_p50_ms`
+and `ack_p99_ms` from handing a change over to the journal's note that the server has it; `burst_p99_ms` and
+`burst_s`, until all of the burst is acknowledged; `relocalize_p95_ms`; `unacked` changes at the end. Of one
+core: `server_cpu`, `router_cpu` (Zenoh's threads in the server's process) and `generator_cpu` (all agents).
+`disturbers_unacked` are changes of the agents that disturb, at the end, when what was held back or frozen has
+been sent again; `said` is what the server says of each. `floor_*` is a bare Zenoh question, answered after a
 bare commit of SQLite, in the same run on a router of its own.
 """
 
@@ -27,8 +33,9 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -37,14 +44,16 @@ from rich.table import Table
 
 from benchmarks.fleet import floor_process
 from benchmarks.fleet.agents_process import FLEET, INTERVAL, PATIENCE, Orders
-from benchmarks.fleet.drives import drive
+from benchmarks.fleet.disturbance import KINDS, THAW_BEFORE, Freeze
+from benchmarks.fleet.drives import drive, name_of
 from benchmarks.fleet.process_usage import cpu_seconds, resident_mb, total
+from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.query import View
 from mapweave.processes import parent_watchdog
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
-from mapweave.wire.messages import encode_view
+from mapweave.wire.messages import decode, encode_view
 from mapweave.wire.zenoh_bus import ZenohBus
 
 AGENTS_PER_PROCESS = 125
@@ -52,7 +61,7 @@ QUESTIONS_PER_S = 5.0
 CONNECTING = 300.0
 """Longest wait until all agents are connected and have handed over their first node, s."""
 ASKED = {"ack_p99_ms": 500.0, "relocalize_p95_ms": 250.0}
-"""Of 1000 agents, at most."""
+"""At most, of the largest fleet."""
 
 Figures = dict[str, float]
 
@@ -109,8 +118,10 @@ def ask(bus: ZenohBus, views: Sequence[View], begin: float, end: float) -> tuple
     return took, lost
 
 
-def measure_fleet(agents: int, options: argparse.Namespace, folder: Path, progress: Progress) -> Figures:
-    """Start a server and so many agents, and let them map."""
+def measure_fleet(
+    agents: int, options: argparse.Namespace, folder: Path, progress: Progress
+) -> tuple[Figures, dict[str, str]]:
+    """Start a server and so many agents, and let them map; also what it says of those that disturb."""
     step = progress.add_task(f"{agents} agents connect", total=None)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     folder.mkdir()
@@ -125,24 +136,31 @@ def measure_fleet(agents: int, options: argparse.Namespace, folder: Path, progre
         if not bus.wait_connected(60.0):
             raise SystemExit("the server does not listen")
         generators = []
+        everyone = Orders(endpoint, journals, 0, agents, agents, options.seconds, options.burst, options.seed)
         for first in range(0, agents, AGENTS_PER_PROCESS):
             count = min(AGENTS_PER_PROCESS, agents - first)
-            orders = Orders(
-                endpoint, journals, first, count, agents, options.seconds, options.burst, options.seed
-            )
-            generators.append(Generator(orders))
+            generators.append(Generator(replace(everyone, first=first, count=count)))
             stack.callback(generators[-1].close)
-        connecting = threading.Timer(CONNECTING, end_all, (generators,))
+        disturbers = {}
+        for number, kind in enumerate(KINDS if options.disturb else (), agents):
+            orders = replace(everyone, first=number, count=1, disturbance=kind)
+            disturbers[kind] = Generator(orders)
+            stack.callback(disturbers[kind].close)
+        began = time.monotonic()
+        connecting = threading.Timer(CONNECTING, end_all, ([*generators, *disturbers.values()],))
         connecting.start()
-        for generator in generators:
+        for generator in (*generators, *disturbers.values()):
             generator.line()
         connecting.cancel()
+        connected = time.monotonic() - began
         children.check()
         views = [drive(k, 1, options.seed).view for k in range(min(agents, 20))]
         begin = time.monotonic() + 1.0
         end = begin + options.seconds
-        for generator in generators:
+        for generator in (*generators, *disturbers.values()):
             generator.start(begin)
+        if "frozen" in disturbers:
+            Freeze(disturbers["frozen"], begin, end).start()
         progress.update(step, description=f"{agents} agents map", total=options.seconds + 1.0)
         asked: list[tuple[list[float], int]] = []
         asking = threading.Thread(target=lambda: asked.append(ask(bus, views, begin, end + 1.0)))
@@ -150,9 +168,12 @@ def measure_fleet(agents: int, options: argparse.Namespace, folder: Path, progre
         server, pids = children.pid("server"), [generator.pid for generator in generators]
         time.sleep(max(0.0, begin - time.monotonic()))
         before = (*cpu_seconds(server), total(pids))
+        words: dict[str, str] = {}
         while time.monotonic() < end:
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
             progress.update(step, completed=time.monotonic() - begin)
+            if disturbers and not words and time.monotonic() > end - 2 * THAW_BEFORE:
+                words = shown(bus)
         took = time.monotonic() - begin
         own, zenoh, generated = (
             (b - a) / took for a, b in zip(before, (*cpu_seconds(server), total(pids)), strict=True)
@@ -161,12 +182,14 @@ def measure_fleet(agents: int, options: argparse.Namespace, folder: Path, progre
         asking.join()
         progress.update(step, description=f"{agents} agents wait for acknowledgements", total=None)
         results = [json.loads(generator.line()) for generator in generators]
+        disturbed = {kind: json.loads(disturber.line()) for kind, disturber in disturbers.items()}
         children.check()
         progress.update(step, description=f"{agents} agents", total=1, completed=1)
     steady = np.array([x for result in results for x in result["steady"]])
     burst = np.array([x for result in results for x in result["burst"]])
     (answers, unanswered), *_ = asked
-    return {
+    figures = {
+        "connected_s": round(connected, 1),
         "acked_per_s": round(float(np.isfinite(steady).sum()) / options.seconds, 1),
         "ack_p50_ms": milliseconds(steady, 50),
         "ack_p99_ms": milliseconds(steady, 99),
@@ -181,6 +204,22 @@ def measure_fleet(agents: int, options: argparse.Namespace, folder: Path, progre
         "generator_cpu": round(generated, 3),
         "server_rss_mb": round(rss),
     }  # fmt: skip
+    if disturbers:
+        unacked = [x for result in disturbed.values() for x in (*result["steady"], *result["burst"])]
+        figures["disturbers_unacked"] = sum(x == float("inf") for x in unacked)
+        said = {kind: words.get(name_of(number), "") for number, kind in enumerate(KINDS, agents)}
+        return figures, said
+    return figures, {}
+
+
+def shown(bus: ZenohBus) -> dict[str, str]:
+    """What the server says of robots that are behind or over their quotas, as `mapweave status` shows it."""
+    words = {}
+    for reply in bus.ask(Keys(FLEET).any_robots(), b"", 10.0):
+        for entry in () if reply.error else decode(reply.payload, FleetStatus).robots:
+            behind = f"{entry.missing} changes missing for {entry.lag:.1f} s" if entry.missing else ""
+            words[entry.robot] = ", ".join(filter(None, (behind, entry.over_quota)))
+    return words
 
 
 def milliseconds(times: np.ndarray, percent: float) -> float:
@@ -230,6 +269,7 @@ def main() -> None:
     parser.add_argument("--agents", type=int, nargs="+", default=[10, 50, 200, 1000], help="fleets")
     parser.add_argument("--seconds", type=float, default=20.0, help="of mapping")
     parser.add_argument("--burst", type=int, default=1000, help="changes within a second, behind that")
+    parser.add_argument("--disturb", action="store_true", help="with a slow, a frozen and a flooding agent")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args()
@@ -238,8 +278,9 @@ def main() -> None:
             f"--agents must be positive, --seconds at least {INTERVAL:g}, --burst and --seed not negative"
         )
     rows: dict[str, Figures] = {}
-    report: dict[str, object] = {
-        "seed": options.seed, "cores": os.cpu_count(), "load_before": round(os.getloadavg()[0], 1),
+    report: dict[str, Any] = {
+        "seed": options.seed, "disturbed": options.disturb, "cores": os.cpu_count(),
+        "load_before": round(os.getloadavg()[0], 1),
     }  # fmt: skip
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -247,7 +288,9 @@ def main() -> None:
     ):
         floor = measure_floor(Path(folder))
         for agents in options.agents:
-            rows[str(agents)] = measure_fleet(agents, options, Path(folder) / str(agents), progress)
+            rows[str(agents)], said = measure_fleet(agents, options, Path(folder) / str(agents), progress)
+            if said:
+                report["said"] = {**report.get("said", {}), str(agents): said}
     table = Table(
         title=f"a map server and its fleet; a bare question and commit: {floor['floor_p50_ms']:g} ms"
     )

@@ -58,6 +58,10 @@ class ShardedIndex:
         helped = sum(link.answers and not link.current for link in self._links)
         return f"{words}; {helped} in this process" if helped else words
 
+    def announce(self, node: Node) -> None:
+        """Add a node, or replace it; any thread may do so."""
+        self.add(node)
+
     def add(self, node: Node) -> None:
         """Add a node, or replace it."""
         self._of(node.id.map).change([node])

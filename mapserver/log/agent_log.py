@@ -109,10 +109,10 @@ class AgentLog:
         self._received.clear()
         self._ahead_bytes = 0
 
-    def next_run(self) -> list[Entry]:
-        """The changes that follow the watermark without a gap."""
+    def next_run(self, after: int) -> list[Entry]:
+        """The changes that follow this sequence number without a gap."""
         run: list[Entry] = []
-        while (entry := self.ahead.get(self.watermark + 1 + len(run))) is not None:
+        while (entry := self.ahead.get(after + 1 + len(run))) is not None:
             run.append(entry)
         return run
 

@@ -70,6 +70,11 @@ def unmeasurable(body: ChangeBody) -> str:
     return ""
 
 
+def words_of(refusal: Refusal) -> str:
+    """Which change is refused, and why."""
+    return f"change {refusal.sequence} is refused ({refusal.reason})"
+
+
 @dataclass(frozen=True, slots=True)
 class Applied:
     """Result of a batch.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class IngestCounters:
     """Counters since the start.
 
@@ -33,6 +33,7 @@ class IngestCounters:
     restored: int = 0
     failures: int = 0
 
-    def plus(self, **more: int) -> IngestCounters:
-        """The same with some of them raised."""
-        return replace(self, **{name: getattr(self, name) + by for name, by in more.items()})
+    def add(self, **more: int) -> None:
+        """Raise some of them."""
+        for name, by in more.items():
+            setattr(self, name, getattr(self, name) + by)

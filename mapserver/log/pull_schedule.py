@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.agent_log import NEVER, AgentLog
 
-AT_ONCE = 4
-"""Robots that are asked at once, each for one piece."""
-SILENT_AT_ONCE = 2
+AT_ONCE = 32
+"""Robots that are asked at once, each for one piece: a fleet that connects again is asked a few hundred a
+second, at a tenth of a second each on busy machines. A thread and at most a megabyte for each."""
+SILENT_AT_ONCE = 16
 """Of these, robots that did not answer last time, or never yet: each holds its place until the time-out."""
 
 

@@ -6,6 +6,7 @@ import logging
 from dataclasses import dataclass
 
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.wire.bus import Reply
 from mapweave.wire.log_messages import LogAnswer, LogRequest
@@ -14,6 +15,8 @@ log = logging.getLogger(__name__)
 
 Row = tuple[int, bytes]
 """Sequence number and encoded change."""
+AT_ONE_TURN = 16
+"""Pulled changes of a robot that are committed at one turn; the others wait for its next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,18 @@ class Piece:
     log: AgentLog
     rows: tuple[Row, ...]
     covered: int
+
+    @property
+    def now(self) -> Piece:
+        """What is committed at the next turn."""
+        rows, later = self.rows[:AT_ONE_TURN], self.rows[AT_ONE_TURN:]
+        return Piece(self.log, rows, later[0][0] - 1 if later else self.covered)
+
+    @property
+    def later(self) -> Piece | None:
+        """What waits for a later turn; None if nothing does."""
+        later = self.rows[AT_ONE_TURN:]
+        return Piece(self.log, later, self.covered) if later else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,3 +78,33 @@ class Pulled:
                 rows = tuple(row for row in answer.changes if row[0] <= asked.last)
                 return Piece(agent_log, rows, min(answer.covered, asked.last)), damaged
         return Piece(agent_log, (), 0), damaged
+
+
+class Pieces:
+    """Pieces of logs of which a part is committed in this turn; one a log."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._pieces: dict[MapId, Piece] = {}
+
+    def put(self, piece: Piece) -> None:
+        """A piece whose turn has come."""
+        self._pieces[piece.log.map] = piece
+
+    def now(self, agent_log: AgentLog) -> Piece | None:
+        """What is committed of a log at this turn; None if nothing of it was pulled that is new."""
+        piece = self._pieces.get(agent_log.map)
+        if piece is None or piece.log is not agent_log or piece.now.covered <= agent_log.watermark:
+            return None
+        return piece.now
+
+    def end(self, agent_log: AgentLog, now: float) -> Piece | None:
+        """The turn of a log is over; returns what waits for its next, if anything."""
+        piece = self._pieces.pop(agent_log.map, None)
+        if piece is None or piece.log is not agent_log:
+            return None
+        gained = agent_log.watermark >= piece.now.covered
+        if gained and piece.later is not None:
+            return piece.later
+        agent_log.pulled(now, gained=gained)
+        return None

@@ -10,14 +10,12 @@ import math
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import faiss
 import numpy as np
 
-from mapweave.hybridmap.descriptor import decode, quantise
-from mapweave.hybridmap.landmark_tables import DIMENSIONS
 from mapweave.mapserver.retrieval.coarse_quantizer import SAMPLE, CoarseQuantizer, Codes, Ids, Vectors
+from mapweave.mapserver.retrieval.flat_landmarks import FlatLandmarks
 from mapweave.mapserver.retrieval.inverted_file import Block, InvertedFile
 
 log = logging.getLogger(__name__)
@@ -81,7 +79,7 @@ class LandmarkIndex:
         """Start empty."""
         self.lock = threading.RLock()
         self._settings = settings or LandmarkIndexSettings()
-        self._flat: Any = faiss.IndexIDMap2(faiss.IndexFlatL2(DIMENSIONS))
+        self._flat: FlatLandmarks | None = FlatLandmarks()
         self._cells: InvertedFile | None = None
         self._learned = 0
         self._learner: threading.Thread | None = None
@@ -90,7 +88,14 @@ class LandmarkIndex:
 
     def __len__(self) -> int:
         """How many landmarks."""
-        return len(self._cells) if self._cells is not None else int(self._flat.ntotal)
+        return len(self._landmarks)
+
+    @property
+    def _landmarks(self) -> FlatLandmarks | InvertedFile:
+        if self._cells is not None:
+            return self._cells
+        assert self._flat is not None  # It goes when there are cells.
+        return self._flat
 
     @property
     def means(self) -> CoarseQuantizer | None:
@@ -108,7 +113,7 @@ class LandmarkIndex:
             if self._cells is not None:
                 self._cells.add(codes, ids)
             if self._flat is not None:
-                self._flat.add_with_ids(decode(codes), ids)
+                self._flat.add(codes, ids)
             self._grow()
 
     def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
@@ -117,18 +122,14 @@ class LandmarkIndex:
             if self._learner is not None:
                 self._missed.append(RemovedRows(first, last, codes))
             if self._flat is not None:
-                self._flat.remove_ids(faiss.IDSelectorRange(first, last))
+                self._flat.remove(first, last)
             if self._cells is not None:
                 self._cells.remove(first, last, codes)
 
     def nearest(self, codes: Codes, k: int) -> tuple[Vectors, Ids]:
         """(N, k) squared distances and ids of the nearest landmarks, nearest first; id -1 is none."""
         with self.lock:
-            k = max(min(k, len(self)), 1)
-            if self._cells is not None:
-                return self._cells.nearest(codes, k, self._settings.probes)
-            squared, ids = self._flat.search(decode(codes), k)
-            return squared, ids
+            return self._landmarks.nearest(codes, max(min(k, len(self)), 1), self._settings.probes)
 
     def within(self, codes: Codes, reach: float) -> tuple[Ids, Vectors, Ids] | None:
         """(M,) row of the code, squared distance and id of the `MOST_WITHIN` nearest landmarks within reach.
@@ -139,10 +140,7 @@ class LandmarkIndex:
         with self.lock:
             if self._flat is None:
                 return None
-            # Where there are fewer, the rest of a row has the greatest distance there is.
-            squared, ids = self._flat.search(decode(codes), MOST_WITHIN)
-        rows, places = np.nonzero(squared < reach**2)
-        return rows.astype(np.int64), squared[rows, places], ids[rows, places]
+            return self._flat.within(codes, reach, MOST_WITHIN)
 
     def keep_up(self) -> None:
         """Wait for the training of cells if too many landmarks have come since: they are kept twice."""
@@ -164,8 +162,7 @@ class LandmarkIndex:
     def contents(self, size: int = AT_ONCE) -> tuple[CoarseQuantizer | None, Iterator[Block]]:
         """What the cells are about, None without cells, and the landmarks in just these, see `blocks`."""
         with self.lock:
-            blocks = iter([self._everything()]) if self._cells is None else self._cells.blocks(size)
-            return self.means, self._in_turn(blocks)
+            return self.means, self._in_turn(self._landmarks.blocks(size))
 
     def _in_turn(self, blocks: Iterator[Block]) -> Iterator[Block]:
         while True:
@@ -183,8 +180,9 @@ class LandmarkIndex:
             end = max(end, int(block.ids.max(initial=-1)) + 1)
         with self.lock:
             if len(cells) <= self._settings.exact:
+                self._flat = FlatLandmarks()
                 for block in cells.blocks(AT_ONCE):
-                    self._flat.add_with_ids(decode(block.codes), block.ids)
+                    self._flat.add(block.codes, block.ids)
             self._learned, self._end = len(cells), end
             self._swap(cells)
 
@@ -235,13 +233,6 @@ class LandmarkIndex:
         self._cells = cells
         if len(cells) > self._settings.exact:
             self._flat = None
-
-    def _everything(self) -> Block:
-        """All that is in the flat index, in the order of the ids."""
-        ids = faiss.vector_to_array(self._flat.id_map)
-        order = np.argsort(ids, kind="stable")
-        codes = quantise(self._flat.index.reconstruct_n(0, len(ids))[order])
-        return Block(codes, ids[order], np.zeros(len(ids), np.int64))
 
 
 def _catch_up(cells: InvertedFile, missed: list[AddedRows | RemovedRows]) -> None:

@@ -54,8 +54,12 @@ class NodeIndex(Protocol):
         """Whether a node is in the index."""
         ...
 
+    def announce(self, node: Node) -> None:
+        """Add a node, or replace it; any thread may do so, and a search does not hold it up."""
+        ...
+
     def add(self, node: Node) -> None:
-        """Add a node, or replace it; any thread may do so."""
+        """Add a node, or replace it."""
         ...
 
     def extend(self, nodes: Iterable[Node]) -> None:
@@ -131,20 +135,18 @@ class PlaceDatabase:
             before: pairs of nodes in which it was; of these also those that were left out are compared.
         """
         overlaps_by_node = self._index.overlaps(node, node_of)
-        for candidate_id in {node_id for pair in before for node_id in pair} & self._left_out:
-            candidate = node_of(candidate_id)
-            if candidate is not None and candidate_id != node.id:
-                codes, candidate_codes = (bounded(node_id).landmarks.codes for node_id in (node, candidate))
-                value = voting.pair_overlap(codes, candidate_codes, ALIKE)
-                if value >= LEAST_OVERLAP:
-                    overlaps_by_node[candidate_id] = value
+        left_out = {node_id for pair in before for node_id in pair} & self._left_out - {node.id}
+        known = [candidate for node_id in left_out if (candidate := node_of(node_id)) is not None]
+        codes, *others = (bounded(compared).landmarks.codes for compared in (node, *known))
+        values = voting.pair_overlaps(codes, others, ALIKE, LEAST_OVERLAP)
+        overlaps_by_node |= {c.id: value for c, value in zip(known, values, strict=True) if value}
         return overlaps_by_node
 
     # Update.
 
     def announce(self, node: Node) -> None:
-        """Let a node be found before it is put; any thread may do so."""
-        self._index.add(node)
+        """Let a node be found before it is put; any thread may do so, and no search holds it up."""
+        self._index.announce(node)
 
     def observe(self, node: Node) -> None:
         """Take note of a node before it is put: what its robot saw long before is no longer of today."""

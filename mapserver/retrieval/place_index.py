@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+import logging
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -17,6 +20,8 @@ from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_print
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
 from mapweave.mapserver.retrieval.ranking import NearestLandmarks, Ranked, rank
 from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
+
+log = logging.getLogger(__name__)
 
 SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
@@ -44,7 +49,8 @@ class PlaceIndexSettings:
 class PlaceIndex:
     """Nodes by the descriptors of their landmarks. A node is searchable as soon as it is added.
 
-    One thread may fill it while others search. It is locked for a search, or for a few nodes that come.
+    One thread may fill it while others search. It is locked for a search, or for a few nodes that come. Who
+    announces nodes does not wait for that: they are taken in by the next who locks it.
     """
 
     def __init__(self, settings: PlaceIndexSettings | None = None) -> None:
@@ -56,14 +62,17 @@ class PlaceIndex:
         self._nodes: dict[int, NodeId] = {}
         self._prints: dict[int, int] = {}
         self._next = 0
+        self._announced: deque[Node] = deque()
 
     def __len__(self) -> int:
         """How many nodes."""
-        return len(self._slots)
+        with self._current():
+            return len(self._slots)
 
     def __contains__(self, node_id: NodeId) -> bool:
         """Whether a node is in the index."""
-        return node_id in self._slots
+        with self._current():
+            return node_id in self._slots
 
     @property
     def settings(self) -> PlaceIndexSettings:
@@ -78,14 +87,18 @@ class PlaceIndex:
     @property
     def version(self) -> tuple[int, int]:
         """Changes whenever a node is added, removed or changed."""
-        with self._lock:
+        with self._current():
             return self._next, len(self._slots)
 
     @property
     def slots(self) -> Mapping[NodeId, int]:
         """Where each node's landmarks are: a copy."""
-        with self._lock:
+        with self._current():
             return dict(self._slots)
+
+    def announce(self, node: Node) -> None:
+        """Add a node, or replace it, without waiting; any thread may do so."""
+        self._announced.append(node)
 
     def add(self, node: Node) -> None:
         """Add a node, or replace it."""
@@ -99,7 +112,7 @@ class PlaceIndex:
         rest = iter(nodes)
         while some := list(islice(rest, AT_ONCE)):
             self._landmarks.keep_up()
-            with self._lock:
+            with self._current():
                 self._take(some)
 
     def remove(self, node_id: NodeId, codes: NDArray[np.uint8] | None = None) -> None:
@@ -109,7 +122,7 @@ class PlaceIndex:
             node_id: which.
             codes: (N, 32) of its landmarks, if they are known: they give its cells.
         """
-        with self._lock:
+        with self._current():
             slot = self._slots.pop(node_id, None)
             if slot is not None:
                 seal = self._prints.pop(slot)
@@ -162,7 +175,7 @@ class PlaceIndex:
         Args:
             codes: (N, 32) of the features.
         """
-        with self._lock:
+        with self._current():
             if len(codes) == 0 or len(self._landmarks) == 0:
                 empty = np.zeros((len(codes), 0))
                 return NearestLandmarks(empty.astype(np.float32), empty.astype(np.int64), ())
@@ -175,7 +188,7 @@ class PlaceIndex:
     def _ranked(
         self, codes: NDArray[np.uint8], k: int, exclude: Collection[NodeId]
     ) -> list[tuple[NodeId, float]]:
-        with self._lock:
+        with self._current():
             if len(codes) == 0 or len(self._landmarks) == 0:
                 return []
             squared, ids = self._landmarks.nearest(codes, self._settings.votes)
@@ -197,9 +210,11 @@ class PlaceIndex:
             Overlaps of at least `least_overlap`.
         """
         node = bounded(node)
-        if len(node.landmarks) == 0 or len(self._landmarks) == 0:
+        if len(node.landmarks) == 0:
             return {}
-        with self._lock:
+        with self._current():
+            if len(self._landmarks) == 0:
+                return {}
             alike = self._landmarks.within(node.landmarks.codes, ALIKE)
             if alike is not None:
                 rows, squared, ids = alike
@@ -213,14 +228,25 @@ class PlaceIndex:
         return overlaps_by_node
 
     def _voted(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
-        s, codes = self._settings, node.landmarks.codes
-        overlaps_by_node: dict[NodeId, float] = {}
-        for candidate_id, _ in self._ranked(codes, s.compared, [node.id]):
-            candidate = node_of(candidate_id)
-            if candidate is not None:
-                candidate_codes = bounded(candidate).landmarks.codes
-                overlaps_by_node[candidate_id] = voting.pair_overlap(codes, candidate_codes, ALIKE)
-        return {candidate: value for candidate, value in overlaps_by_node.items() if value >= LEAST_OVERLAP}
+        codes = node.landmarks.codes
+        ranked = self._ranked(codes, self._settings.compared, [node.id])
+        known = [candidate for node_id, _ in ranked if (candidate := node_of(node_id)) is not None]
+        values = voting.pair_overlaps(
+            codes, [bounded(candidate).landmarks.codes for candidate in known], ALIKE, LEAST_OVERLAP
+        )
+        return {candidate.id: value for candidate, value in zip(known, values, strict=True) if value}
+
+    @contextmanager
+    def _current(self) -> Iterator[None]:
+        """Lock the index, with all nodes in it that were announced."""
+        with self._lock:
+            while self._announced:
+                node = self._announced.popleft()
+                try:
+                    self._take([node])
+                except Exception:  # it is put once more by who merges
+                    log.exception("node %s cannot be found yet", node.id)
+            yield
 
     def settle(self) -> None:
         """Wait until cells that are being learned are in use."""

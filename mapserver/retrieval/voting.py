@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.landmark_tables import landmark_tables
+from mapweave.mapserver.retrieval.similar_landmarks import comparable, similar
 from mapweave.merge.pose_graph.candidates import overlap
-from mapweave.registration.matching import squared_distances
 
 Whole = NDArray[np.int64]
 Real = NDArray[np.float64]
@@ -69,12 +69,23 @@ def overlaps(
     return nodes[kept], sums[kept]
 
 
-def pair_overlap(codes: NDArray[np.uint8], other_codes: NDArray[np.uint8], alike: float) -> float:
-    """The same of two nodes' (N, 32) and (M, 32) codes, all compared with all."""
-    squared = squared_distances(codes.astype(np.float32), other_codes.astype(np.float32))
-    squared *= np.float32(landmark_tables().step ** 2)
-    rows, columns = np.nonzero(squared < alike**2)
-    return overlap(rows, columns, squared[rows, columns], alike)
+def pair_overlaps(
+    codes: NDArray[np.uint8], others: Sequence[NDArray[np.uint8]], alike: float, least: float
+) -> list[float]:
+    """The same of a node's (N, 32) codes with several others' (M, 32): 0 where it is below the least."""
+    if not others:
+        return []
+    sizes = [len(other) for other in others]
+    ends = np.cumsum(sizes)
+    columns, rows, squared = similar(comparable(np.concatenate(others)), codes, alike)
+    values = []
+    for begin, first, last in zip(ends - sizes, *np.searchsorted(columns, (ends - sizes, ends)), strict=True):
+        value = 0.0
+        # Each hit counts 1 at most.
+        if last - first >= least:
+            value = overlap(rows[first:last], columns[first:last] - begin, squared[first:last], alike)
+        values.append(value if value >= least else 0.0)
+    return values
 
 
 def _best(which: Whole, side: Whole, weights: Real, count: int) -> Real:

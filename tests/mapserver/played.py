@@ -8,7 +8,8 @@ from pathlib import Path
 from mapweave.hybridmap.change import Change, NodeRetired
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.agent_log import PullSettings
-from mapweave.mapserver.log.ingest import Ingest, IngestSettings
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.quotas import Quotas
 from mapweave.wire.bus import Request

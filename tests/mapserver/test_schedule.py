@@ -10,7 +10,7 @@ import pytest
 
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.schedule import OVERDUE, LiveSchedule, LockstepSchedule, Schedule
+from mapweave.mapserver.schedule import GIVEN_WAY, OVERDUE, LiveSchedule, LockstepSchedule, Schedule
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -121,3 +121,17 @@ def test_in_lock_step_time_passes_while_nothing_is_mapped(tmp_path: Path) -> Non
         eventually(lambda: schedule.monotonic() == 7.0)
     robot.close()
     bus.close()
+
+
+def test_the_background_gives_way_and_is_not_starved() -> None:
+    schedule, busy, done = LiveSchedule(), threading.Event(), list[float]()
+    busy.set()
+    schedule.give_way(busy.is_set)
+    schedule.start()
+    began = time.monotonic()
+    for _ in range(3):
+        schedule.post(lambda: done.append(time.monotonic()))
+    eventually(lambda: len(done) == 3)
+    assert done[2] - began >= 3 * GIVEN_WAY, "each job waits"
+    busy.clear()
+    schedule.close()

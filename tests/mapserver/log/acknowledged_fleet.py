@@ -17,7 +17,8 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.agent_log import PullSettings
-from mapweave.mapserver.log.ingest import Ingest, IngestSettings
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.keys import Keys

@@ -150,7 +150,7 @@ def test_memory_for_changes_ahead_is_bounded() -> None:
         agent_log.offer(Entry(sequence, b"", "x"))
     assert len(agent_log.ahead) == 10
     agent_log.offer(Entry(1, b"", "x"))
-    assert [entry.sequence for entry in agent_log.next_run()] == list(range(1, 12))
+    assert [entry.sequence for entry in agent_log.next_run(0)] == list(range(1, 12))
     agent_log.settled(Applied((), (), 5))
     assert min(agent_log.ahead) == 6
 

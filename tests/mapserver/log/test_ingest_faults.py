@@ -16,7 +16,8 @@ from mapweave.agent.replication.replicator import ReplicationSettings, Replicato
 from mapweave.hybridmap.change import Change, NodeRetired
 from mapweave.hybridmap.node import NodeId
 from mapweave.mapserver.log.agent_log import PullSettings
-from mapweave.mapserver.log.ingest import Ingest, IngestSettings
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys

@@ -8,8 +8,9 @@ import time
 import pytest
 
 from mapweave.hybridmap.change import Change
-from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.store import Run
 from mapweave.wire.bus import Request
 from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.log_messages import LogAnswer, LogRequest, Mark, Refusal
@@ -146,11 +147,11 @@ def test_a_disk_that_is_full_for_a_while(
 ) -> None:
     agent.serve(3)
 
-    def full(*_: object) -> None:
-        raise InvalidFile("s0.sqlite: map store cannot be used (database or disk is full)")
+    def full(runs: list[Run]) -> list[MapweaveError]:
+        return [InvalidFile("s0.sqlite: map store cannot be used (database or disk is full)") for _ in runs]
 
     with monkeypatch.context() as patched, caplog.at_level(logging.ERROR):
-        patched.setattr(server.store, "apply", full)
+        patched.setattr(server.store, "apply_all", full)
         for sequence in (1, 2, 3):
             agent.publish(sequence)
         eventually(lambda: server.ingest.counters().failures >= 3)

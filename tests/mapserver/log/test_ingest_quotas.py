@@ -14,7 +14,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log import ingest
+from mapweave.mapserver.log import ingest, known_logs, pull_schedule, pulled
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.intake import ADVICE
 from mapweave.mapserver.log.sqlite_store import SqliteStore
@@ -89,7 +89,7 @@ def test_a_pulled_log_is_no_queue_for_another_either(
     agent.serve(256)
     agent.beacon(256)
     eventually(lambda: len(server.seen) == 257)
-    assert [change.map for change in server.seen].index(OTHER) == ingest.AT_ONE_TURN
+    assert [change.map for change in server.seen].index(OTHER) == pulled.AT_ONE_TURN
 
 
 def test_what_is_held_back_is_fetched_later_in_order(
@@ -182,7 +182,7 @@ def test_logs_that_never_answer_do_not_hold_up_one_that_does(
         silent.map = MapId(f"x{number}", 1)
         silent.bus.serve(KEYS.log(silent.map), kept.append)
         silent.beacon(5)
-    eventually(lambda: len(kept) >= ingest.AT_ONCE // 2)
+    eventually(lambda: len(kept) >= pull_schedule.AT_ONCE // 2)
     agent.serve(5)
     agent.beacon(5)
     # Each of them is waited for 2 s, four at once: that alone is half a minute.
@@ -193,7 +193,7 @@ def test_names_alone_fill_no_memory(
     hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
 ) -> None:
     crowd = other_agent(hub, cleanup)
-    for number in range(3 * ingest.MOST_UNKNOWN):
+    for number in range(3 * known_logs.MOST_UNKNOWN):
         crowd.map = MapId(f"x{number}", number % 7)
         crowd.beacon(0)
         if number % 500 == 0:
@@ -202,7 +202,7 @@ def test_names_alone_fill_no_memory(
     agent.publish(1)
     eventually(lambda: server.sequences == [1])
     eventually(lambda: not len(server.ingest._work._items))
-    assert len(server.ingest._logs) <= ingest.MOST_UNKNOWN + 1
+    assert len(server.ingest._logs) <= known_logs.MOST_UNKNOWN + 1
 
 
 def test_a_beacon_beyond_all_logs_moves_only_its_own(

@@ -21,7 +21,8 @@ from mapweave.agent.replication.replicator import ReplicationSettings, Replicato
 from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.mapserver.log.ingest import Ingest, IngestSettings
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub

@@ -1,5 +1,8 @@
 """The place index against exhaustive search."""
 
+import threading
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -286,3 +289,29 @@ def test_an_index_that_cannot_be_trained_reports_it_and_goes_on(
     view, _ = take_view(world, tour[1], np.random.default_rng(11))
     assert index.query(view, 1)[0][0] == nodes[1].id
     assert "could not be made faster" in caplog.text
+
+
+def test_who_announces_a_node_does_not_wait_for_a_search(
+    building: tuple[World, list[Node], list[Pose2]],
+) -> None:
+    _, nodes, _ = building
+    index = filled(nodes[:5])
+    with index.landmarks.lock:
+        announcing = threading.Thread(target=lambda: [index.announce(node) for node in nodes[5:]])
+        announcing.start()
+        announcing.join(10.0)
+        assert not announcing.is_alive()
+    assert nodes[-1].id in index and len(index) == len(nodes)
+    assert index.overlaps(nodes[0], {}.get) == filled(nodes).overlaps(nodes[0], {}.get)
+
+
+def test_a_node_that_cannot_be_taken_in_spoils_no_search(
+    building: tuple[World, list[Node], list[Pose2]], caplog: pytest.LogCaptureFixture
+) -> None:
+    _, nodes, _ = building
+    index = filled(nodes[:5])
+    bad = replace(nodes[5], landmarks=None)  # type: ignore[arg-type]
+    index.announce(bad)
+    index.announce(nodes[6])
+    assert index.overlaps(nodes[0], {}.get) == filled([*nodes[:5], nodes[6]]).overlaps(nodes[0], {}.get)
+    assert f"{bad.id}" in caplog.text

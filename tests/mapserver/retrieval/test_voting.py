@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.descriptor import decode
 from mapweave.mapserver.retrieval import voting
 from mapweave.merge.pose_graph.candidates import overlap
 
@@ -44,3 +45,23 @@ def test_overlaps_agree_with_one_node_at_a_time(seed: int) -> None:
     assert dict(zip(overlaps.tolist(), values.tolist(), strict=True)) == pytest.approx(
         {slot: value for slot, value in expected.items() if value >= 3.0}
     )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_overlaps_of_pairs_do_not_depend_on_what_is_compared_at_once(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    codes = rng.integers(24, 40, (60, 32)).astype(np.uint8)
+    others = [
+        np.clip(codes[: int(rng.integers(0, 60))] + rng.integers(-4, 5, 32), 0, 63).astype(np.uint8)
+        for _ in range(90)
+    ]
+    one_by_one = []
+    for other in others:
+        differences = decode(codes)[:, None].astype(np.float64) - decode(other)[None]
+        squared = (differences**2).sum(axis=2)
+        rows, columns = np.nonzero(squared < 0.5**2)
+        one_by_one.append(overlap(rows, columns, squared[rows, columns], 0.5))
+    values = voting.pair_overlaps(codes, others, 0.5, 3.0)
+    assert values == [voting.pair_overlaps(codes, [other], 0.5, 3.0)[0] for other in others]
+    assert values == pytest.approx([value if value >= 3.0 else 0.0 for value in one_by_one], rel=1e-6)
+    assert sum(value > 0 for value in values) > 10

@@ -1,0 +1,72 @@
+"""Asks agents for what is missing of their logs; a few threads wait for the answers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+from mapweave.mapserver.log.agent_log import AgentLog
+from mapweave.mapserver.log.intake import Intakes
+from mapweave.mapserver.log.pull_schedule import AT_ONCE, PullSchedule
+from mapweave.mapserver.log.pulled import Pulled
+from mapweave.wire.bus import Bus
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import LogRequest
+
+
+class Puller:
+    """Pulls of one server.
+
+    Attributes:
+        schedule: which log is asked for next.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        intakes: Intakes,
+        unmerged: Callable[[str], int],
+        ask_timeout: float,
+        answered: Callable[[Pulled], None],
+    ) -> None:
+        """Begin with nothing missing.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            intakes: how much is taken of each robot.
+            unmerged: how many changes of a robot were passed on and wait.
+            ask_timeout: for a piece of a log, s.
+            answered: called in one of the threads.
+        """
+        self.schedule = PullSchedule()
+        self._bus, self._keys, self._intakes = bus, keys, intakes
+        self._unmerged, self._timeout, self._answered = unmerged, ask_timeout, answered
+        self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="pull")
+
+    def start(self) -> int:
+        """Ask for what is due; returns for how many pieces."""
+        count = 0
+        while (agent_log := self.schedule.next(now := time.monotonic())) is not None:
+            agent = agent_log.map.agent
+            intake = self._intakes.of(agent)
+            rows = intake.rows(self._unmerged(agent))
+            asked = agent_log.missing(now, rows) if rows else None
+            if asked is None:
+                agent_log.pull_at = now + intake.pause()
+                continue
+            count += 1
+            self.schedule.asks(agent)
+            self._threads.submit(self._pull, agent_log, asked)
+        return count
+
+    def close(self) -> None:
+        """Wait for the answers that are due, and ask for no more."""
+        self._threads.shutdown(cancel_futures=True)
+
+    def _pull(self, agent_log: AgentLog, asked: LogRequest) -> None:
+        """In a thread of its own, because an agent may be slow."""
+        replies = self._bus.ask(self._keys.log(agent_log.map), asked.encode(), self._timeout)
+        self._answered(Pulled(agent_log, asked, replies))
