@@ -196,21 +196,25 @@ def test_a_commit_that_no_standby_confirms_is_none(postgres: PostgresServer) -> 
         people.execute("SELECT pg_reload_conf()")
         try:
             results: list[Applied | MapweaveError] = []
-            run = Run(MAP, 5, [entry(2)])
-            writer = threading.Thread(target=lambda: results.extend(store.apply_all([run])))
-            # The setting reaches other sessions a little later.
-            eventually(lambda: people.execute("SHOW synchronous_standby_names").fetchone() == ("absent",))
+
+            def write() -> None:
+                # The setting is in force a little later.
+                while all(isinstance(result, Applied) for result in results):
+                    results.extend(store.apply_all([Run(MAP, 5, [entry(2 + len(results))])]))
+
+            writer = threading.Thread(target=write)
             writer.start()
             waiting = "SELECT pid FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
-            eventually(lambda: people.execute(waiting).fetchall() or not writer.is_alive())
+            eventually(lambda: people.execute(waiting).fetchall())
             assert store.traffic().nodes == 0, "questions are answered meanwhile"
             people.execute("SELECT pg_cancel_backend(pid) FROM pg_stat_activity WHERE wait_event = 'SyncRep'")
             writer.join(30)
-            assert "is not confirmed" in str(results[0]) and isinstance(results[0], InvalidFile)
+            assert "is not confirmed" in str(results[-1]) and isinstance(results[-1], InvalidFile)
         finally:
             people.execute("ALTER SYSTEM RESET synchronous_standby_names")
             people.execute("SELECT pg_reload_conf()")
-    eventually(lambda: isinstance(store.apply_all([Run(MAP, 5, [entry(2)])])[0], Applied))
+    again = Run(MAP, 5, [entry(1 + len(results))])
+    eventually(lambda: isinstance(store.apply_all([again])[0], Applied))
     store.close()
 
 
