@@ -73,7 +73,8 @@ class RayNodes:
         mine = {pid for node in self._nodes for pid in descendants(node.pid)}
         return sorted(pid for pid in mine if _title(pid).startswith(title))
 
-    def _start(self, *how: str) -> None:
+    def _start(self, *how: str, attempts: int = 3) -> None:
+        """Start a node; on a busy machine Ray gives up waiting for its own processes."""
         with (self._folder / f"ray{len(self._nodes)}.log").open("ab") as output:
             node = subprocess.Popen(
                 [
@@ -90,6 +91,10 @@ class RayNodes:
             self._nodes.append(node)
         end = time.monotonic() + START
         while not any(_title(pid).rsplit("/", 1)[-1].startswith("raylet") for pid in descendants(node.pid)):
+            if node.poll() is not None and attempts > 1:
+                self._nodes.remove(node)
+                self._start(*how, attempts=attempts - 1)
+                return
             if node.poll() is not None or time.monotonic() > end:
                 raise SystemExit(f"a node of the cluster does not start: see {output.name}")
             time.sleep(0.2)
