@@ -15,7 +15,7 @@ KEPT = 15.0
 """What a robot has said is kept for so long, s: robots that are far from all others ask every 5 s."""
 MAP_SIGMA = 0.05
 """Standard deviation of a robot's map against another's in the merged map, m: of answers in simulated offices
-half are off by less than 0.015 m, and a tenth by more than 0.05 m. Of each pair the pose graph knows it, but
+half are off by less than 0.03 m, and a tenth by more than 0.05 m. Of each pair the pose graph knows it, but
 that costs more than all the rest of the answer."""
 CELL = 16.0
 """Side of the cells by which robots are found, m. What is not in a cell beside a robot's needs more than the

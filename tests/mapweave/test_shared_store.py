@@ -114,6 +114,7 @@ def test_either_of_two_servers_may_be_killed(
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_restored_backup_has_the_map_and_robots_add_what_is_newer(
     postgres: PostgresServer, tmp_path: Path
 ) -> None:

@@ -77,7 +77,9 @@ def logs_of(journals: list[Journal]) -> dict[MapId, Log]:
     }
 
 
-@pytest.mark.parametrize("poll", [1000.0, 0.1], ids=["notified", "polled"])
+@pytest.mark.parametrize(
+    "poll", [1000.0, pytest.param(0.1, marks=pytest.mark.slow)], ids=["notified", "polled"]
+)
 def test_all_servers_pass_on_everything_once_and_in_order(
     address: str, journals: list[Journal], monkeypatch: pytest.MonkeyPatch, poll: float
 ) -> None:
