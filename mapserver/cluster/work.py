@@ -46,6 +46,8 @@ class WorkPool:
 
     def compare(self, pairs: Sequence[tuple[Node, Node]]) -> list[Verdict]:
         """Compare pairs of nodes; see `mapweave.mapserver.merging.node_comparisons.compare`."""
+        if len(pairs) <= PAIRS:  # a single worker would be no faster
+            return compare(pairs)
         rest = iter([(bounded(a), bounded(b)) for a, b in pairs])
         parts = iter(lambda: list(islice(rest, PAIRS)), [])
         return [verdict for verdicts in self._map("compare", parts) for verdict in verdicts]

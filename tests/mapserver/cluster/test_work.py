@@ -43,7 +43,8 @@ def test_verdicts_are_those_of_one_server(failing: int, monkeypatch: pytest.Monk
             assert one.a_from_b.mean == other.a_from_b.mean
 
 
-def test_without_a_cluster_all_is_done_here() -> None:
+def test_without_a_cluster_all_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "PAIRS", 2)
     nodes = [change.node for _, change in Building.draw(1, 4, 1).log(0) if isinstance(change, NodePut)]
 
     def call(request: bytes) -> Future[bytes]:
