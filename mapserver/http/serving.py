@@ -188,7 +188,7 @@ class _Loop(asyncio.SelectorEventLoop):
         self._shaking[waiter] = transport
         waiter.add_done_callback(lambda done: self._shaking.pop(done, None))
         if len(self._shaking) > MAX_WAITING:
-            # Later: in a burst the oldest has not been told of its socket yet.
+            # Later: in a burst the oldest has no socket yet.
             self.call_soon(self._shaking.pop(next(iter(self._shaking))).abort)
         return transport
 

@@ -321,7 +321,7 @@ def test_who_logs_in_over_https_sees_the_certificate_of_the_authority(
 
 
 def test_handshakes_that_are_never_begun_make_room(services: StubServices, tmp_path: Path) -> None:
-    """Hundreds were held until their time was over: with the limit of open files nobody else got in."""
+    """Hundreds were held until their time was over: with the limit of open files no one else got in."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0")
     tls = server_context(read_key_file(folder.key_file("s0")).credentials)
     trusting = ssl.create_default_context(cafile=str(folder.path / "authority.pem"))
@@ -364,7 +364,7 @@ def encrypted(web: Web, context: ssl.SSLContext, data: bytes) -> bytes:
         return got
 
 
-def test_one_who_asks_without_end_is_told_when_and_nobody_else_waits(
+def test_one_who_asks_without_end_gets_the_time_to_retry_and_no_other_waits(
     tmp_path: Path, services: StubServices, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By name, whatever the way of logging in; what costs nothing is not counted."""
