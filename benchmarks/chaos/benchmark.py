@@ -81,22 +81,25 @@ def disturb(
     """Carry out a schedule; returns when each disturbance ended."""
     bar = progress.add_task("mapping", total=seconds)
     began = time.monotonic()
-    waiting, going = list(schedule), list[Disturbance]()
+    waiting, going = list(schedule), list[tuple[float, Disturbance]]()
     done: Done = []
     while waiting or going or time.monotonic() < began + seconds:
         now = time.monotonic() - began
-        for one in [one for one in going if one.at + one.lasts <= now]:
-            going.remove(one)
+        for begun, one in [(begun, one) for begun, one in going if begun + one.lasts <= now]:
+            going.remove((begun, one))
             fleet.end_disturbance(one.kind, one.target)
             done.append((time.monotonic(), one.kind, one.target))
-        while waiting and waiting[0].at <= now:
-            one = waiting.pop(0)
+        for one in [one for one in waiting if one.at <= now]:
+            # A database that takes long to start makes all that is behind it late.
+            if any(one.target == other.target for _, other in going):
+                continue
+            waiting.remove(one)
             fleet.begin(one.kind, one.target)
-            going.append(one)
+            going.append((now, one))
             progress.update(bar, description=f"{len(done) + len(going)}: {one.target} {one.kind}")
-        for one in going:
+        for begun, one in going:
             if one.kind is Kind.FLAP:
-                fleet.toggle(one.target, int((now - one.at) / FLAP) % 2 == 0)
+                fleet.toggle(one.target, int((now - begun) / FLAP) % 2 == 0)
         fleet.check()
         progress.update(bar, completed=min(now, seconds))
         time.sleep(0.02)
