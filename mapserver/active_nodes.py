@@ -93,7 +93,7 @@ def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
 
 def _adrift(merged: MergedMap) -> Iterator[NodeId]:
     """Nodes of fragments that nothing joins with a larger map: an answer from there would be of no use."""
-    small = set(fragments(merged.maps))
+    small = set(fragments(merged.maps, merged.pruned.maps))
     for graph in merged.graphs if small else ():
         if graph.maps <= small:
             yield from graph.nodes

@@ -6,7 +6,7 @@ show, and is not joined with them, it makes no answer ambiguous (mapweave.mapser
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
@@ -32,16 +32,20 @@ MOST_FRAGMENTS = 8
 """Of a robot. One that loses its way leaves one or two a day."""
 
 
-def fragments(maps: Mapping[MapId, HybridMap]) -> list[MapId]:
+def fragments(maps: Mapping[MapId, HybridMap], pruned: Container[MapId]) -> list[MapId]:
     """Maps with fewer nodes that their robots have left for others: nothing tells whether they are right.
 
     Of a robot that leaves very many, the newest as well.
+
+    Args:
+        maps: by id.
+        pruned: maps that had more nodes, which newer ones have superseded.
     """
     small: dict[str, list[MapId]] = {}
     newest: dict[str, int] = {}
     for map_id, hybrid_map in sorted(maps.items()):
         newest[map_id.agent] = map_id.epoch
-        if len(hybrid_map.nodes) < LEAST_NODES:
+        if len(hybrid_map.nodes) < LEAST_NODES and map_id not in pruned:
             small.setdefault(map_id.agent, []).append(map_id)
     return [
         map_id
@@ -51,10 +55,10 @@ def fragments(maps: Mapping[MapId, HybridMap]) -> list[MapId]:
     ]
 
 
-def scattered(maps: Mapping[MapId, HybridMap]) -> dict[MapId, str]:
-    """The first fragment of each robot that leaves very many."""
+def scattered(maps: Mapping[MapId, HybridMap], pruned: Container[MapId]) -> dict[MapId, str]:
+    """The first fragment of each robot that leaves very many; see `fragments`."""
     by_robot: dict[str, list[MapId]] = {}
-    for map_id in fragments(maps):
+    for map_id in fragments(maps, pruned):
         by_robot.setdefault(map_id.agent, []).append(map_id)
     words = f"its robot has left {MOST_FRAGMENTS} maps and more with fewer than {LEAST_NODES} nodes each"
     return {some[0]: words for some in by_robot.values() if len(some) >= MOST_FRAGMENTS}

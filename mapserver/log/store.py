@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 import secrets
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
 from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
 from mapweave.storage.database import Database
@@ -134,6 +134,33 @@ class Store:
             watermark = max(watermark, covered or 0)
             insert(rows, "log", (*map_id, str(log_id), watermark))
         return Applied(tuple(changes), tuple(refusals), watermark)
+
+    def prune(
+        self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]
+    ) -> None:
+        """Delete the changes of nodes and edges for good, in one transaction with results that stand for them.
+
+        The logs' watermarks stay, so robots do not send them again.
+
+        Args:
+            nodes: that have left the map.
+            edges: likewise.
+            results: by their names, see `put_result`.
+
+        Raises:
+            InvalidFile: the disk does not take it; nothing is pruned.
+        """
+        nodes = tuple(nodes)
+        with self._lock, self._database.transaction() as rows:
+            for elements, names in ((nodes, (NodePut, NodeRetired)), (tuple(edges), (EdgePut, EdgeRetired))):
+                kinds = [kind.__name__ for kind in names]
+                rows.executemany(
+                    "DELETE FROM change WHERE agent = ? AND epoch = ? AND number = ? AND kind IN (?, ?)",
+                    ((*element, *kinds) for element in elements),
+                )
+            rows.executemany("DELETE FROM node WHERE agent = ? AND epoch = ? AND number = ?", nodes)
+            for name, value in results.items():
+                insert(rows, "result", (name, value))
 
     def replay(self, map_id: MapId, last: int = 0) -> Iterator[Change]:
         """Every change behind `last` that was taken, in order.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
@@ -18,6 +18,7 @@ from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import NodeComparisons
+from mapweave.mapserver.merging.pruning import PrunePlan, Pruning, left_of
 from mapweave.mapserver.merging.verification_cache import VerificationCache
 from mapweave.mapserver.plausibility import implausible, scattered
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
@@ -60,6 +61,7 @@ class Merger:
         self.settings = settings or MergeSettings()
         self._comparisons = NodeComparisons(self.places, self.node, self.counters)
         self._verdicts = Verdicts()
+        self.pruning = Pruning()
         self._pipeline = self._new_pipeline()
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
@@ -244,12 +246,13 @@ class Merger:
         kept = {map_id: self._kept[map_id] for map_id in maps}
         merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins)
         odd = {which: reason for which, reason in self._implausible.items() if reason}
-        odd |= scattered(kept) | self._refused
+        odd |= scattered(kept, self.pruning.pruned.maps) | self._refused
         merged = replace(
             merged,
             set_apart=self._set_apart(),
             implausible={which: odd[which] for which in sorted(odd.keys() & kept.keys())},
             wrong=self._wrong,
+            pruned=self.pruning.pruned,
         )
         if use is not None:
             use(merged)
@@ -334,6 +337,54 @@ class Merger:
 
         return PinnedFrames().moved(leave_out(sorted(kept), attempt)[0], self._pins)
 
+    def plan_pruning(
+        self, now_ns: int, keep_days: float, staying: Container[NodeId] = ()
+    ) -> PrunePlan | None:
+        """What is to be pruned after the merge that was made last; None: nothing now.
+
+        Args:
+            now_ns: the server's clock.
+            keep_days: superseded nodes are kept for so long.
+            staying: nodes that are not pruned.
+        """
+        merged = self._merged
+        due = self.pruning.due(merged.superseded, now_ns, keep_days)
+        due = {node for node in due if node not in staying}
+        if self._dirty or not due:
+            return None
+        nodes, marginals = left_of(merged, due, self.pruning.marginals, now_ns)
+        if not nodes:
+            return None
+        edges = {
+            edge_id
+            for hybrid_map in self.maps.values()
+            for node in nodes
+            if node in hybrid_map.graph
+            for _, _, edge_id in hybrid_map.graph.edges(node, keys=True)
+        }
+        return PrunePlan(nodes, tuple(sorted(edges)), tuple(marginals))
+
+    def prune(self, plan: PrunePlan) -> None:
+        """Let the nodes of a plan go, as if their robots had retired them, and keep what is left of them."""
+        for map_id, hybrid_map in list(self.maps.items()):
+            for node in plan.nodes:
+                if node in hybrid_map.graph:
+                    self._replay(map_id, NodeRetired(node))
+            if not hybrid_map.nodes:
+                del self.maps[map_id]
+                self._changed.discard(map_id)
+                self._kept.pop(map_id, None)
+                self._implausible.pop(map_id, None)
+        self.alike.remove(plan.nodes)
+        self.reaches.remove(plan.nodes)
+        self.pruning.take(plan)
+        self._pipeline.replace_marginals(self.pruning.marginals)
+
+    def restore_pruning(self, pruning: Pruning) -> None:
+        """Go on with what another process has pruned, before anything is merged."""
+        self.pruning = pruning
+        self._pipeline.replace_marginals(pruning.marginals)
+
     def status(self) -> str:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
         return self.merged().summary()
@@ -356,9 +407,12 @@ class Merger:
                 self.places.observe(node)
             case NodeRetired(node_id):
                 self._comparisons.forget(node_id)
+                self._copies.gone(node_id)
                 self.places.remove(removed, node_id)
             case EdgePut(edge):
                 self._comparisons.connect(edge)
 
     def _new_pipeline(self) -> MergePipeline:
-        return MergePipeline(self.settings, self.reaches)
+        pipeline = MergePipeline(self.settings, self.reaches)
+        pipeline.replace_marginals(self.pruning.marginals)
+        return pipeline

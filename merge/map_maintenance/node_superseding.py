@@ -259,7 +259,9 @@ class _Round:
             return None
         if b.landmarks.has_depth.sum() < min(DEPTHS * a.landmarks.has_depth.sum(), ENOUGH):
             return None
-        link = self._links.between(covered, successor) or self._compare(a, b)
+        link = self._links.between(covered, successor)
+        # A link may be of poses alone: by a person, or left of nodes that are gone.
+        link = link if link is not None and len(link.shared) else self._compare(a, b)
         if link is None:
             return None
         link = link if link.a == covered else link.turned()
