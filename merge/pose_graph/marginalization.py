@@ -32,7 +32,7 @@ from mapweave.merge.pose_graph.optimization import optimized
 
 MARGINAL = "marginal"
 """Name among the evidence of a link that is left of removed nodes."""
-NEIGHBOURS = 8
+NEIGHBOURS = 24
 """Pairs of each node that may be in the tree, the nearest; more if these do not connect what is connected."""
 TURN = 1.0
 """m/rad, how far a turn is: two rad apart, two nodes of one place see nothing in common."""
