@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
@@ -10,7 +11,7 @@ from dataclasses import replace
 
 from mapweave.agent.mission import Answer, Driven, Question
 from mapweave.agent.mission_control import MissionControl
-from mapweave.agent.replication.queries import decode_answer, encode_query
+from mapweave.agent.replication.queries import Said, best, decode_answer, encode_query, settles
 from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.agent_status import AgentStatus, Status, one_line
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
@@ -19,7 +20,7 @@ from mapweave.hybridmap.mission_order import MissionOrder
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pose import Pose2
-from mapweave.wire.bus import Bus, Request
+from mapweave.wire.bus import Bus, Reply, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
@@ -27,6 +28,11 @@ from mapweave.wire.senders import serve_senders
 from mapweave.wire.traffic_meter import TrafficMeter
 
 NO_ANSWER = "no map server answered"
+FAILOVER = 1.0
+"""s behind the loss of a server or router in which a question without an answer is asked again: a session is
+at the next router in some 10 ms, and routers that lose one find another way between them in 0.1 s."""
+ASK_AGAIN = 0.05
+"""s before that."""
 
 
 class FleetClient:
@@ -39,7 +45,6 @@ class FleetClient:
         map_id: MapId,
         missions: MissionControl,
         answer_timeout: float = 3.0,
-        server: str = "s0",
         unsent: Callable[[], int] = lambda: 0,
         placed: Callable[[], int] = lambda: 0,
         teleoperation: Teleoperation | None = None,
@@ -53,7 +58,6 @@ class FleetClient:
             map_id: the map that the agent makes.
             missions: takes orders.
             answer_timeout: how long a question may take, s.
-            server: the map server of `server_in_reach`.
             unsent: counts the changes that it has not acknowledged; called from any thread.
             placed: counts the nodes of the map with a merged pose; likewise.
             teleoperation: takes the commands of a person who drives; it outlives this map.
@@ -63,8 +67,8 @@ class FleetClient:
         self._keys = keys
         self._map = map_id
         self._agent = map_id.agent
-        self._server = server
-        self._server_alive = False
+        self._servers: set[str] = set()
+        self._server_lost_at = -math.inf
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
         self._stamp_ns = self._skipped = 0
         self._battery: float | None = None
@@ -81,7 +85,7 @@ class FleetClient:
             bus.serve(keys.drive(map_id.agent), self._take_drive),
             *serve_senders(bus, keys.portal(map_id.agent), self._take_portal),
             bus.serve(keys.agent_status(map_id.agent), self._tell_status),
-            bus.watch(keys.server_alive(server), self._see_server),
+            bus.watch(keys.servers_alive(), self._see_server),
             bus.announce(keys.agent_alive(map_id)),
         ]
         self._asker = threading.Thread(target=self._ask_all, name="questions", daemon=True)
@@ -92,8 +96,8 @@ class FleetClient:
         return self._teleoperation.driven()
 
     def server_in_reach(self) -> bool:
-        """Whether the map server is known to be reachable in both directions."""
-        return self._server_alive and self._bus.connected()
+        """Whether a map server is known to be reachable in both directions."""
+        return bool(self._servers) and self._bus.connected()
 
     def report(
         self,
@@ -164,8 +168,11 @@ class FleetClient:
         request.reply(encode(self._now()))
 
     def _see_server(self, key: str, alive: bool) -> None:
-        del key
-        self._server_alive = alive
+        if alive:
+            self._servers.add(key)
+        else:
+            self._servers.discard(key)
+            self._server_lost_at = time.monotonic()
 
     def _take_mission(self, request: Request, who: str) -> None:
         order = decode(request.payload, MissionOrder)
@@ -194,15 +201,29 @@ class FleetClient:
             key, payload = encode_query(self._keys, question, self._agent)
         except InvalidValue as unspeakable:
             return Answer(question.number, None, str(unspeakable))
-        replies = self._bus.ask(key, payload, self._timeout)
-        error, retry_after = NO_ANSWER if not replies else "", 0.0
-        for reply in replies:
+        answers: list[Said] = []
+        error, retry_after = NO_ANSWER, 0.0
+
+        def enough(reply: Reply) -> bool:
+            nonlocal error, retry_after
             if reply.error:
                 error, retry_after = reply.error, reply.retry_after or retry_after
-                continue
+                return False
             try:
-                return Answer(question.number, decode_answer(question, reply.payload))
+                answers.append(decode_answer(question, reply.payload))
             except MapweaveError as refused:
                 error = str(refused)
+                return False
+            return settles(answers[-1])
+
+        end = time.monotonic() + self._timeout
+        while not self._bus.ask(key, payload, max(end - time.monotonic(), ASK_AGAIN), enough):
+            # No reply: a server or router may have died with the question. Without any it is not repeated.
+            now = time.monotonic()
+            if now >= end or not (self._servers or now - self._server_lost_at < FAILOVER):
+                break
+            time.sleep(ASK_AGAIN)
+        if answers:
+            return Answer(question.number, best(answers))
         self._trouble, self._trouble_at = one_line(error), time.monotonic()
         return Answer(question.number, None, error, retry_after)

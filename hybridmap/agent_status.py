@@ -138,6 +138,11 @@ class RobotEntry:
         over_quota: what the server holds back of it, in words; empty if it sends and asks what it may.
         accusation: what the server holds against the newest of its maps with which something is wrong; empty
             if there is none.
+        missing: changes that the server knows of and lacks.
+        lag: for how long it knows of one of them, s.
+        newest: the newest node of the map that it makes, as far as that is merged; None without one.
+        links: of that map with others.
+        apart: why that map is one with no other; empty if it is, or if there is no other.
     """
 
     robot: Name
@@ -150,6 +155,11 @@ class RobotEntry:
     floor: Annotated[str, Meta(max_length=256)] = ""
     over_quota: Line = ""
     accusation: Annotated[str, Meta(max_length=MAX_ACCUSATION)] = ""
+    missing: Number = 0
+    lag: Amount = 0.0
+    newest: NodeId | None = None
+    links: Number = 0
+    apart: Annotated[str, Meta(max_length=MAX_ACCUSATION)] = ""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 
@@ -16,6 +17,7 @@ from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import Job, Schedule
@@ -46,6 +48,7 @@ class MergeWorker:
         merge: MergeSettings | None = None,
         keeper: VerificationCacheKeeper | None = None,
         history: MapHistory | None = None,
+        observe: Callable[[float], None] = lambda seconds: None,
     ) -> None:
         """Start with no map.
 
@@ -56,10 +59,12 @@ class MergeWorker:
             merge: how maps are merged.
             keeper: of the verification cache.
             history: records what joins and parts.
+            observe: called with the time that a merge has taken, s.
         """
         self._schedule = schedule
         self._keeper = keeper
         self._history = history or MapHistory()
+        self._observe = observe
         self._share = share
         self._merger = Merger(places, merge)
         self._fresh: dict[NodeId, Node] = {}
@@ -113,6 +118,14 @@ class MergeWorker:
         with self._counting:
             self._waiting.put(change.map.agent, change, bounded=False)
         self._post(self._take_next)
+
+    def counters(self) -> MergerCounters:
+        """Counters since the start, from any thread."""
+        return replace(self._merger.counters)
+
+    def queues(self) -> Mapping[str, int]:
+        """Changes that wait to be taken in, and nodes to be compared."""
+        return {"merge": len(self._waiting), "comparisons": self._merger.uncompared}
 
     def unmerged(self, robot: str) -> int:
         """Changes of a robot that wait to be taken in: robots take turns."""
@@ -286,6 +299,7 @@ class MergeWorker:
 
     def _merge(self) -> None:
         self._dirty = False
+        began = self._schedule.monotonic()
         made: list[Answers] = []
         try:
             merged = self._merger.merged(lambda merged: made.append(self._answers_from(merged)))
@@ -297,6 +311,7 @@ class MergeWorker:
             return
         finally:
             self._done = self._applied
+            self._observe(self._schedule.monotonic() - began)
         self._curious, self._plight = True, ""
         try:
             self._history.follow(merged)

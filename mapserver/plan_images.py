@@ -10,12 +10,15 @@ from pathlib import Path
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlanImage
+from mapweave.mapserver.log.store import Store
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.storage.plan_image import check_plan_png
 
 MOST_BYTES = 2**29
 """Of all images together: a plan takes about 2 MiB."""
 SUFFIX = ".png"
+RESULT = "plan image "
+"""With which the names of images begin among the results of a store that servers share."""
 
 
 def kept_images(store: Path, annotations: Annotations) -> dict[str, bytes]:
@@ -26,6 +29,13 @@ def kept_images(store: Path, annotations: Annotations) -> dict[str, bytes]:
     return {name: path.read_bytes() for name, path in files.items() if path.is_file()}
 
 
+def recorded_images(store: Store, annotations: Annotations) -> dict[str, bytes]:
+    """The same of a store that servers share."""
+    used = sorted({plan.image.sha256 for _, plan in annotations.in_force(FloorPlan)})
+    images = {name: store.result(RESULT + name) for name in used}
+    return {name: png for name, png in images.items() if png is not None}
+
+
 def _folder_of(store: Path) -> Path:
     return store.with_name(f"{store.name}.plans")
 
@@ -33,15 +43,22 @@ def _folder_of(store: Path) -> Path:
 class PlanImages:
     """Kept until no plan names them. Thread-safe."""
 
-    def __init__(self, store: Path, used: Iterable[str], beside: Mapping[str, bytes] | None = None) -> None:
+    def __init__(
+        self,
+        store: Path,
+        used: Iterable[str],
+        beside: Mapping[str, bytes] | None = None,
+        shared: Store | None = None,
+    ) -> None:
         """Open the folder of a store.
 
         Args:
             store: path of the store; the folder is made when the first image comes.
             used: names of images that plans use, or have used; others are removed.
             beside: images that are there besides, in memory.
+            shared: the store of several servers: an image that one was given is there for all.
         """
-        self._beside = dict(beside or {})
+        self._beside, self._shared = dict(beside or {}), shared
         self._folder = _folder_of(store)
         self._lock = threading.Lock()
         kept = {f"{name}{SUFFIX}" for name in used}
@@ -64,6 +81,8 @@ class PlanImages:
                 if total + len(png) > MOST_BYTES:
                     raise InvalidValue(f"the images of plans take {total >> 20} MiB: no more are kept")
                 self._folder.mkdir(parents=True, exist_ok=True)
+                if self._shared is not None:
+                    self._shared.put_result(RESULT + image.sha256, png)
                 write_whole(path, png)
         return image
 
@@ -79,14 +98,18 @@ class PlanImages:
         try:
             png = read_whole(path)
         except OSError:
-            raise InvalidFile(f"the image {sha256[:12]} of a plan is not on the server's disk") from None
+            png = (self._shared and self._shared.result(RESULT + sha256)) or b""
+        if not png:
+            raise InvalidFile(f"the image {sha256[:12]} of a plan is not on the server's disk")
         if hashlib.sha256(png).hexdigest() != sha256:
             raise InvalidFile(f"the image {sha256[:12]} of a plan is damaged: add the plan again")
         return png
 
     def __contains__(self, sha256: str) -> bool:
         """Whether an image is there."""
-        return sha256 in self._beside or self._path(sha256).is_file()
+        if sha256 in self._beside or self._path(sha256).is_file():
+            return True
+        return self._shared is not None and self._shared.result(RESULT + sha256) is not None
 
     def _path(self, sha256: str) -> Path:
         # A name comes from a message: `PlanImage` has checked it, others may not have.

@@ -11,6 +11,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage, PlanPiece, PlanReceived
 from mapweave.mapserver.floor_plans import placed_plans
+from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.plan_images import PlanImages
 from mapweave.mapserver.services import guarded
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -35,6 +36,7 @@ class PlanService:
         annotations: Callable[[], Annotations],
         store: Path,
         beside: Mapping[str, bytes],
+        shared: Store | None = None,
     ) -> None:
         """Begin to answer.
 
@@ -46,10 +48,11 @@ class PlanService:
             annotations: the record, in which the plans are.
             store: path of the server's store, beside which the images are.
             beside: images of the map that the server was given at its start.
+            shared: the store of several servers, which has the images, too.
         """
         self._merged, self._annotations = merged, annotations
         used = {entry.body.image.sha256 for entry in annotations().made if isinstance(entry.body, FloorPlan)}
-        self.images = PlanImages(store, used, beside)
+        self.images = PlanImages(store, used, beside, shared)
         self._lock = threading.Lock()
         self._incoming: dict[str, bytearray] = {}
         self._placed: tuple[MergedMap, Annotations, PlacedPlans] | None = None

@@ -106,6 +106,7 @@ class Quotas:
         self.clock = clock
         self._lock = threading.Lock()
         self._robots: dict[str, _Excess] = {}
+        self._totals: dict[str, int] = {}
 
     def hold_back(self, robot: str, what: str, count: int = 1) -> None:
         """Note that something of a robot is held back, and log it at each power of two."""
@@ -116,6 +117,7 @@ class Quotas:
             before = excess.counts.get(what, 0)
             after = excess.counts[what] = before + count
             excess.last = self.clock()
+            self._totals[what] = self._totals.get(what, 0) + count
         if before.bit_length() != after.bit_length():
             log.warning("%s is over its quota: %d %s held back so far", robot, after, what)
 
@@ -143,6 +145,11 @@ class Quotas:
                 del self._robots[next(iter(self._robots))]
             self._robots[robot] = _Excess(TokenBucket(self.settings.questions, self.clock()))
         return self._robots[robot]
+
+    def totals(self) -> dict[str, int]:
+        """What was held back of all robots since the start, by kind."""
+        with self._lock:
+            return dict(self._totals)
 
     def over(self) -> dict[str, str]:
         """Robots that were over their quotas just now, with what is held back of each, in words."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 from mapweave.hybridmap.agent_status import (
     MAX_ACCUSATION,
@@ -16,12 +17,32 @@ from mapweave.hybridmap.agent_status import (
 )
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.log.ingest import Lag
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
+from mapweave.merge.explanation.map_standing import MapStanding, map_standings
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode
+
+NO_LAG = Lag(0, 0.0)
+UNKNOWN = MapStanding(None, 0, "")
+"""Of a map that is not merged yet."""
+
+
+class Presence(NamedTuple):
+    """What is known of a robot without looking at the map.
+
+    Attributes:
+        alive: whether its agent is there.
+        age: since its last status, s; None if none has come.
+        unsent: changes that no server has acknowledged, by its own count.
+    """
+
+    alive: bool
+    age: float | None
+    unsent: int
 
 
 class Roster:
@@ -34,6 +55,7 @@ class Roster:
         clock: Callable[[], float],
         hear: Callable[[AgentStatus], None],
         quotas: Quotas,
+        lags: Callable[[], Mapping[str, Lag]] = dict,
     ) -> None:
         """Begin to listen.
 
@@ -43,7 +65,10 @@ class Roster:
             clock: only grows, s.
             hear: called with each status.
             quotas: of robots.
+            lags: how far the store is behind each of them.
         """
+        self._lags = lags
+        self._standings: tuple[MergedMap, Mapping[MapId, MapStanding]] = MergedMap.empty(), {}
         self._quotas = quotas
         self._keys, self._clock, self._hear = keys, clock, hear
         self._turn = threading.Lock()
@@ -69,6 +94,18 @@ class Roster:
         with self._turn:
             return self._heard[robot][0] if robot in self._heard else None
 
+    def presence(self) -> Mapping[str, Presence]:
+        """All robots that are heard of, by name: `MAX_ROBOTS` at most."""
+        now = self._clock()
+        with self._turn:
+            known = {name for name, maps in self._alive.items() if maps} | self._heard.keys()
+            found = {}
+            for name in sorted(known)[:MAX_ROBOTS]:
+                status, at = self._heard.get(name, (None, now))
+                age, unsent = (None, 0) if status is None else (max(now - at, 0.0), status.unsent)
+                found[name] = Presence(bool(self._alive.get(name)), age, unsent)
+        return found
+
     def robots(self, places: Places) -> FleetStatus:
         """All robots, with where they are in a merged map."""
         merged = places.merged
@@ -76,7 +113,8 @@ class Roster:
         with self._turn:
             known = {name for name, maps in self._alive.items() if maps} | self._heard.keys()
             heard, alive = dict(self._heard), {name for name, maps in self._alive.items() if maps}
-        over = self._quotas.over()
+        over, lags, standings = self._quotas.over(), self._lags(), self._standings_in(merged)
+        newest_maps = {map_id.agent: map_id for map_id in standings}
         against: dict[str, str] = {}
         for map_id, words in sorted(merged.accusations().items()):
             against[map_id.agent] = words[:MAX_ACCUSATION]
@@ -89,10 +127,24 @@ class Roster:
                 place, floor = places.name_at(component, pose), places.floor_of(component)
             age = max(now - at, 0.0)
             words, accusation = one_line(over.get(name, "")), against.get(name, "")
+            own = newest_maps.get(name) if status is None else status.map
+            newest, links, apart = standings.get(own, UNKNOWN) if own is not None else UNKNOWN
+            missing, lag = lags.get(name, NO_LAG)
             entries.append(
-                RobotEntry(name, name in alive, age, status, pose, component, place, floor, words, accusation)
-            )
+                RobotEntry(
+                    name, name in alive, age, status, pose, component, place, floor, words, accusation,
+                    missing, lag, newest, links, one_line(apart),
+                )
+            )  # fmt: skip
         return FleetStatus(tuple(entries))
+
+    def _standings_in(self, merged: MergedMap) -> Mapping[MapId, MapStanding]:
+        """The standings of a merged map's maps, worked out once."""
+        known, standings = self._standings
+        if known is not merged:
+            standings = map_standings(merged)
+            self._standings = merged, standings
+        return standings
 
     def _take(self, sample: Sample) -> None:
         robot = self._keys.parse_agent_status(sample.key)

@@ -30,10 +30,11 @@ from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
+from mapweave.mapserver.metrics import Metrics, Sources
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.places import Places
@@ -83,23 +84,25 @@ class MapServer:
         self,
         bus: Bus,
         keys: Keys,
-        path: Path,
+        address: Path | str,
         name: str,
         settings: ServerSettings | None = None,
         schedule: Schedule | None = None,
         base: BaseMap | None = None,
+        cache: Path | None = None,
     ) -> None:
         """Open the store and take up where it was left.
 
         Args:
             bus: the connection.
             keys: of the fleet.
-            path: of the store; its folder is made.
+            address: of the store: a file, whose folder is made, or the address of a PostgreSQL database.
             name: of this server in the fleet.
             settings: how it shares its time.
             schedule: runs its work and gives the time; threads and the machine's clock by default. It
                 starts and ends with the server.
             base: a map that is there from the start, beside the store.
+            cache: folder for what is kept beside a store in PostgreSQL; made if it is not there.
 
         Raises:
             InvalidFile: the store is damaged or is none, or has another map of a name that is in the base.
@@ -109,8 +112,9 @@ class MapServer:
         self._name = name
         self._settings = s = settings or ServerSettings()
         self._schedule = clock = schedule or LiveSchedule()
+        path = address if isinstance(address, Path) else (cache or Path()) / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._store = Store(path)
+        self._store = open_store(address, name)
         try:
             self._base = (base or BaseMap()).beside(self._store)
         except InvalidFile:
@@ -119,7 +123,10 @@ class MapServer:
         self._places = PlaceDatabase(self._store, path, [*self._base.nodes()])
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
-        self._worker = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._history)
+        self._metrics = Metrics()
+        self._worker = MergeWorker(
+            clock, MERGE_SHARE, self._places, s.merge, findings, self._history, self._metrics.merged
+        )
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
         self._pins, self._floors = self._annotations.annotations.pins, self._annotations.annotations.floors
@@ -141,19 +148,23 @@ class MapServer:
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
             self._quotas, lambda: self._constraints.constraints.retired, worker.unmerged, worker.note_refusal,
+            self._metrics.acknowledged,
         )  # fmt: skip
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,
             lambda: self._annotations.annotations, self._path, base.images,
+            self._store if self._store.shared else None,
         )  # fmt: skip
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
-        self._roster = Roster(self._bus, self._keys, clock.monotonic, self._hear, self._quotas)
+        self._roster = Roster(
+            self._bus, self._keys, clock.monotonic, self._hear, self._quotas, self._ingest.lags
+        )
         self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
             self._events, self._missions, self._roster,
             clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places, self._plans.files,
-            self._quotas,
+            self._quotas, self._metrics.relocalized,
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
@@ -166,6 +177,7 @@ class MapServer:
             lambda: self._constraints.constraints, self._apply_annotations,
         )  # fmt: skip
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
+        self._metrics.read(self._sources())
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
         clock.every(EVERY, self._places.save_if_worthwhile)
@@ -211,7 +223,7 @@ class MapServer:
         return {
             **merged.counts(),
             "over_quota": ", ".join(self._quotas.over())[:1000],
-            "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
+            "damaged": self._damaged(),
             "event": self._ingest.failure or self._worker.event,
             "settled": self._worker.settled,
             "bytes": traffic.payload_bytes,
@@ -231,7 +243,7 @@ class MapServer:
         Raises:
             Busy: too many ask.
         """
-        return self._admission.submit(lambda: self._services.locate(look()), ticket)
+        return self._services.locate(look, ticket)
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
         """Ask why nodes or maps are linked or are not, or why a route leads so, from any thread.
@@ -349,6 +361,23 @@ class MapServer:
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file."""
         return self._services.map_file()
+
+    def metrics(self) -> bytes:
+        """What Prometheus scrapes, in its text format; from any thread."""
+        return self._metrics.scrape()
+
+    def _sources(self) -> Sources:
+        worker, ingest = self._worker, self._ingest
+        return Sources(
+            self._path, ingest.counters, worker.counters, lambda: worker.answers.merged.counts(),
+            self._quotas.totals, self._admission.counters, ingest.lags, self._roster.presence,
+            self._quotas.over, self._damaged, lambda: {"ingest": ingest.waiting, **worker.queues()},
+            lambda: bool(ingest.failure), lambda: worker.settled,
+        )  # fmt: skip
+
+    def _damaged(self) -> int:
+        """Changes that are damaged on the disk."""
+        return sum(gap.last - gap.first + 1 for gap in self._store.damaged())
 
     def _constrain(self) -> None:
         """Merge by the constraints and the floors of the records."""

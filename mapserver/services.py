@@ -65,6 +65,7 @@ class Services:
         places: Callable[[], Places],
         images: Callable[[], Mapping[str, bytes]],
         quotas: Quotas,
+        observe: Callable[[float, Future[RelocalizeAnswer]], None] = lambda seconds, done: None,
     ) -> None:
         """Begin to answer.
 
@@ -85,9 +86,11 @@ class Services:
             places: named places of the newest merged map. May wait for it.
             images: of the plans, for the map's file.
             quotas: of robots.
+            observe: called with the time from each question for a place to its answer, s, and the answer.
         """
         self._places = places
         self._quotas = quotas
+        self._observe = observe
         self._clock = clock
         self._answers = answers
         self._admission = admission
@@ -150,15 +153,27 @@ class Services:
         return handle
 
     def _relocalize_later(self, request: Request) -> None:
-        work, robot = partial(self._relocalize, request.payload), robot_of(request.key)
-        done = self._admission.submit(work, hash(request.payload), asker=robot)
-        done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
+        look, robot = partial(decode_view, request.payload), robot_of(request.key)
+        done = self.locate(look, hash(request.payload), robot)
+        done.add_done_callback(lambda done: guarded(lambda _: encode(within_range(done.result())))(request))
 
-    def _relocalize(self, payload: bytes) -> bytes:
-        view = decode_view(payload)
-        return encode(within_range(self.locate(view)))
+    def locate(self, look: Callable[[], View], ticket: int, asker: str = "") -> Future[RelocalizeAnswer]:
+        """Ask where a view was taken, from any thread; see `AdmissionControl.submit`.
 
-    def locate(self, view: View) -> RelocalizeAnswer:
+        Args:
+            look: makes the view; called by a worker.
+            ticket: the same if the same image comes again.
+            asker: a robot; empty for people.
+
+        Raises:
+            Busy: too many ask.
+        """
+        began = self._clock()
+        done = self._admission.submit(lambda: self._located(look()), ticket, asker=asker)
+        done.add_done_callback(lambda done: self._observe(self._clock() - began, done))
+        return done
+
+    def _located(self, view: View) -> RelocalizeAnswer:
         """Where a view was taken, with the names of the places; on the floor that the robot knows, if any."""
         answers, places = self._answers(), self._places()
         elsewhere: frozenset[MapId] = frozenset()

@@ -39,9 +39,9 @@ Every command has `--help` with examples. This page is made of the commands them
 """
 FINDING = """## Where the fleet is
 
-`--connect tcp/HOST:7447` names the router, `--fleet NAME` the fleet, `--settings FILE` a file with both and
-all other [settings](settings.md). Without a server or router a command says so within 2 s, in one line with
-what to do.
+`--connect tcp/HOST:7447` names the router, or several, `--fleet NAME` the fleet, `--settings FILE` a file
+with both and all other [settings](settings.md). Without a server or router a command says so within 2 s, in
+one line with what to do.
 
 ## Scripts
 

@@ -341,7 +341,7 @@ class FileMap(Map):
 
 
 def open(path: str | os.PathLike[str]) -> FileMap:
-    """Open a map file, a server's store or an agent's journal. It is never changed.
+    """Open a map file, a server's store, also one in PostgreSQL, or an agent's journal. It is never changed.
 
     Several maps of a store or journal are merged first. Of a damaged one what can be read is opened, with a
     warning that says what is lost.
@@ -350,7 +350,7 @@ def open(path: str | os.PathLike[str]) -> FileMap:
         InvalidFile: it cannot be read, is damaged, in use, or none of these.
         MissingExtra: several maps are merged with the extra "server".
     """
-    opened = open_map(Path(path))
+    opened = open_map(os.fspath(path))
     for complaint in opened.complaints.values():
         warnings.warn(complaint, stacklevel=2)
     if opened.source is MapSource.FILE or len(opened.maps) < 2:

@@ -32,11 +32,11 @@ class Extracted:
     complaint: str
 
 
-def extract_maps(source: Path, folder: Path) -> tuple[list[Extracted], str]:
+def extract_maps(source: Path | str, folder: Path) -> tuple[list[Extracted], str]:
     """Write every robot's own map into a file of a folder. A journal or store must not be in use.
 
     Args:
-        source: map file, journal or store.
+        source: map file, journal or store, also one in PostgreSQL.
         folder: made if it is not there.
 
     Returns:

@@ -48,7 +48,7 @@ class Parts:
     images: Mapping[str, bytes] = field(default_factory=dict)
 
 
-def parts_of(files: Mapping[Path, MapFile]) -> Parts:
+def parts_of(files: Mapping[Path, MapFile] | Mapping[Path | str, MapFile]) -> Parts:
     """The robots' own maps in some files, and the manual constraints in any of them.
 
     The same map twice is taken once. Of an older and a newer state of it the newer one counts: numbers are
@@ -58,10 +58,10 @@ def parts_of(files: Mapping[Path, MapFile]) -> Parts:
         InvalidFile: two files hold different maps of one name, or it cannot be decided which is newer.
     """
     maps: dict[MapId, HybridMap] = {}
-    origin: dict[MapId, Path] = {}
+    origin: dict[MapId, Path | str] = {}
     constraints = ManualConstraints()
     notes: list[str] = []
-    for path, content in sorted(files.items()):
+    for path, content in sorted(files.items(), key=lambda file: str(file[0])):
         if not content.changes:
             notes.append(f"there is nothing in {path}")
         for map_id, hybrid_map in sorted(maps_of(content).items()):

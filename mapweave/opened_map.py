@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -20,10 +21,12 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log import store
-from mapweave.mapserver.log.salvage import Salvage, salvage
+from mapweave.mapserver.log import sqlite_store
+from mapweave.mapserver.log.opening import is_postgres
+from mapweave.mapserver.log.salvage import Salvage, all_of, salvage
+from mapweave.mapserver.log.store import HISTORY
 from mapweave.mapserver.own_maps import maps_of
-from mapweave.mapserver.plan_images import kept_images
+from mapweave.mapserver.plan_images import kept_images, recorded_images
 from mapweave.storage.database_reader import MAGIC as SQLITE
 from mapweave.storage.database_reader import reading
 from mapweave.storage.map_file import MAGIC, MapFile, read_map_file
@@ -50,7 +53,7 @@ class OpenedMap:
     """A map file, store or journal, as it was when it was opened.
 
     Attributes:
-        path: of the file.
+        path: of the file; the address of a PostgreSQL database, without secrets.
         source: what it is.
         content: of a file as it is; of a store or journal all maps, constraints, annotations and history, not
             merged yet.
@@ -58,11 +61,16 @@ class OpenedMap:
         complaints: what of each map could not be read, in one line each; key None: what belongs to no map.
     """
 
-    path: Path
+    path: Path | str
     source: MapSource
     content: MapFile
     maps: tuple[MapId, ...]
     complaints: Mapping[MapId | None, str]
+
+    @property
+    def name(self) -> str:
+        """For people: that of the file, without its folder."""
+        return self.path.name if isinstance(self.path, Path) else self.path
 
     def merged(
         self,
@@ -87,7 +95,7 @@ class OpenedMap:
         constraints = ManualConstraints(self.content.constraints, floors=floors)
         if self.source is MapSource.FILE or (len(maps) < 2 and not constraints.in_force):
             return merged_of(self.content, settings)
-        of_store = self.path if self.source is MapSource.STORE else None
+        of_store = self.path if self.source is MapSource.STORE and isinstance(self.path, Path) else None
         pins = Annotations(self.content.annotations).pins
         return merge_parts(maps, constraints, progress, settings, of_store, pins)
 
@@ -105,12 +113,18 @@ class OpenedMap:
         return map_file_of(merged, self.content.history, said, self.content.images)
 
 
-def open_map(path: Path) -> OpenedMap:
+def open_map(path: Path | str) -> OpenedMap:
     """Open a map file, a server's store or an agent's journal, whatever its name. Nothing is written.
+
+    Args:
+        path: of a file, or the address of a PostgreSQL database with a server's store, which may be in use.
 
     Raises:
         InvalidFile: it is none of these, damaged, truncated, of another version, or in use by a process.
     """
+    if isinstance(path, str) and is_postgres(path):
+        return _of_postgres(path)
+    path = Path(path)
     source = source_of(path)
     if source is MapSource.FILE:
         content = read_map_file(path)
@@ -149,10 +163,10 @@ def source_of(path: Path) -> MapSource:
         raise InvalidFile(f"{path}: cannot be read ({error})") from None
     if kind == journal.APPLICATION_ID:
         return MapSource.JOURNAL
-    if kind != store.APPLICATION_ID:
+    if kind != sqlite_store.APPLICATION_ID:
         raise InvalidFile(f"{path}: {OTHER}")
-    if version != store.VERSION:
-        raise InvalidFile(f"{path}: map store of format {version}, this program uses {store.VERSION}")
+    if version != sqlite_store.VERSION:
+        raise InvalidFile(f"{path}: map store of format {version}, this program uses {sqlite_store.VERSION}")
     return MapSource.STORE
 
 
@@ -167,11 +181,22 @@ def _of_journal(path: Path) -> OpenedMap:
 
 
 def _of_store(path: Path) -> OpenedMap:
-    salvaged = salvage(path)
+    return _of_salvaged(path, salvage(path), lambda annotations: kept_images(path, annotations))
+
+
+def _of_postgres(address: str) -> OpenedMap:
+    # Without the extra `postgres` there is no psycopg.
+    from mapweave.mapserver.log.postgres_store import PostgresStore
+
+    with closing(PostgresStore(address, "reader", read_only=True)) as store:
+        return _of_salvaged(store.address.words, all_of(store), partial(recorded_images, store))
+
+
+def _of_salvaged(
+    path: Path | str, salvaged: Salvage, images: Callable[[Annotations], dict[str, bytes]]
+) -> OpenedMap:
     constraints, bad = _read(salvaged.constraints, ManualConstraint)
-    history, worse = _read(
-        [salvaged.results[store.HISTORY]] if store.HISTORY in salvaged.results else [], KeptHistory
-    )
+    history, worse = _read([salvaged.results[HISTORY]] if HISTORY in salvaged.results else [], KeptHistory)
     annotations, worst = _read(salvaged.annotations, Annotation)
     content = MapFile(
         "agent",
@@ -180,7 +205,7 @@ def _of_store(path: Path) -> OpenedMap:
         constraints=tuple(constraints),
         history=tuple(event for record in history for event in record.events),
         annotations=tuple(annotations),
-        images=kept_images(path, Annotations(tuple(annotations))),
+        images=images(Annotations(tuple(annotations))),
     )
     complaint = _lost(path, salvaged, bad + worse + worst)
     maps = tuple(sorted(salvaged.maps))
@@ -202,7 +227,7 @@ def _read(bodies: Iterable[bytes], kind: type[Value]) -> tuple[list[Value], int]
     return values, bad
 
 
-def _lost(path: Path, salvaged: Salvage, unread: int) -> str:
+def _lost(path: Path | str, salvaged: Salvage, unread: int) -> str:
     """What of a store could not be read, in one line; empty if all could."""
     lost = salvaged.damaged + unread
     if salvaged.whole and not lost:

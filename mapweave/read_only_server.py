@@ -93,7 +93,7 @@ class ReadOnlyServer:
             "settled": True,
             "summary": self._merged.summary(),
             "version": version("mapweave"),
-            "file": self._opened.path.name,
+            "file": self._opened.name,
             "source": str(self._opened.source),
         }
 
@@ -135,7 +135,7 @@ class ReadOnlyServer:
         """
         image = self.plans().plan(name).plan.image
         if image.sha256 not in self._opened.content.images:
-            raise InvalidValue(f"the image of plan {name} is not in {self._opened.path.name}")
+            raise InvalidValue(f"the image of plan {name} is not in {self._opened.name}")
         return self._opened.content.images[image.sha256]
 
     def kept_image(self, sha256: str) -> bytes:
@@ -145,7 +145,7 @@ class ReadOnlyServer:
             InvalidValue: it is not in the file.
         """
         if sha256 not in self._opened.content.images:
-            raise InvalidValue(f"the image {sha256[:12]} is not in {self._opened.path.name}")
+            raise InvalidValue(f"the image {sha256[:12]} is not in {self._opened.name}")
         return self._opened.content.images[sha256]
 
     def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
@@ -182,6 +182,14 @@ class ReadOnlyServer:
         """
         self._refuse("there are no robots to send")
 
+    def metrics(self) -> bytes:
+        """Refuse: nothing changes, so there is nothing to measure.
+
+        Raises:
+            InvalidValue: always.
+        """
+        self._refuse("a map file has no metrics")
+
     def portal_done(self, robot: str, by: str) -> str:
         """Refuse.
 
@@ -216,6 +224,6 @@ class ReadOnlyServer:
 
     def _refuse(self, why: str) -> NoReturn:
         raise InvalidValue(
-            f"{self._opened.path.name} is only shown, and nothing of it changes: {why}; "
+            f"{self._opened.name} is only shown, and nothing of it changes: {why}; "
             "`mapweave server --map FILE` serves it to robots"
         )

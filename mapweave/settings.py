@@ -20,13 +20,16 @@ class NetworkSettings:
 
     Attributes:
         fleet: name that robots, server and simulator share.
-        endpoints: Zenoh endpoints of the router, tried in order. The server listens at them.
+        endpoints: Zenoh endpoints of routers, tried in order; when one fails a robot goes on with the next.
+            A server or router listens at all of them.
+        routers: of a server or router: endpoints of other routers that it joins.
         server: name of the map server that must have a change before the agent may forget it.
         keys: key file of this robot or person; for a server or router the folder of `mapweave keys init`.
     """
 
     fleet: str = "demo"
     endpoints: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    routers: tuple[str, ...] = ()
     server: str = "s0"
     keys: str = ""
 

@@ -17,7 +17,9 @@ from hypothesis import settings
 from tests.simulator import INSTALLED, SkipWithoutSimulator
 
 # Assertions of these modules are rewritten, as in tests.
-pytest.register_assert_rewrite("tests.waiting", "tests.mapweave.command_line", "tests.sim.measured_world")
+pytest.register_assert_rewrite(
+    "tests.waiting", "tests.postgres", "tests.mapweave.command_line", "tests.sim.measured_world"
+)
 
 # The duration of an example means nothing on a busy machine.
 settings.register_profile("patient", deadline=None)
@@ -28,6 +30,8 @@ cv2.setNumThreads(1)
 # files are forbidden, as in images of containers, that is a good part of the time that all tests take.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+pytest_plugins = ["tests.postgres"]
 
 if not INSTALLED:
     sys.meta_path.insert(0, SkipWithoutSimulator())

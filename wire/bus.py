@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A published message."""
+    """A published message.
+
+    Attributes:
+        key: under which it was published.
+        payload: its content.
+        attachment: what is sent beside it.
+        received: when it came, of the monotonic clock, s.
+    """
 
     key: str
     payload: bytes
     attachment: bytes = b""
+    received: float = field(default_factory=time.monotonic, compare=False)
 
 
 class Request(Protocol):
@@ -58,6 +67,12 @@ class Reply:
     retry_after: float = 0.0
 
 
+def never(reply: Reply) -> bool:
+    """Every reply is waited for."""
+    del reply
+    return False
+
+
 class Closing(Protocol):
     """Something declared on the bus that can be taken back."""
 
@@ -86,8 +101,16 @@ class Bus(Protocol):
         """Answer questions. A handler that raises MapweaveError refuses with its text, and Busy its time."""
         ...
 
-    def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
+    def ask(
+        self, key: str, payload: bytes, timeout: float, enough: Callable[[Reply], bool] = never
+    ) -> list[Reply]:
         """Ask everyone who serves the key; waits until all have answered or the time is over.
+
+        Args:
+            key: or a pattern.
+            payload: the question.
+            timeout: longest wait, s.
+            enough: whether a reply ends the wait for others; called in the asking thread with each.
 
         Returns:
             The replies. An empty list means that there is no server.

@@ -14,6 +14,8 @@ RETRY_FIRST = 0.1
 """Pause before the second attempt to connect, s; doubled each time."""
 RETRY_LONGEST = 1.0
 """Longest pause between attempts to connect, s."""
+NEXT_ENDPOINT = 2.0
+"""s that a client with several endpoints spends on one of them. A router gives a handshake as long."""
 LEASE = 2.5
 """After what silence a participant counts as dead, s."""
 QUEUE_LIMIT = 16384
@@ -44,10 +46,11 @@ class BusSettings:
         mode: a client of a router, or the router itself.
         endpoints: routers that a client tries; it takes the first that answers.
         listen: where a router waits for clients.
+        routers: other routers that a router joins; all their clients reach each other then.
         session: id of the Zenoh session, hexadecimal; empty for a random one.
         timestamps: whether what is published gets a time, without which nothing is kept for late subscribers.
-        attempt: of a client to open a connection, s: so long a host that does not answer holds up the next
-            endpoint, and the end of the process. Zenoh's own default is 10.
+        attempt: of a client to open a connection, s: so long a host that does not answer holds up the end of
+            the process, and, up to `NEXT_ENDPOINT`, the next endpoint. Zenoh's own default is 10.
         credentials: prove who this is; None on this machine alone.
         access: who is admitted by a router, and to what; None: all clients to everything.
         fleet: of the rules of `access`.
@@ -56,6 +59,7 @@ class BusSettings:
     mode: Literal["client", "router"] = "client"
     endpoints: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    routers: tuple[str, ...] = ()
     session: str = ""
     timestamps: bool = False
     attempt: float = 10.0
@@ -74,12 +78,15 @@ class BusSettings:
         used = self.endpoints if self.mode == "client" else self.listen
         if not used:
             raise SettingsError("bus: give at least one endpoint, for example " + DEFAULT_ENDPOINT)
-        for endpoint in used:
+        if self.routers and self.credentials is not None and not self.credentials.certified:
+            # Who connects with a password does not learn who is at the other end.
+            raise SettingsError("routers join each other with certificates, not with the passwords of a lab")
+        for endpoint in (*used, *self.routers):
             if not ENDPOINT.fullmatch(endpoint):
                 raise SettingsError(f"endpoint {endpoint!r}: endpoints look like {DEFAULT_ENDPOINT}")
             if self.mode == "router" and self.credentials is None and not is_loopback(endpoint):
                 raise SettingsError(
-                    f"without keys a router listens on this machine alone, not at {endpoint}: make keys with "
+                    f"without keys a router stays on this machine alone, not {endpoint}: make keys with "
                     "`mapweave keys init`, and give them with --keys"
                 )
             if (

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from mapweave.hybridmap.errors import NotConnected
-from mapweave.wire.bus import Closing, Reply, Request, Sample
+from mapweave.wire.bus import Closing, Reply, Request, Sample, never
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.keyexpr import answered, check_key, check_pattern, intersects
 from mapweave.wire.memory_entities import (
@@ -175,7 +175,9 @@ class MemoryBus:
         declared = Service(check_pattern(key), self._dispatcher, self._remove, handler)
         return self._add(self._services, declared)
 
-    def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
+    def ask(
+        self, key: str, payload: bytes, timeout: float, enough: Callable[[Reply], bool] = never
+    ) -> list[Reply]:
         """Ask everyone who serves the key (or a key that the pattern matches)."""
         check_pattern(key)
         collector = Collector()
@@ -183,7 +185,7 @@ class MemoryBus:
         if not self._closed:
             self._hub._ask(self, key, bytes(payload), collector)
         try:
-            return collector.wait(timeout)
+            return collector.wait(timeout, enough)
         finally:
             self._open_questions.discard(collector)
 

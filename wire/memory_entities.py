@@ -154,10 +154,19 @@ class Collector:
             self._missing = 0
             self._changed.notify_all()
 
-    def wait(self, timeout: float) -> list[Reply]:
-        """The answers, as soon as none is missing or the time is over."""
+    def wait(self, timeout: float, enough: Callable[[Reply], bool]) -> list[Reply]:
+        """The answers, as soon as one is enough, none is missing or the time is over."""
         end = time.monotonic() + timeout
-        with self._changed:
-            while self._missing > 0 and (left := end - time.monotonic()) > 0:
-                self._changed.wait(left)
-            return list(self._replies)
+        seen = 0
+        while True:
+            with self._changed:
+                while (
+                    seen == len(self._replies) and self._missing > 0 and (left := end - time.monotonic()) > 0
+                ):
+                    self._changed.wait(left)
+                if seen == len(self._replies):
+                    return list(self._replies)
+                reply = self._replies[seen]
+                seen += 1
+            if enough(reply):
+                return self._replies[:seen]

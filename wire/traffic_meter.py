@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from mapweave.wire.bus import Bus, Closing, Reply, Request, Sample
+from mapweave.wire.bus import Bus, Closing, Reply, Request, Sample, never
 
 
 class TrafficMeter:
@@ -51,11 +51,13 @@ class TrafficMeter:
 
         return self._bus.serve(key, count)
 
-    def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
+    def ask(
+        self, key: str, payload: bytes, timeout: float, enough: Callable[[Reply], bool] = never
+    ) -> list[Reply]:
         """Ask."""
         if self._bus.connected():
             self._count(key, payload)
-        replies = self._bus.ask(key, payload, timeout)
+        replies = self._bus.ask(key, payload, timeout, enough)
         for reply in replies:
             self._count(reply.payload, reply.error)
         return replies

@@ -19,7 +19,7 @@ import zenoh
 
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire import exit_closing
-from mapweave.wire.bus import Closing, Reply, Request, Sample
+from mapweave.wire.bus import Closing, Reply, Request, Sample, never
 from mapweave.wire.bus_settings import QUEUE_LIMIT, RETRY_FIRST, RETRY_LONGEST, BusSettings
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.keyexpr import check_key, check_pattern
@@ -84,28 +84,32 @@ class ZenohBus:
         """Answer questions."""
         return self.declare(Service(self.owner, check_pattern(key), handler))
 
-    def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
+    def ask(
+        self, key: str, payload: bytes, timeout: float, enough: Callable[[Reply], bool] = never
+    ) -> list[Reply]:
         """Ask everyone who serves the key (or a key that the pattern matches)."""
         check_pattern(key)
+        replies: list[Reply] = []
         with self.using_session() as session:
             if session is None:
                 return []
             try:
                 # Every server is asked and every answer kept: the default consolidation holds a quick answer
                 # back until the slowest server's, and takes two answers on one key for one.
-                replies = list(
-                    session.get(
-                        key,
-                        payload=payload,
-                        timeout=timeout,
-                        target=zenoh.QueryTarget.ALL,
-                        consolidation=zenoh.ConsolidationMode.NONE,
-                    )
-                )
+                for one in session.get(
+                    key,
+                    payload=payload,
+                    timeout=timeout,
+                    target=zenoh.QueryTarget.ALL,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                ):
+                    if (reply := read_reply(one)) is not None:
+                        replies.append(reply)
+                        if enough(reply):
+                            break
             except zenoh.ZError as error:
                 log.debug("asking %s failed: %s", key, error)
-                return []
-        return [reply for reply in map(read_reply, replies) if reply is not None]
+        return replies
 
     def announce(self, key: str) -> Closing:
         """Be alive under this key."""

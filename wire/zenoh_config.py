@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import base64
+import json
+from typing import Any
 
 from mapweave.wire.access_rules import access_control
-from mapweave.wire.bus_settings import LEASE, RETRY_FIRST, RETRY_LONGEST, ROUTER_QUEUE, BusSettings
+from mapweave.wire.bus_settings import (
+    LEASE,
+    NEXT_ENDPOINT,
+    RETRY_FIRST,
+    RETRY_LONGEST,
+    ROUTER_QUEUE,
+    BusSettings,
+)
 from mapweave.wire.credentials import Credentials
 from mapweave.wire.keys import Keys
 
@@ -19,6 +28,10 @@ LARGEST = {"put": 2**18, "query": 2**20, "reply": 2**25}
 drops what is larger before anything reads it."""
 
 
+LARGEST_MESSAGE = 2**26
+"""Bytes of a message that a router puts together: twice the largest reply. Zenoh's own default is 1 GiB."""
+
+
 def session_values(settings: BusSettings) -> dict[str, object]:
     """Zenoh's configuration, by path."""
     retry = {
@@ -26,10 +39,13 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "period_max_ms": round(RETRY_LONGEST * 1e3),
         "period_increase_factor": 2,
     }
+    routes = settings.mode == "router"
+    endpoints = settings.routers if routes else settings.endpoints
+    attempt = settings.attempt if len(endpoints) == 1 else min(settings.attempt, NEXT_ENDPOINT)
     values: dict[str, object] = {
         "mode": settings.mode,
-        "connect/endpoints": list(settings.endpoints) if settings.mode == "client" else [],
-        "listen/endpoints": list(settings.listen) if settings.mode == "router" else [],
+        "connect/endpoints": list(endpoints),
+        "listen/endpoints": list(settings.listen) if routes else [],
         "connect/retry": retry,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -38,12 +54,13 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         # With Zenoh's own 100 and 10 s, a hundred idle connections keep all others out for 10 s.
         "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT * 1e3),
-        "transport/unicast/open_timeout": round(settings.attempt * 1e3),
+        "transport/unicast/open_timeout": round(attempt * 1e3),
         "transport/link/tx/lease": round(LEASE * 1e3),
-        "transport/link/tx/queue/size/data": ROUTER_QUEUE if settings.mode == "router" else 2,
+        "transport/link/tx/queue/size/data": ROUTER_QUEUE if routes else 2,
         "transport/shared_memory/enabled": False,
     }
-    if settings.mode == "router":
+    if routes:
+        values["transport/link/rx/max_message_size"] = LARGEST_MESSAGE
         values["low_pass_filter"] = [
             {"id": name, "flows": ["ingress"], "messages": [name], "key_exprs": ["mapweave/**"],
              "size_limit": size}
@@ -54,7 +71,7 @@ def session_values(settings: BusSettings) -> dict[str, object]:
     if settings.timestamps:
         values["timestamping/enabled"] = True
     if settings.credentials is not None:
-        values |= _proof(settings.credentials, settings.mode == "router")
+        values |= _proof(settings.credentials, settings)
     if settings.access is not None:
         certified = settings.credentials is not None and settings.credentials.certified
         values["access_control"] = access_control(Keys(settings.fleet), settings.access, certified)
@@ -63,18 +80,37 @@ def session_values(settings: BusSettings) -> dict[str, object]:
     return values
 
 
-def _proof(credentials: Credentials, listens: bool) -> dict[str, object]:
+def router_file(settings: BusSettings) -> str:
+    """The same as a configuration file, for a zenohd."""
+    tree: dict[str, Any] = {}
+    for path, value in session_values(settings).items():
+        *folders, last = path.split("/")
+        node = tree
+        for folder in folders:
+            node = node.setdefault(folder, {})
+        node[last] = value
+    return json.dumps(tree, indent=2)
+
+
+def _proof(credentials: Credentials, settings: BusSettings) -> dict[str, object]:
     if not credentials.certified:
         return {
             "transport/auth/usrpwd/user": credentials.name,
             "transport/auth/usrpwd/password": credentials.password,
         }
-    side = "listen" if listens else "connect"
+    sides = {"client": ("connect",), "router": ("listen", "connect") if settings.routers else ("listen",)}
+    own = {
+        f"{side}_{part}_base64": _base64(text)
+        for side in sides[settings.mode]
+        for part, text in (
+            ("private_key", credentials.private_key),
+            ("certificate", credentials.certificate),
+        )
+    }
     return {
         "transport/link/tls": {
             "root_ca_certificate_base64": _base64(credentials.authority),
-            f"{side}_private_key_base64": _base64(credentials.private_key),
-            f"{side}_certificate_base64": _base64(credentials.certificate),
+            **own,
             "enable_mtls": True,
             "close_link_on_expiration": True,
             # A router has whatever address the network gave it. Its certificate is one of the fleet's

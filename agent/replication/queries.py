@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -10,6 +11,7 @@ from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
+    Certainty,
     KnownAnswer,
     KnownRequest,
     RelocalizeAnswer,
@@ -21,6 +23,8 @@ from mapweave.hybridmap.query import (
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode, encode_view
 from mapweave.wire.senders import sent_by
+
+Said = RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer
 
 FARTHEST = 100.0
 """m; no robot sees a node, or drives from one node to the next, from further away. Nodes of recordings from
@@ -51,9 +55,7 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
     return sent_by(keys.any_route(), robot), encode(request)
 
 
-def decode_answer(
-    question: Question, payload: bytes
-) -> RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer:
+def decode_answer(question: Question, payload: bytes) -> Said:
     """A server's answer to a question.
 
     Raises:
@@ -82,6 +84,34 @@ def decode_answer(
         if frozenset((a, b)) in blocked:
             raise InvalidMessage(f"route: it leads from {a} to {b}, where the robot did not get through")
     return route
+
+
+def settles(answer: Said) -> bool:
+    """Whether no other server's answer is waited for.
+
+    One that is new, or gets its store again, does not know yet what others do. And a robot drives only where
+    every server lets it.
+    """
+    match answer:
+        case RelocalizeAnswer():
+            return answer.certainty in (Certainty.FOUND, Certainty.PLACE)
+        case RouteAnswer():
+            return bool(answer.legs)
+    return False
+
+
+def best(answers: Sequence[Said]) -> Said:
+    """The one of several servers' answers that a robot acts on; of equals the first."""
+
+    def rank(answer: Said) -> tuple[bool, float]:
+        match answer:
+            case ReserveAnswer():
+                return not answer.closed, answer.granted
+            case KnownAnswer():
+                return False, -len(answer.views)
+        return not settles(answer), 0.0
+
+    return min(answers, key=rank)
 
 
 def _check_near(pose: Pose2, name: str) -> None:

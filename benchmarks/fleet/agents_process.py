@@ -100,7 +100,7 @@ class Agent:
         self.journal = TimedJournal(Path(orders.folder) / f"{name}.sqlite", name)
         self._map = self.journal.open_map(1)
         self._replicator = Replicator(self._bus, keys, self.journal, self._map, (SERVER,))
-        self._client = FleetClient(self._bus, keys, self._map, MissionControl(name), server=SERVER)
+        self._client = FleetClient(self._bus, keys, self._map, MissionControl(name))
         self.submitted: list[float] = []
         self.stops: list[list[ChangeBody]] = drive(number, stops, orders.seed).changes[::-1]
 

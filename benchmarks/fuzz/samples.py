@@ -35,7 +35,7 @@ from mapweave.hybridmap.query import (
     Whereabouts,
 )
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import MapFile, pack_map_file
@@ -120,7 +120,7 @@ class Samples:
         """A server's store, as a file."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "s0.sqlite"
-            store = Store(path)
+            store = SqliteStore(path)
             entries = [Entry(change.sequence, encode_change(change), change) for change in self.changes]
             store.apply(self.map_id, 5, entries)
             store.close()

@@ -36,7 +36,7 @@ from mapweave.hybridmap.constraint_subject import read_end
 from mapweave.hybridmap.errors import InvalidMessage, MapweaveError
 from mapweave.identities.key_file import read_key_file
 from mapweave.mapserver.http.form import read_photo
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.settings import load_settings
 from mapweave.storage.image_file import decode_grey
 from mapweave.storage.map_file import pack_map_file, unpack_map_file
@@ -190,7 +190,7 @@ def _file(name: str, read: Callable[[Path], object]) -> Callable[[bytes, Path], 
 
 
 def _read_store(path: Path) -> None:
-    store = Store(path)
+    store = SqliteStore(path)
     try:
         for map_id in store.maps():
             store.watermark(map_id)

@@ -46,6 +46,7 @@ from mapweave.hybridmap.query import Certainty, View
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.active_nodes import ActiveNodes
 from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.pruning import DAY_NS
@@ -134,7 +135,7 @@ def run(
     merger, merged, curve = Merger(), MergedMap.empty(), list[Drive]()
     truth: dict[NodeId, Pose2] = {}
     folder = TemporaryDirectory()
-    path, early = Path(folder.name) / "store.db", Store(Path(folder.name) / "early.db")
+    path, early = Path(folder.name) / "store.db", SqliteStore(Path(folder.name) / "early.db")
     at_first = resident()
     for epoch in track(range(1, drives + 1), "driving", console=console):
         if epoch > 1 and moved:
@@ -157,7 +158,7 @@ def run(
         node_ms = 1e3 * (taken - began) / len(nodes)
         plan = merger.plan_pruning(now_ns, keep_days)
         # A store that is closed is one file.
-        with closing(Store(path)) as store:
+        with closing(SqliteStore(path)) as store:
             store.apply(map_id, 1, entries)
             if plan is not None:
                 store.prune(plan.nodes, plan.edges, merger.pruning.records(plan))

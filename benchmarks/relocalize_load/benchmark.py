@@ -37,7 +37,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.hybridmap.query import RelocalizeAnswer, RouteRequest, View
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_change
@@ -72,7 +72,7 @@ class Building:
     def make(cls, nodes: int, store: Path, rng: np.random.Generator) -> Building:
         """Map so many nodes and write them to a store."""
         building = cls({}, {})
-        database = Store(store)
+        database = SqliteStore(store)
         for number in range(math.ceil(nodes / ROOM_NODES)):
             x, map_id = 20.0 * number, MapId(f"r{number}", 1)
             world = room(x, 0, 5, 4, 700, rng)

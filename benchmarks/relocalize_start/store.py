@@ -25,6 +25,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import snap
 from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.wire.codec import encode_change
 
@@ -48,7 +49,7 @@ def fill(
         total: nodes wanted.
         progress: called with the number of new nodes.
     """
-    store = Store(path)
+    store = SqliteStore(path)
     for number in sorted({place.site for place in places}):
         here = [place for place in places if place.site == number]
         _keep(store, MapId(f"m{number}", 1), _surveyed([place.node for place in here]))

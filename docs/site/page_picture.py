@@ -20,7 +20,7 @@ from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.node import NodeId
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
@@ -41,7 +41,7 @@ MERGED = 240.0
 @contextmanager
 def page_of(building: Building, folder: Path) -> Iterator[Browser]:
     """The page of a server with the robots' maps."""
-    store = Store(folder / "s0.sqlite")
+    store = SqliteStore(folder / "s0.sqlite")
     for robot in range(building.robots):
         log = list(building.log(robot))
         map_id = log[0][0]

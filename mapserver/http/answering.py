@@ -35,6 +35,9 @@ class Answering(Annotating, Planning, Shown, Protocol):
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file."""
 
+    def metrics(self) -> bytes:
+        """What Prometheus scrapes."""
+
     def portal_done(self, robot: str, by: str) -> str:
         """Tell a robot that it was taken through a portal."""
 

@@ -11,6 +11,7 @@
     GET /route        explanation of the route from a to b: ?a=r0.1.17&b=r1.1.5, JSON
     GET /robots       what every robot is doing, JSON
     GET /missions     the missions that are known, JSON
+    GET /metrics      what Prometheus scrapes
     GET /map          the merged map, a map file
     GET /annotations  what people say about the map: named places and so on, JSON
     POST /annotations JSON: adds an annotation, or withdraws one
@@ -81,13 +82,26 @@ MISSION = "/robots/ROBOT/go?goal=GOAL"
 OF_ROBOTS = tuple(f"/robots/ROBOT/{word}" for word in ("explore", "stop", "portal-done"))
 METHODS = {
     **dict.fromkeys(
-        (*PAGES, "/session", "/status", "/history", "/explain", "/route", "/robots", "/missions", "/map"),
+        (
+            *PAGES,
+            "/session",
+            "/status",
+            "/history",
+            "/explain",
+            "/route",
+            "/robots",
+            "/missions",
+            "/map",
+            "/metrics",
+        ),
         "GET",
     ),
     **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
     **dict.fromkeys(("/relocalize", MISSION, *OF_ROBOTS, "/stop", "/login", "/logout"), "POST"),
 }
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+"""Of the text format of Prometheus."""
 BY = "http"
 """Gives a mission, if the request does not say."""
 
@@ -191,6 +205,7 @@ class Questions:
             ("GET", "/route", "explain", self._explain),
             ("GET", "/robots", "robots", self._robots),
             ("GET", "/missions", "missions", self._missions),
+            ("GET", "/metrics", "robots", self._metrics),
             ("GET", "/map", "map", self._map),
             ("GET", "/nodes/{node}", "map", self._node),
             ("GET", "/annotations", "annotations", self._annotations),
@@ -260,6 +275,9 @@ class Questions:
 
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
+
+    async def _metrics(self, _: Request) -> Response:
+        return Response(await run_in_threadpool(self._server.metrics), media_type=CONTENT_TYPE)
 
     async def _annotations(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(annotations_json, self._server)

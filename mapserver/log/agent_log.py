@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 from mapweave.hybridmap.node import MapId
@@ -10,6 +11,8 @@ from mapweave.mapserver.log.integrity import Gap
 from mapweave.wire.log_messages import MAX_REFUSALS, MAX_ROWS, LogRequest, Refusal
 
 NEVER = float("inf")
+MOST_ANNOUNCED = 64
+"""Announcements that are kept while changes are missing; beyond, each two become one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,18 +67,46 @@ class AgentLog:
     resting_until: float = -NEVER
     _pause: float = 0.0
     _ahead_bytes: int = 0
+    _announced: deque[tuple[int, float]] = field(default_factory=deque)
+    _received: dict[int, float] = field(default_factory=dict)
 
-    def offer(self, entry: Entry) -> None:
-        """Keep a change until its turn comes, if there is room."""
+    def announce(self, newest: int, now: float) -> None:
+        """Take note that the log goes up to this sequence number."""
+        if newest <= self.newest:
+            return
+        self.newest = newest
+        self._announced.append((newest, now))
+        if len(self._announced) > MOST_ANNOUNCED:
+            *older, last = self._announced
+            pairs = zip(older[::2], older[1::2], strict=True)
+            self._announced = deque([*((later, began) for (_, began), (later, _) in pairs), last])
+
+    def lag(self, now: float) -> float:
+        """For how long a change is known of that is not settled, s; 0 if all are.
+
+        Never less than it is, and at most a few percent more.
+        """
+        return max(now - self._announced[0][1], 0.0) if self._announced else 0.0
+
+    def offer(self, entry: Entry, received: float | None = None) -> None:
+        """Keep a change until its turn comes, if there is room.
+
+        Args:
+            entry: the change.
+            received: when it was; None if it did not come by itself.
+        """
         size = self._ahead_bytes + len(entry.message)
         room = len(self.ahead) < self.settings.ahead and size <= self.settings.ahead_bytes
         if room or entry.sequence == self.watermark + 1:
             self.ahead[entry.sequence] = entry
             self._ahead_bytes = size
+            if received is not None:
+                self._received[entry.sequence] = received
 
     def forget_ahead(self) -> None:
         """Drop the changes that wait for their turn; they will be pulled."""
         self.ahead.clear()
+        self._received.clear()
         self._ahead_bytes = 0
 
     def next_run(self) -> list[Entry]:
@@ -85,13 +116,21 @@ class AgentLog:
             run.append(entry)
         return run
 
-    def settled(self, applied: Applied) -> None:
-        """Take note of what is committed."""
+    def settled(self, applied: Applied) -> list[float]:
+        """Take note of what is committed.
+
+        Returns:
+            When those of the changes were received that came by themselves.
+        """
         self.watermark = applied.watermark
         self.newest = max(self.newest, self.watermark)
         self.ahead = {sequence: e for sequence, e in self.ahead.items() if sequence > self.watermark}
         self._ahead_bytes = sum(len(entry.message) for entry in self.ahead.values())
         self.refusals = (*self.refusals, *applied.refusals)[-MAX_REFUSALS:]
+        while self._announced and self._announced[0][0] <= self.watermark:
+            self._announced.popleft()
+        settled = [sequence for sequence in self._received if sequence <= self.watermark]
+        return [self._received.pop(sequence) for sequence in settled]
 
     def heard(self, now: float) -> None:
         """The agent is reachable: shorten the wait for the next attempt."""

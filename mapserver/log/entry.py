@@ -78,11 +78,13 @@ class Applied:
         changes: that are new, in order; they are on the disk.
         refusals: that were refused now, in order; that is on the disk too.
         watermark: every change up to this one is settled.
+        before: every change up to this one was settled already; by another server, if this one did not know.
     """
 
     changes: tuple[Change, ...]
     refusals: tuple[Refusal, ...]
     watermark: int
+    before: int = 0
 
 
 class Position(NamedTuple):

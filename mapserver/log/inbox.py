@@ -32,6 +32,11 @@ class Inbox(Generic[_T]):
             self._changed.notify()
         return taken
 
+    def __len__(self) -> int:
+        """What waits."""
+        with self._changed:
+            return len(self._items)
+
     def interrupt(self) -> None:
         """End the wait."""
         with self._changed:

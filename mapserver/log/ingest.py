@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
@@ -62,6 +63,18 @@ class IngestSettings:
     retry_interval: float = 1.0
 
 
+class Lag(NamedTuple):
+    """How far the store is behind a robot.
+
+    Attributes:
+        missing: changes that are known of and not settled.
+        seconds: for how long one of them is known of.
+    """
+
+    missing: int
+    seconds: float
+
+
 MOST_AHEAD = 10_000_000
 """Changes that a server may lack of a log: a robot makes about one a second, and a year has 3e7."""
 
@@ -89,6 +102,7 @@ class Ingest:
         retired: Callable[[], Collection[MapId]] = tuple,
         unmerged: Callable[[str], int] = lambda robot: 0,
         note_refusal: Callable[[MapId, str], None] = lambda map_id, reason: None,
+        observe_ack: Callable[[float], None] = lambda seconds: None,
     ) -> None:
         """Replay the store, then listen.
 
@@ -108,6 +122,8 @@ class Ingest:
             retired: maps that do not count for them.
             unmerged: how many changes of a robot were passed on and wait.
             note_refusal: called for a map of which a change was refused or is not believed, with the reason.
+            observe_ack: called for each published change with the time from its receipt to its
+                acknowledgement, s.
 
         Raises:
             InvalidFile: the store cannot be read.
@@ -115,7 +131,7 @@ class Ingest:
         self._bus, self._keys, self._store, self._name = bus, keys, store, check_name(server_name)
         self._objection, self._taken = objection, tuple(taken)
         self._quotas, self._unmerged = quotas or Quotas(clock=time.monotonic), unmerged
-        self._on_change, self._note_refusal = on_change, note_refusal
+        self._on_change, self._note_refusal, self._observe_ack = on_change, note_refusal, observe_ack
         self._counters = IngestCounters()
         self._settings = settings or IngestSettings()
         self._logs: dict[MapId, AgentLog] = {}
@@ -155,6 +171,20 @@ class Ingest:
     def counters(self) -> IngestCounters:
         """Counters since the start."""
         return self._counters
+
+    def lags(self) -> dict[str, Lag]:
+        """How far the store is behind each robot, by name; from any thread."""
+        now, lags = time.monotonic(), dict[str, Lag]()
+        for agent_log in list(self._logs.values()):
+            before = lags.get(agent_log.map.agent, Lag(0, 0.0))
+            missing = max(agent_log.newest - agent_log.watermark, 0)
+            lags[agent_log.map.agent] = Lag(before.missing + missing, max(before.seconds, agent_log.lag(now)))
+        return lags
+
+    @property
+    def waiting(self) -> int:
+        """Messages that wait for their turn."""
+        return len(self._work)
 
     @property
     def failure(self) -> str:
@@ -245,7 +275,7 @@ class Ingest:
             log.info("%s %d came damaged (%s), pulling it", map_id, mark.sequence, entry.change)
         else:
             intake.keep_ahead_of(agent_log)
-            agent_log.offer(entry)
+            agent_log.offer(entry, sample.received)
         return agent_log
 
     def _take_head(self, sample: Sample) -> AgentLog | None:
@@ -343,7 +373,7 @@ class Ingest:
             reason = f"change {newest} is announced, where {agent_log.watermark} have come"
             self._note_refusal(agent_log.map, reason)
             raise InvalidMessage(f"{agent_log.map}: {reason}")
-        agent_log.newest = max(agent_log.newest, newest)
+        agent_log.announce(newest, time.monotonic())
 
     def _refuse(self, map_id: MapId, log_id: int, reason: str, watermark: int = 0) -> None:
         """Notify an agent that its log is not taken, or not beyond the watermark."""
@@ -373,7 +403,7 @@ class Ingest:
             self._commit_failed(agent_log, error)
             return
         self._failure = ""
-        agent_log.settled(applied)
+        received = agent_log.settled(applied)
         self._pulls.answers(agent_log.map.agent)
         for refusal in applied.refusals:
             log.warning("refused %s %d: %s", agent_log.map, refusal.sequence, refusal.reason)
@@ -382,6 +412,8 @@ class Ingest:
         self._pass_on(applied.changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.
         self._acknowledge(agent_log)
+        for at in received:
+            self._observe_ack(time.monotonic() - at)
         if full:
             self._rest(agent_log, full)
 

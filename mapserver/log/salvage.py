@@ -12,6 +12,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.integrity import checksum
+from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.storage.database_reader import reading
 from mapweave.wire.codec import decode_body
 
@@ -47,6 +48,21 @@ def salvage(path: Path) -> Salvage:
     """
     with reading(path, "map store") as connection:
         return _read(connection, path)
+
+
+def all_of(store: Store) -> Salvage:
+    """The same of a store that is open."""
+    maps: dict[MapId, HybridMap] = {}
+    changes = 0
+    for map_id in store.maps():
+        for change in store.replay(map_id):
+            maps.setdefault(map_id, HybridMap()).apply(change.body)
+            changes += 1
+    history = store.result(HISTORY)
+    return Salvage(
+        maps, changes, 0, True, tuple(store.constraints()), tuple(store.annotations()),
+        {} if history is None else {HISTORY: history},
+    )  # fmt: skip
 
 
 def _read(connection: sqlite3.Connection, path: Path) -> Salvage:

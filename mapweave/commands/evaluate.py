@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.commands.replay import add_recording, options_of
 
 
@@ -37,7 +37,7 @@ def add_to(commands: Any) -> None:
         "--focal", type=float, metavar="PX", help="focal length for photographs without a camera.toml"
     )
     relocalize.add_argument(
-        "--map", type=Path, metavar="FILE",
+        "--map", type=map_source, metavar="FILE",
         help=f"ask this map instead of mapping a pass: {SOURCES}; truth.csv, if it is of the same clock, "
         "tells where its nodes are",
     )  # fmt: skip

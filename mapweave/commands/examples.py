@@ -7,7 +7,10 @@ import argparse
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "demo": ("mapweave demo --seed 3",),
     "server": ("mapweave server --http 8080", "mapweave server --keys keys --http 0.0.0.0:8080"),
-    "router": ("mapweave router --keys keys",),
+    "router": (
+        "mapweave router --keys keys",
+        "mapweave router --keys keys --print-config",
+    ),
     "sim": ("mapweave sim run passing --one-process",),
     "sim list": ("mapweave sim list",),
     "sim run": ("mapweave sim run office --set world.rooms=5 --seed 7",),

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
-from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.exit_status import DONE, NO
 
 
@@ -21,8 +20,8 @@ def add_to(actions: Any) -> None:
         "`mapweave map diff monday.mapweave tuesday.mapweave`. "
         "Exit status 0: they are the same; 4: they differ; 1: one cannot be read.",
     )
-    parser.add_argument("before", type=Path, metavar="A", help=SOURCES)
-    parser.add_argument("after", type=Path, metavar="B", help="another one")
+    parser.add_argument("before", type=map_source, metavar="A", help=SOURCES)
+    parser.add_argument("after", type=map_source, metavar="B", help="another one")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=run)
 

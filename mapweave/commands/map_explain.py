@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
@@ -27,7 +27,9 @@ def add_to(actions: Any) -> None:
         "is asked, or a map file. A named place may be given instead of a node.",
     )
     parser.add_argument("ends", nargs="*", metavar="NODE|MAP", help="two nodes or two maps")
-    parser.add_argument("--map", type=Path, metavar="FILE", help=f"explain {SOURCES}; no server is asked")
+    parser.add_argument(
+        "--map", type=map_source, metavar="FILE", help=f"explain {SOURCES}; no server is asked"
+    )
     parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the landmarks of the two nodes")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.commands.plan import add_plan_option
 
 FORMATS = ("g2o", "tum", "graphml", "geojson")
@@ -22,7 +22,7 @@ def add_to(actions: Any) -> None:
         "(tum: a file, or a folder if there are several robots), places and edges (graphml), or a route "
         "graph that Nav2's route server loads (geojson).",
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help=SOURCES)
+    parser.add_argument("file", type=map_source, metavar="FILE", help=SOURCES)
     parser.add_argument("--to", choices=FORMATS, required=True, help="format")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder (tum)")
     parser.add_argument(

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.map_input import SOURCES
+from mapweave.commands.map_input import SOURCES, map_source
 
 
 def add_to(actions: Any) -> None:
@@ -20,7 +20,7 @@ def add_to(actions: Any) -> None:
         "file holds into a map file of its own, for example r0.3.mapweave. The agent or server must not be "
         "running. A file that is there already is never written over.",
     )
-    parser.add_argument("source", type=Path, metavar="FILE", help=SOURCES)
+    parser.add_argument("source", type=map_source, metavar="FILE", help=SOURCES)
     parser.add_argument(
         "-o", "--out", type=Path, default=Path(), metavar="DIR", help="folder for the files (default: here)"
     )

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_input import SOURCES, opened
+from mapweave.commands.map_input import SOURCES, map_source, opened
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ def add_to(actions: Any) -> None:
         "disk, and every constraint; a map file (--map) has the history until it was "
         "written.",
     )
-    parser.add_argument("--map", type=Path, metavar="FILE", help=f"of {SOURCES}; no server is asked")
+    parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
     parser.add_argument("--json", action="store_true", help="print one JSON object, with all")
     parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")

@@ -17,10 +17,20 @@ if TYPE_CHECKING:
     from mapweave.offline_merge import Progress
     from mapweave.opened_map import OpenedMap
 
-SOURCES = "a map file (.mapweave), a server's store or an agent's journal (.sqlite)"
+SOURCES = (
+    "a map file (.mapweave), a server's store or an agent's journal (.sqlite), or a store's address "
+    "(postgresql://)"
+)
 
 
-def opened(path: Path) -> OpenedMap:
+def map_source(text: str) -> Path | str:
+    """The value of an option that names a map: a file, or the address of a database."""
+    from mapweave.mapserver.log.opening import is_postgres
+
+    return text if is_postgres(text) else Path(text)
+
+
+def opened(path: Path | str) -> OpenedMap:
     """Open a map; what of it is damaged is reported on stderr.
 
     Raises:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_input import SOURCES, opened
+from mapweave.commands.map_input import SOURCES, map_source, opened
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.hybrid_map import HybridMap
@@ -29,7 +29,7 @@ def add_to(actions: Any) -> None:
         "one map the newer counts. Manual constraints in any of them hold. The result does not depend on the "
         "order of the files.",
     )
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help=SOURCES)
+    parser.add_argument("files", type=map_source, nargs="+", metavar="FILE", help=SOURCES)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the merged map's file")
     parser.add_argument("--json", action="store_true", help="print the outcome as one JSON object")
     parser.add_argument(
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     check_place(arguments.out)
     settings = settings_of(arguments).merge
-    parts = parts_of({path: opened(path).content for path in arguments.files})
+    parts = parts_of({one.path: one.content for one in map(opened, arguments.files)})
     merged = merged_with_progress(parts.maps, parts.constraints, settings, parts.annotations.pins)
     write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations, parts.images))
     joined = joinings((), merged)

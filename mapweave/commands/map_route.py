@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_input import SOURCES, router_of
+from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import add_network
 from mapweave.exit_status import DONE, NO
 
@@ -39,7 +39,7 @@ def add_to(actions: Any) -> None:
     parser.add_argument(
         "--via", action="append", default=[], metavar="PLACE", help="pass this first; may be given again"
     )
-    parser.add_argument("--map", type=Path, metavar="FILE", help=f"of {SOURCES}; no server is asked")
+    parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")

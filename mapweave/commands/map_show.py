@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.node import NodeId
@@ -27,7 +27,7 @@ def add_to(actions: Any) -> None:
         "the same for the same map, whatever file it is in. A robot's own map is drawn with its loop "
         "closures applied; a store, and a journal of several maps, is merged first.",
     )
-    show.add_argument("file", type=Path, help=SOURCES)
+    show.add_argument("file", type=map_source, help=SOURCES)
     show.add_argument("--out", type=Path, metavar="PNG", help="picture (default: next to the file, as .png)")
     show.add_argument(
         "--component", type=int, default=0, metavar="N",
@@ -86,12 +86,12 @@ def run(arguments: argparse.Namespace) -> int:
     for edge in hybrid.edges.values():
         kinds[str(edge.kind)] = kinds.get(str(edge.kind), 0) + 1
     summary = {
-        "file": str(arguments.file),
+        "file": str(source.path),
         "source": str(source.source),
         "kind": content.kind,
         "title": content.title,
         "content_hash": content_hash(content),
-        "bytes": arguments.file.stat().st_size,
+        "bytes": source.path.stat().st_size if isinstance(source.path, Path) else None,
         "maps": sorted({str(n.map) for n in hybrid.nodes}),
         "nodes": len(hybrid.nodes),
         "superseded": len(content.superseded),
@@ -103,7 +103,8 @@ def run(arguments: argparse.Namespace) -> int:
         "landmarks_per_node_median": float(np.median(landmarks)) if landmarks else 0.0,
     }
     if not arguments.no_picture and poses:
-        out = arguments.out or arguments.file.with_suffix(".png")
+        beside = source.path if isinstance(source.path, Path) else Path(source.name.rpartition("/")[2])
+        out = arguments.out or beside.with_suffix(".png")
         components = [
             poses[n.id].apply(n.points_in_robot[n.landmarks.has_depth, :2])
             for n in hybrid.nodes.values()

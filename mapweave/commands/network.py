@@ -28,13 +28,21 @@ def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
     """Arguments with which a process finds its fleet."""
     group = parser.add_argument_group("network")
     group.add_argument("--fleet", metavar="NAME", help="name that robots and server share (default: demo)")
-    word = "listen at" if listens else "connect to"
-    group.add_argument(
-        f"--{'listen' if listens else 'connect'}",
-        metavar="ENDPOINT",
-        dest="endpoint",
-        help=f"Zenoh endpoint to {word} (default: tcp/127.0.0.1:7447, or as the keys say)",
-    )
+    if listens:
+        group.add_argument(
+            "--listen", nargs="+", metavar="ENDPOINT", dest="endpoints",
+            help="Zenoh endpoints to listen at (default: tcp/127.0.0.1:7447, or as the keys say)",
+        )  # fmt: skip
+        group.add_argument(
+            "--connect", nargs="+", metavar="ROUTER", dest="routers",
+            help="other routers to join; the robots of each reach the servers of all (default: none)",
+        )  # fmt: skip
+    else:
+        group.add_argument(
+            "--connect", nargs="+", metavar="ENDPOINT", dest="endpoints",
+            help="Zenoh endpoints of routers; the first in reach is taken, and the next one when it fails "
+            "(default: tcp/127.0.0.1:7447, or as the key says)",
+        )  # fmt: skip
     what = "folder of `mapweave keys init`" if listens else "key file of `mapweave keys add`"
     group.add_argument("--keys", metavar="FOLDER" if listens else "FILE", help=what)
     parser.set_defaults(listens=listens)
@@ -73,9 +81,10 @@ def network_of(arguments: argparse.Namespace, settings: Settings, name: str = ""
         if name and name != owner:
             raise SettingsError(f"{keys} is the key of {owner}, not of {name}")
         fleet, endpoints = key.fleet, key.endpoints if endpoints == default.endpoints else endpoints
-    if arguments.endpoint:
-        endpoints = (arguments.endpoint,)
-    return NetworkSettings(fleet=fleet, endpoints=endpoints, server=given.server, keys=keys)
+    if arguments.endpoints:
+        endpoints = tuple(arguments.endpoints)
+    routers = tuple(arguments.routers or given.routers) if arguments.listens else ()
+    return NetworkSettings(fleet, endpoints, routers, given.server, keys)
 
 
 def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
@@ -116,13 +125,15 @@ def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings,
     from mapweave.wire.bus_settings import BusSettings
 
     if not network.keys:
-        return BusSettings(mode="router", listen=network.endpoints, fleet=network.fleet), None
+        return BusSettings(
+            mode="router", listen=network.endpoints, routers=network.routers, fleet=network.fleet
+        ), None
     folder, default = KeyFolder(Path(network.keys)), NetworkSettings()
     fleet = folder.catalogue.fleet
     if network.fleet not in (default.fleet, fleet):
         raise SettingsError(f"{network.keys} has the keys of fleet {fleet}, not of {network.fleet}")
     listen = () if network.endpoints == default.endpoints else network.endpoints
-    return folder.router(server, listen), folder
+    return folder.router(server, listen, network.routers), folder
 
 
 def key_renewal(
@@ -142,7 +153,7 @@ def key_renewal(
     def say(line: str) -> None:
         print(stamped(line), file=sys.stderr, flush=True)
 
-    return KeyRenewal(bus, folder, server, settings.listen, say, renewed)
+    return KeyRenewal(bus, folder, server, settings, say, renewed)
 
 
 def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[ZenohBus, Keys]:

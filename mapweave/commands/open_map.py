@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.map_input import SOURCES, merged_with_progress, opened
+from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.commands.network import settings_of, stop_on_signals
 
 
@@ -19,7 +19,7 @@ def add_to(commands: Any) -> None:
         "`mapweave open office.mapweave`, then open the address that is printed. The map is only shown: "
         "neither the file nor its folder is ever changed, and there are no robots to send.",
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help=SOURCES)
+    parser.add_argument("file", type=map_source, metavar="FILE", help=SOURCES)
     parser.add_argument(
         "--http", metavar="[HOST:]PORT", default="8080",
         help="where; with --keys people log in, and 0.0.0.0:8080 serves other machines, too (default: 8080)",
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     merged = merged_with_progress(one, settings.merge)
     stop = stop_on_signals()
     with ReadOnlyServer(one, merged, settings.merge) as server, people.serve(server):
-        print(f"{arguments.file}: {merged.summary()}", flush=True)
+        print(f"{one.path}: {merged.summary()}", flush=True)
         print(f"open {people.url} to see it; Ctrl-C ends", flush=True)
         stop.wait()
     return 0

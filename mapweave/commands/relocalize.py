@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.map_input import SOURCES, router_of
+from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import add_network, key_holder, network_of, reach, settings_of
 from mapweave.commands.plan import add_plan_option, plan_of, plan_place
 from mapweave.exit_status import DONE, NO
@@ -42,7 +42,9 @@ def add_to(commands: Any) -> None:
         "--camera", type=Path, metavar="FILE",
         help="camera.toml with the intrinsics (default: next to the image or one folder up)",
     )  # fmt: skip
-    parser.add_argument("--map", type=Path, metavar="FILE", help=f"answer from {SOURCES}; no server is asked")
+    parser.add_argument(
+        "--map", type=map_source, metavar="FILE", help=f"answer from {SOURCES}; no server is asked"
+    )
     parser.add_argument(
         "--draw", type=Path, metavar="PNG",
         help="draw the best candidate's landmarks next to the image, joined where they match",

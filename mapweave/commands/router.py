@@ -22,8 +22,13 @@ def add_to(commands: Any) -> None:
         help="run the router alone, without a map server",
         description="Run the Zenoh router for robots and tools, without a map server. It needs only the "
         "base installation. Maps are not merged; robots keep them on their own disks and send them when a "
-        "map server can be reached.",
+        "map server can be reached. A map server elsewhere joins it with --connect.",
     )
+    parser.add_argument(
+        "--print-config", action="store_true",
+        help="print the configuration as JSON5 for a zenohd, which takes the same, and end; with --keys it "
+        "contains the private key",
+    )  # fmt: skip
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -32,10 +37,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Route until stopped."""
     from mapweave.terminal import log_with_time, stamped
     from mapweave.wire.zenoh_bus import ZenohBus
+    from mapweave.wire.zenoh_config import router_file
 
     log_with_time()
     network = network_of(arguments, settings_of(arguments))
     settings, keys = router_settings(network, network.server)
+    if arguments.print_config:
+        print(router_file(settings))
+        return 0
     stop = stop_on_signals()
     bus = ZenohBus(settings)
     try:

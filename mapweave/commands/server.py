@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from mapweave.commands.map_input import SOURCES, opened
+from mapweave.commands.map_input import SOURCES, map_source, opened
 from mapweave.commands.network import (
     add_network,
     key_renewal,
@@ -37,12 +37,17 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
     parser.add_argument("--data", type=Path, help=f"folder for the store (default: {DATA})")
     parser.add_argument(
+        "--store", metavar="postgresql://...",
+        help="a PostgreSQL database for the store, which several servers may share; --data is then the "
+        "folder for what can be computed again. A password belongs in ~/.pgpass (default: a file in --data)",
+    )  # fmt: skip
+    parser.add_argument(
         "--demo", action="store_true",
         help="show a recorded fleet whose robots move, without any robot; nothing is kept, and the page is "
         "at http://127.0.0.1:8080/ unless --http says otherwise",
     )  # fmt: skip
     parser.add_argument(
-        "--map", type=Path, metavar="FILE",
+        "--map", type=map_source, metavar="FILE",
         help=f"a map that is there from the start, beside the store, and that robots join: {SOURCES}; it is "
         "read at each start and never changed",
     )  # fmt: skip
@@ -63,6 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.errors import SettingsError
     from mapweave.hybridmap.node import check_name
     from mapweave.mapserver.base_map import BaseMap
+    from mapweave.mapserver.log.opening import is_postgres
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
@@ -79,8 +85,10 @@ def run(arguments: argparse.Namespace) -> int:
     name = check_name(arguments.name or network.server)
     router, folder = router_settings(network, name)
     keys = Keys(router.fleet)
-    if arguments.demo and arguments.data is not None:
-        raise SettingsError("--demo keeps nothing: leave out --data")
+    if arguments.demo and (arguments.data is not None or arguments.store is not None):
+        raise SettingsError("--demo keeps nothing: leave out --data and --store")
+    if arguments.store is not None and not is_postgres(arguments.store):
+        raise SettingsError("--store is a PostgreSQL address: postgresql://USER@HOST/DATABASE")
     people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
     if http is not None:
         from mapweave.commands.http_access import http_access
@@ -99,12 +107,13 @@ def run(arguments: argparse.Namespace) -> int:
                 data = Path(stack.enter_context(TemporaryDirectory()))
                 prepare(data, data / f"{name}.sqlite")
             path = data / f"{name}.sqlite"
-            if path.exists() and path.stat().st_size > LARGE:
+            if arguments.store is None and path.exists() and path.stat().st_size > LARGE:
                 print(stamped(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ..."), flush=True)
             base = None
             if arguments.map is not None:
-                base = BaseMap.of(str(arguments.map), opened(arguments.map).content)
-            server = MapServer(bus, keys, path, name, how, schedule, base)
+                given = opened(arguments.map)
+                base = BaseMap.of(str(given.path), given.content)
+            server = MapServer(bus, keys, arguments.store or path, name, how, schedule, base, data)
             if base is not None:
                 print(stamped(f"with {base}"), flush=True)
             stack.enter_context(server)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.missions import fleet_of
@@ -12,6 +13,7 @@ from mapweave.commands.network import add_network
 from mapweave.commands.plan import add_plan_option
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.table import Table
 
     from mapweave.fleet import Fleet
@@ -20,12 +22,22 @@ if TYPE_CHECKING:
 
 SILENT = 5.0
 """A robot that has sent nothing for longer is shown as silent, s; it sends twice a second."""
-COLUMNS = ("robot", "mission", "doing", "at", "nodes", "battery", "unsent", "age", "trouble")
-MAY_LACK = ("battery", "trouble")
+COLUMNS = (
+    "robot", "mission", "doing", "at", "last node", "links", "nodes", "battery", "unsent", "lag", "age",
+    "trouble",
+)  # fmt: skip
+MAY_LACK = ("last node", "links", "battery", "lag", "trouble")
+SPARE = ("links", "last node", "battery")
+"""Left out, the first first, of a terminal on which even cut columns find no room."""
+NUMBERS = ("links", "nodes", "battery", "unsent", "lag")
 LEAST = 9
 """Characters that a column of words keeps on a narrow terminal."""
 EVERY = 0.5
 """Time between two looks, s."""
+TABLE_EVERY = 5.0
+"""Between two tables where there is no terminal, s."""
+MOST_APART = 10
+"""Robots of which it is told below the table why their maps are not merged."""
 
 
 def add_to(commands: Any) -> None:
@@ -34,13 +46,17 @@ def add_to(commands: Any) -> None:
         "status",
         help="what every robot is doing",
         description="List the robots of a running fleet: mission and how far it is, what each is doing, "
-        "where it is in the merged map, battery (if its driver tells it), changes that no server has yet, "
-        "the age of its last message, its last trouble. Example: `mapweave status --watch`. Without a map "
-        "server the robots are asked themselves; their places in the merged map are then unknown.",
+        "where it is in the merged map, its last node there and links of its map with others, battery (if "
+        "its driver tells it), changes that no server has yet and for how long the server has known of one, "
+        "the age of its last message, its last trouble; below, why maps are not merged. "
+        "Example: `mapweave status --watch`. Without a map server the robots are asked themselves; what only "
+        "a server knows is then left out.",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object; with --watch one a line")
     add_plan_option(parser)
-    parser.add_argument("--watch", action="store_true", help="go on until interrupted")
+    parser.add_argument("--watch", action="store_true",
+        help="go on until interrupted: live on a terminal, else a table in 5 s",
+    )  # fmt: skip
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -50,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.live import Live
 
     from mapweave.hybridmap.errors import NotConnected
-    from mapweave.terminal import plain_or_terminal
+    from mapweave.terminal import plain_or_terminal, stamped
 
     with fleet_of(arguments) as fleet:
         if arguments.json:
@@ -62,22 +78,41 @@ def run(arguments: argparse.Namespace) -> int:
         # A line a robot where another program reads.
         console = plain_or_terminal(stderr=False)
         if not arguments.watch:
-            status = fleet.status()
-            rows = table(status, console.width, _plan(fleet, arguments))
-            console.print(rows if status.robots else "no robot is there")
+            console.print(_shown(fleet.status(), console.width, _plan(fleet, arguments)))
             return 0
-        with Live(console=console, auto_refresh=False) as live:
+        with Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext() as live:
             while True:
                 try:
-                    shown: Table | str = table(fleet.status(), console.width, _plan(fleet, arguments))
+                    shown = _shown(fleet.status(), console.width, _plan(fleet, arguments))
                 except NotConnected as error:  # it may come back
                     shown = str(error)
-                live.update(shown, refresh=True)
-                time.sleep(EVERY)
+                if live is not None:
+                    live.update(shown, refresh=True)
+                else:
+                    console.print(stamped("status"), highlight=False)
+                    console.print(shown)
+                time.sleep(EVERY if live is not None else TABLE_EVERY)
 
 
 def _plan(fleet: Fleet, arguments: argparse.Namespace) -> PlacedPlan | None:
     return None if arguments.plan is None else fleet.plans().plan(arguments.plan)
+
+
+def _shown(status: FleetStatus, width: int, plan: PlacedPlan | None) -> RenderableType:
+    """The table, and why maps are not merged."""
+    from rich.console import Group
+    from rich.text import Text
+
+    if not status.robots:
+        return "no robot is there"
+    return Group(table(status, width, plan), *map(Text, apart(status)))
+
+
+def apart(status: FleetStatus) -> list[str]:
+    """Lines that say why maps are not merged: at most `MOST_APART`, and how many more there are."""
+    lines = [f"{one.robot} is not merged: {one.apart}" for one in status.robots if one.apart]
+    more = len(lines) - MOST_APART
+    return [*lines[:MOST_APART], *([f"and {more} more"] if more > 0 else [])]
 
 
 def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Table:
@@ -100,12 +135,15 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
         if column in shown:
             cut = min(max(over, 0), max(widest[column] - LEAST, 0))
             widest[column], over = widest[column] - cut, over - cut
+    for column in (COLUMNS.index(name) for name in SPARE):
+        if over > 0:
+            shown.remove(column)
+            over -= widest[column] + 1
     lines = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for column in shown:
-        number = COLUMNS[column] in ("nodes", "battery", "unsent")
         lines.add_column(
             COLUMNS[column],
-            justify="right" if number else "left",
+            justify="right" if COLUMNS[column] in NUMBERS else "left",
             no_wrap=True,
             width=widest[column],
             overflow="ellipsis",
@@ -116,11 +154,12 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
 
 
 def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
-    """A robot's line: name, mission, doing, place, nodes, battery, unsent changes, age, trouble."""
+    """A robot's line, see `COLUMNS`."""
     status = robot.status
     age = "gone" if not robot.alive else f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
     if status is None:
-        return robot.robot, "", "", "", "", "", "", age, robot.over_quota or robot.accusation
+        known = _newest(robot), _links(robot), "", "", "", _lag(robot), age
+        return robot.robot, "", "", "", *known, robot.over_quota or robot.accusation
     doing = status.status
     mission = ""
     if (report := status.mission) is not None:
@@ -131,14 +170,29 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
         mission,
         f"{doing.doing}: {doing.detail}" if doing.detail else doing.doing,
         _place(robot, plan),
+        _newest(robot),
+        _links(robot),
         str(doing.nodes),
         "" if status.battery is None else f"{status.battery:.0%}",
         str(status.unsent),
+        _lag(robot),
         age,
         robot.over_quota
         or robot.accusation
         or (f"{status.last_error} ({status.error_age:.0f} s ago)" if status.last_error else ""),
     )
+
+
+def _newest(robot: RobotEntry) -> str:
+    return "" if robot.newest is None else str(robot.newest)
+
+
+def _links(robot: RobotEntry) -> str:
+    return "" if robot.newest is None else str(robot.links)
+
+
+def _lag(robot: RobotEntry) -> str:
+    return f"{robot.lag:.1f} s" if robot.missing else ""
 
 
 def _place(robot: RobotEntry, plan: PlacedPlan | None) -> str:

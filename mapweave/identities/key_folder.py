@@ -237,19 +237,21 @@ class KeyFolder:
             raise InvalidValue(f"{name} has no key here; make one with `mapweave keys add {name}`")
         return path
 
-    def router(self, server: str, listen: Sequence[str] = ()) -> BusSettings:
-        """Settings of the fleet's router.
+    def router(self, server: str, listen: Sequence[str] = (), routers: Sequence[str] = ()) -> BusSettings:
+        """Settings of one of the fleet's routers.
 
         Args:
             server: name of the map server, whose key the router has.
             listen: other endpoints than those of the keys.
+            routers: that it joins.
         """
         catalogue = self.catalogue
         good = [Member(one.name, one.role, one.subject) for one in catalogue.identities if not one.revoked]
         bad = [pair for one in catalogue.identities for pair in one.void]
         passwords = str(self.path / PASSWORDS) if self.profile is Profile.LAB else ""
         return BusSettings(
-            mode="router", listen=tuple(listen) or catalogue.listen, fleet=catalogue.fleet,
+            mode="router", listen=tuple(listen) or catalogue.listen, routers=tuple(routers),
+            fleet=catalogue.fleet,
             credentials=read_key_file(self.key_file(server)).credentials,
             access=Access(tuple(good), passwords, tuple(bad)),
         )  # fmt: skip

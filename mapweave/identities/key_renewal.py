@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.identities.key_folder import KeyFolder
+from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials
 from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -22,7 +23,7 @@ class KeyRenewal:
         bus: ZenohBus,
         folder: KeyFolder,
         server: str,
-        listen: Sequence[str],
+        settings: BusSettings,
         say: Callable[[str], None],
         renewed: Callable[[Credentials], None] = lambda credentials: None,
     ) -> None:
@@ -32,12 +33,12 @@ class KeyRenewal:
             bus: the router.
             folder: of the keys, as they were when the router was opened.
             server: name of the map server whose key the router has.
-            listen: endpoints at which it listens.
+            settings: of the router.
             say: takes a line for people.
             renewed: takes the server's own key, which may be another one now.
         """
         self._bus, self._folder, self._server, self._say = bus, folder, server, say
-        self._listen, self._renewed = tuple(listen), renewed
+        self._listen, self._routers, self._renewed = settings.listen, settings.routers, renewed
         self._behind = False
         self._complaint = ""
 
@@ -48,7 +49,7 @@ class KeyRenewal:
                 self._complaint = ""
                 return
             self._behind = True
-            settings = self._folder.router(self._server, self._listen)
+            settings = self._folder.router(self._server, self._listen, self._routers)
             self._bus.reopen(settings)
             if settings.credentials is not None:
                 self._renewed(settings.credentials)

@@ -226,7 +226,7 @@ class Agent:
         self.merged_poses = MergedPoses(self._bus, self._keys, options.name, options.server)
         self._fleet = FleetClient(
             self._bus, self._keys, map_id, self.missions, options.synchronization.answer_timeout,
-            options.server, self.replicator.unacknowledged, self._placed, self._teleoperation,
+            self.replicator.unacknowledged, self._placed, self._teleoperation,
             (self._description.max_forward, self._description.max_turn),
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)

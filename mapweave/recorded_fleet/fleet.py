@@ -12,7 +12,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.recorded_fleet.recording import recorded_maps
 from mapweave.recorded_fleet.robot import RecordedRobot
 from mapweave.wire.bus import Bus
@@ -34,7 +34,7 @@ def prepare(folder: Path, store: Path) -> None:
     Raises:
         MapweaveError: the disk does not take it.
     """
-    with closing(Store(store)) as filled:
+    with closing(SqliteStore(store)) as filled:
         for map_id, changes in recorded_maps().items():
             with closing(Journal(_journal(folder, map_id), map_id.agent)) as journal:
                 journal.open_map(map_id.epoch)

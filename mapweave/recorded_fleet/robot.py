@@ -77,7 +77,7 @@ class RecordedRobot:
         self._control = MissionControl(self._name)
         self._control.unknown_goal = self._unknown
         self._client = FleetClient(
-            bus, keys, map_id, self._control, server=server,
+            bus, keys, map_id, self._control,
             unsent=self._replicator.unacknowledged, placed=lambda: len(self._map.nodes),
         )  # fmt: skip
         first = next(iter(self._map.nodes.values()))

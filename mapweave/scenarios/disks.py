@@ -11,6 +11,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.wire.codec import encode_body
 
@@ -41,7 +42,7 @@ def read_disks(agents: Path, store: Path, robots: Iterable[str]) -> dict[str, Di
     Raises:
         InvalidFile: one is damaged.
     """
-    kept = Store(store)
+    kept = SqliteStore(store)
     try:
         return {robot: _compare(Journal(agents / f"{robot}.sqlite", robot), kept) for robot in robots}
     finally:

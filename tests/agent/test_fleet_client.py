@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.agent.fleet_client import NO_ANSWER, FleetClient
-from mapweave.agent.mission import Answer, Question, WhatIsKnown, WhereAmI, WhichWay
+from mapweave.agent.mission import Answer, MayIDrive, Question, WhatIsKnown, WhereAmI, WhichWay
 from mapweave.agent.mission_control import MissionControl
 from mapweave.hybridmap.agent_status import MAX_STATUS_WORDS, AgentStatus, Status
 from mapweave.hybridmap.camera import Camera
@@ -28,6 +28,7 @@ from mapweave.hybridmap.query import (
     KnownAnswer,
     KnownRequest,
     RelocalizeAnswer,
+    ReserveAnswer,
     RouteAnswer,
     RouteRequest,
     View,
@@ -146,7 +147,7 @@ def other(hub: MemoryHub) -> Iterator[MemoryBus]:
 @pytest.fixture
 def link(hub: MemoryHub) -> Iterator[FleetClient]:
     bus = MemoryBus(hub)
-    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"), answer_timeout=0.5)
+    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"), answer_timeout=20.0)
     yield link
     link.close()
     bus.close()
@@ -323,8 +324,9 @@ def test_a_robot_never_waits(link: FleetClient, other: MemoryBus) -> None:
     assert [answer.number for answer in got] == [1]
 
 
-def test_waiting_ends_when_the_time_is_over(link: FleetClient, other: MemoryBus) -> None:
-    release = threading.Event()
+def test_waiting_ends_when_the_time_is_over(hub: MemoryHub, other: MemoryBus) -> None:
+    release, bus = threading.Event(), MemoryBus(hub)
+    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"), answer_timeout=0.5)
     other.serve(sent_by_any(KEYS.route("s0")), lambda request: release.wait(60))
     begin = time.monotonic()
     for number in (1, 2):
@@ -333,6 +335,81 @@ def test_waiting_ends_when_the_time_is_over(link: FleetClient, other: MemoryBus)
     assert time.monotonic() - begin < 20
     assert [(a.number, a.content) for a in answers] == [(1, None), (2, None)]
     release.set()
+    link.close()
+    bus.close()
+
+
+def answering(other: MemoryBus, server: str, answer: object) -> None:
+    what = {
+        RelocalizeAnswer: KEYS.relocalize, RouteAnswer: KEYS.route, KnownAnswer: KEYS.known,
+        ReserveAnswer: KEYS.reserve,
+    }[type(answer)]  # fmt: skip
+    other.serve(sent_by_any(what(server)), lambda request: request.reply(encode(answer)))
+
+
+def test_a_server_that_knows_the_place_is_not_waited_past(link: FleetClient, hub: MemoryHub) -> None:
+    frozen, other, release = MemoryBus(hub), MemoryBus(hub), threading.Event()
+    frozen.serve(sent_by_any(KEYS.relocalize("s0")), lambda request: release.wait(60))
+    answering(other, "s1", RelocalizeAnswer(Certainty.FOUND, (), "seen before"))
+    link.ask(WhereAmI(1, VIEW))
+    begin = time.monotonic()
+    (answer,) = link.answers(wait=True)
+    assert isinstance(answer.content, RelocalizeAnswer) and answer.content.reason == "seen before"
+    assert time.monotonic() - begin < 15, "less than the time of a question"
+    release.set()
+    frozen.close()
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("question", "worse", "better"),
+    [
+        (
+            WhereAmI(1, VIEW),
+            RelocalizeAnswer(Certainty.UNKNOWN, (), "no map here"), RelocalizeAnswer(Certainty.FOUND, (), ""),
+        ),
+        (
+            WhatIsKnown(1, MAP, 0.0, 0.0, 9.0),
+            KnownAnswer(np.zeros((0, 4), np.float32), ""), KnownAnswer(np.zeros((1, 4), np.float32), ""),
+        ),
+        (
+            MayIDrive(1, HERE, Pose2(), (HERE, THERE)),
+            ReserveAnswer(2, "", None, ""), ReserveAnswer(1, "r7", None, "r7 is there"),
+        ),
+        (
+            MayIDrive(1, HERE, Pose2(), (HERE, THERE)),
+            ReserveAnswer(0, "r7", None, ""), ReserveAnswer(0, "", None, "closed", closed=True),
+        ),
+    ],
+    ids=["where", "known", "right of way", "closed"],
+)  # fmt: skip
+@pytest.mark.parametrize("first", ["worse", "better"])
+def test_of_two_servers_the_one_that_knows_more_is_believed(
+    link: FleetClient, other: MemoryBus, question: Question, worse: object, better: object, first: str
+) -> None:
+    """One of them may be new, or get its store again; and a robot drives only where both let it."""
+    for server, answer in zip(("s0", "s1"), (worse, better)[:: 1 if first == "worse" else -1], strict=True):
+        answering(other, server, answer)
+    link.ask(question)
+    (answer,) = link.answers(wait=True)
+    assert answer.content is not None and encode(answer.content) == encode(better)
+
+
+def test_a_question_that_a_server_took_along_is_asked_again(link: FleetClient, hub: MemoryHub) -> None:
+    """A server dies with the question; the other one takes its place a moment later."""
+    dying, other = MemoryBus(hub), MemoryBus(hub)
+    asked = threading.Event()
+    dying.announce(KEYS.server_alive("s0"))
+    dying.serve(sent_by_any(KEYS.route("s0")), lambda request: asked.set())
+    eventually(link.server_in_reach)
+    link.ask(WhichWay(1, HERE, THERE))
+    assert asked.wait(30)
+    other.announce(KEYS.server_alive("s1"))
+    dying.close()
+    answering(other, "s1", RouteAnswer((), "from s1"))
+    (answer,) = link.answers(wait=True)
+    assert isinstance(answer.content, RouteAnswer) and answer.content.reason == "from s1"
+    other.close()
 
 
 def test_a_refusal_is_quoted_and_another_servers_answer_is_used(link: FleetClient, other: MemoryBus) -> None:

@@ -12,7 +12,7 @@ from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from synthetic.world import room, take_map
 
 
@@ -27,7 +27,7 @@ def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path: Path) -> None
     none = Differences(np.zeros((1, 32), np.float32), np.zeros((1, 128), np.int16))
     distractors, result = Distractors(places, none, 7), list[int]()
     fill(tmp_path / "store", places, distractors, 20, result.append)
-    store = Store(tmp_path / "store")
+    store = SqliteStore(tmp_path / "store")
     assert sum(result) == len(store.present()) == 20
     maps = {map_id: HybridMap(change.body for change in store.replay(map_id)) for map_id in store.maps()}
     assert {map_id: len(outcome.nodes) for map_id, outcome in maps.items()} == {

@@ -14,7 +14,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import MemoryHub
 from synthetic.world import World, room, take_map, take_view
@@ -59,7 +59,7 @@ def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Mapped
 
     def make() -> MappedRoom:
         path = tmp_path_factory.mktemp("store") / "s0.sqlite"
-        store = Store(path)
+        store = SqliteStore(path)
         store.apply(ROBOT, 7, entries, len(entries))
         store.close()
         return MappedRoom(path, world, truth)

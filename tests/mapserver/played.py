@@ -9,7 +9,7 @@ from mapweave.hybridmap.change import Change, NodeRetired
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest, IngestSettings
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.quotas import Quotas
 from mapweave.wire.bus import Request
 from mapweave.wire.codec import encode_change
@@ -81,7 +81,7 @@ class Server:
 
     def begin(self) -> None:
         self.bus = MemoryBus(self.hub)
-        self.store = Store(self.path)
+        self.store = SqliteStore(self.path)
         self.ingest = Ingest(
             self.bus, KEYS, self.store, self.name, lambda c: self.on_change(c), QUICK, quotas=self.quotas
         )

@@ -69,6 +69,9 @@ class StubServices:
     def annotations(self) -> Annotations:
         return Annotations()
 
+    def metrics(self) -> bytes:
+        return b"mapweave_nodes 12.0\n"
+
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         done: Future[RelocalizeAnswer] = Future()
         if isinstance(self.refusal, Busy):

@@ -22,7 +22,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.codec import encode_change
@@ -103,7 +103,7 @@ def serving(path: Path) -> Iterator[Asking]:
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     path = tmp_path / "s0.sqlite"
-    store = Store(path)
+    store = SqliteStore(path)
     for map_id, changes in logs().items():
         store.apply(map_id, 7, entries(map_id, changes), len(changes))
     store.close()
@@ -146,7 +146,7 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         assert listed["constraints"][1]["about"] == {"kind": "nodes", "nodes": ["b.1.5"]}
 
     # Meanwhile b maps on.
-    store = Store(path)
+    store = SqliteStore(path)
     more = logs(4)[B]
     later = [change for change in more if change not in more[:3]][:1] + more[-1:]
     store.apply(B, 7, entries(B, later, 6), 7)
@@ -200,7 +200,7 @@ def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: st
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Asking]:
     path = tmp_path_factory.mktemp("small") / "s0.sqlite"
-    store = Store(path)
+    store = SqliteStore(path)
     for map_id, changes in logs().items():
         store.apply(map_id, 7, entries(map_id, changes), len(changes))
     store.close()

@@ -29,7 +29,7 @@ from mapweave.hybridmap.query import ExplainRequest, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.own_maps import maps_of
@@ -67,7 +67,7 @@ def logs() -> dict[MapId, list[ChangeBody]]:
 def stored(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The bytes of a server's store."""
     path = tmp_path_factory.mktemp("store") / "s0.sqlite"
-    store = Store(path)
+    store = SqliteStore(path)
     for map_id, changes in logs().items():
         entries = [
             Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
@@ -274,7 +274,7 @@ def test_an_incomplete_merge_is_reported(stored: bytes, path: Path) -> None:
     bus, merged = MemoryBus(MemoryHub()), MergedMap.empty()
     with serving(path) as asker:
         merged = merged_of(asker.merged())
-    store, admission, settled = Store(path), AdmissionControl(AdmissionSettings(workers=1)), False
+    store, admission, settled = SqliteStore(path), AdmissionControl(AdmissionSettings(workers=1)), False
     answers = SimpleNamespace(merged=merged, router=Router(merged))
     explainer = Explainer(
         bus, KEYS, "s0", lambda: answers, admission, ConstraintRecord(store),
@@ -310,7 +310,7 @@ def test_other_links_use_the_gate_of_the_merge(path: Path) -> None:
 
 
 def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    store = Store(path)
+    store = SqliteStore(path)
     store.add_constraint(b"rubbish")
     ConstraintRecord(store).add(ManualConstraint(Apart((MapId("r0", 1), MapId("r1", 1))), True, "anna", 5))
     assert [constraint.who for constraint in ConstraintRecord(store).constraints.made] == ["anna"]

@@ -19,6 +19,7 @@ from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.constraint_history import with_constraints
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_history import EXCLUSION_WORDS, MOST_AT_ONCE, MapHistory
 from mapweave.mapserver.merging.merger import Merger
@@ -61,7 +62,7 @@ def two(merger: Merger) -> MergedMap:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store(tmp_path / "s0.sqlite")
+    store = SqliteStore(tmp_path / "s0.sqlite")
     yield store
     store.close()
 
@@ -187,7 +188,7 @@ def test_a_damaged_record_is_replaced_and_reported(store: Store, one: MergedMap)
 def test_a_disk_that_does_not_take_it_ends_nothing(
     tmp_path: Path, one: MergedMap, two: MergedMap, caplog: pytest.LogCaptureFixture
 ) -> None:
-    store = Store(tmp_path / "s0.sqlite")
+    store = SqliteStore(tmp_path / "s0.sqlite")
     history = MapHistory(store)
     history.follow(one)
 
@@ -198,7 +199,7 @@ def test_a_disk_that_does_not_take_it_ends_nothing(
     history.follow(two)
     assert events(history) == [JOINED, PARTED] and "is not kept: the disk is full" in caplog.text
     store.close()
-    store = Store(tmp_path / "s0.sqlite")
+    store = SqliteStore(tmp_path / "s0.sqlite")
     assert events(MapHistory(store)) == [JOINED], "the record of before is whole"
     store.close()
 

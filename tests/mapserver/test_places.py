@@ -29,7 +29,7 @@ from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
@@ -278,7 +278,7 @@ def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.C
     """Two robots in twin rooms, which a running server has merged, until people say that they are not one."""
     rng, path = np.random.default_rng(6), tmp_path / "s0.sqlite"
     world, maps = room(0, 0, 5, 4, 700, rng), [MapId("r0", 1), MapId("r1", 1)]
-    store = Store(path)
+    store = SqliteStore(path)
     for map_id in maps:
         stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
         nodes, edges = take_map(world, map_id, stops, rng)

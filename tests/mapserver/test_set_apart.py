@@ -25,6 +25,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.merger import Merger
@@ -72,7 +73,7 @@ def messages(map_id: MapId, changes: list[ChangeBody]) -> list[bytes]:
 
 def stored(path: Path, logs: dict[MapId, list[bytes]]) -> Store:
     """A store that has taken them in, as far as it does."""
-    store = Store(path)
+    store = SqliteStore(path)
     for map_id, log in logs.items():
         entries = [Entry.read(map_id, k + 1, message) for k, message in enumerate(log)]
         store.apply(map_id, 7, entries, len(entries))

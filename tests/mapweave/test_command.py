@@ -12,10 +12,12 @@ import pytest
 from rich.console import Console
 
 from mapweave.cli import main
-from mapweave.commands.status import COLUMNS, MAY_LACK, cells, table
-from mapweave.exit_status import NO
+from mapweave.commands import status as status_command
+from mapweave.commands.status import COLUMNS, SPARE, cells, table
+from mapweave.exit_status import INTERRUPTED, NO
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.errors import NotConnected
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -173,7 +175,8 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
     entry = RobotEntry("r0", True, 7.04, status, Pose2(1.234, -5.0, 3.14159265), 2)
     assert cells(entry) == (
         "r0", "go to r1.1.5 (kitchen) running 25%", "driving along the route: 0.4 m to node r1.1.5",
-        "1.23,-5.00 180° in part 2", "12", "50%", "3", "7.0 s silent", "no map server answered (61 s ago)",
+        "1.23,-5.00 180° in part 2", "", "", "12", "50%", "3", "", "7.0 s silent",
+        "no map server answered (61 s ago)",
     )  # fmt: skip
     lies = RobotEntry("r1", False, accusation="map r1.1 is implausible: its clock utc runs backwards")
     assert cells(lies)[-1] == lies.accusation
@@ -186,6 +189,46 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         assert ("0.4 m to node r1.1.5" in line) is (width == 240)
 
 
+@pytest.mark.parametrize("terminal", [True, False])
+def test_watching_is_live_on_a_terminal_and_tables_elsewhere(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Into a file it wrote nothing until it was interrupted."""
+    apart = "3 links were found and all refused: [they contradict each other]"
+    entry = RobotEntry(
+        "r0", True, 0.2, None, missing=4, lag=2.5, newest=NodeId("r0", 1, 7), links=0, apart=apart
+    )
+    found: list[FleetStatus | NotConnected] = [
+        FleetStatus(), NotConnected("no map server"), FleetStatus((entry,)),
+    ]  # fmt: skip
+    waited: list[float] = []
+
+    class Found:
+        def __enter__(self) -> Found:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def status(self) -> FleetStatus:
+            if not found:
+                raise KeyboardInterrupt
+            if isinstance(one := found.pop(0), NotConnected):
+                raise one
+            return one
+
+    monkeypatch.setattr(status_command, "fleet_of", lambda arguments: Found())
+    monkeypatch.setattr(time, "sleep", waited.append)
+    console = Console(width=100, force_terminal=terminal)
+    monkeypatch.setattr("mapweave.terminal.plain_or_terminal", lambda **_: console)
+    assert main(["status", "--watch"]) == INTERRUPTED
+    printed = capsys.readouterr().out
+    assert waited == [status_command.EVERY if terminal else status_command.TABLE_EVERY] * 3
+    for words in ("no robot is there", "no map server", "r0.1.7", "2.5 s", f"r0 is not merged: {apart}"):
+        assert words in printed
+    assert ("\x1b[" in printed) is terminal
+
+
 def test_a_terminal_of_80_columns_shows_every_column() -> None:
     """Each was cut to three characters there: `ro… mission doing at no… batt… un… age last tro…`."""
     robots = []
@@ -196,12 +239,17 @@ def test_a_terminal_of_80_columns_shows_every_column() -> None:
         status = AgentStatus(
             doing, 1, name, 1, 1234, mission=mission, battery=0.5 if trouble else None, last_error=trouble
         )
-        robots.append(RobotEntry(name, True, 7.04, status, Pose2(-12.345, -5.0, 3.0), 2))
+        robots.append(
+            RobotEntry(
+                name, True, 7.04, status, Pose2(-12.345, -5.0, 3.0), 2, missing=3 * bool(trouble), lag=12.345,
+                newest=NodeId(name, 1, 128), links=4,
+            )
+        )  # fmt: skip
     for shown in (robots[:1], robots):
         lines = Console(width=80, file=(printed := io.StringIO()))
         lines.print(table(FleetStatus(tuple(shown)), 80))
         head, *rows = printed.getvalue().splitlines()
-        assert [name for name in COLUMNS if name in head] == (
-            [name for name in COLUMNS if name not in MAY_LACK] if shown == robots[:1] else list(COLUMNS)
-        ), head
+        lacking = {"battery", "lag", "trouble"} if shown == robots[:1] else {*SPARE}
+        assert [name for name in COLUMNS if name in head] == [c for c in COLUMNS if c not in lacking], head
+        assert ("12.3 s" in rows[-1]) is (shown == robots)
         assert all("128" in row and "1234" in row and "7.0 s silent" in row for row in rows), rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -209,7 +210,7 @@ def test_the_extras_are_those_of_the_package() -> None:
     package = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     installed = packages_distributions()
     for extra, modules in MODULES.items():
-        named = {requirement.split(">")[0] for requirement in package[extra]}
+        named = {re.split(r"[\[>]", requirement)[0] for requirement in package[extra]}
         present = [module for module in modules if module in installed]
         assert {installed[module][0] for module in present} <= named, extra
         assert len(named) == len(modules), extra

@@ -21,7 +21,7 @@ from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_files import epochs_of_files
 from mapweave.scenarios.children import Children, free_port
@@ -211,7 +211,7 @@ def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, 
     from mapweave.hybridmap.change import Change
 
     path = tmp_path / "s0.sqlite"
-    store = Store(path)
+    store = SqliteStore(path)
     for epoch in (1, 2):
         map_id = MapId("r0", epoch)
         encoded = encode_change(Change(map_id, 1, 0, renumbered(epoch)))

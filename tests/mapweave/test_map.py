@@ -21,7 +21,7 @@ from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.explanation import PairExplanation
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import unpack_map_file
 from mapweave.wire.codec import encode_change
@@ -56,7 +56,7 @@ class Running:
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[Running]:
     rng = np.random.default_rng(2)
-    store = Store(tmp_path / "s.sqlite")
+    store = SqliteStore(tmp_path / "s.sqlite")
     places: dict[str, mapweave.Pose2] = {}
     made: dict[str, mapweave.Node] = {}
     for map_id in MAPS:

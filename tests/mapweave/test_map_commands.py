@@ -21,7 +21,7 @@ from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import merged_of
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
@@ -349,7 +349,7 @@ def serving(folder: Path, port: int) -> Iterator[None]:
 
 @pytest.mark.slow
 def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path: Path) -> None:
-    store = Store(tmp_path / "s0.sqlite")
+    store = SqliteStore(tmp_path / "s0.sqlite")
     for map_id, changes in logs().items():
         entries = [
             Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))

@@ -35,7 +35,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.opened_map import MapSource, open_map
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, RefusedPair, pack_map_file, unpack_map_file, write_map_file
@@ -67,7 +67,7 @@ LOGS = logs()
 
 
 def write_store(path: Path, maps: dict[MapId, list[ChangeBody]]) -> Path:
-    store = Store(path)
+    store = SqliteStore(path)
     for map_id, changes in maps.items():
         entries = [
             Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
@@ -177,10 +177,10 @@ def test_a_store_whose_server_was_killed_is_read_with_its_last_commits(tmp_path:
     path = tmp_path / "s0.sqlite"
     code = (
         "import os, sys; from pathlib import Path\n"
-        "from mapweave.mapserver.log.store import Store\n"
+        "from mapweave.mapserver.log.sqlite_store import SqliteStore\n"
         "from tests.mapweave.test_opened_map import LOGS, R0, write_store\n"
-        "store = Store(Path(sys.argv[1])); store.put_result('history', b'x' * 9)\n"
-        "Store.close = lambda self: os._exit(0)\n"
+        "store = SqliteStore(Path(sys.argv[1])); store.put_result('history', b'x' * 9)\n"
+        "SqliteStore.close = lambda self: os._exit(0)\n"
         "store._database.close(); write_store(Path(sys.argv[1]), {R0: LOGS[R0]})\n"
     )
     subprocess.run([sys.executable, "-c", code, str(path)], check=True, cwd=Path(__file__).parents[2])

@@ -24,7 +24,7 @@ from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.mapserver.services import Services
 from mapweave.storage.map_file import MapFile, write_map_file
@@ -82,7 +82,7 @@ def node() -> Node:
 def served(node: Node, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """An endpoint where a map server knows the place."""
     path = tmp_path_factory.mktemp("server") / "s0.sqlite"
-    store = Store(path)
+    store = SqliteStore(path)
     map_id = MapId("r0", 1)
     store.apply(map_id, 7, [Entry.read(map_id, 1, encode_change(Change(map_id, 1, 0, NodePut(node))))], 1)
     store.close()

@@ -94,7 +94,7 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
             "[agent.exploration]\ntravel_sped = 1",
             "agent.exploration: no setting 'travel_sped'; did you mean 'travel_speed'?",
         ),
-        ("[network]\nzzz = 1", "no setting 'zzz'; known are fleet, endpoints, server"),
+        ("[network]\nzzz = 1", "no setting 'zzz'; known are fleet, endpoints, routers, server"),
         ("network = 3", "network: expected table, got int; it is 3"),
         ("agent = []", "agent: expected table, got list"),
         ("[network]\nfleet = 3", "network.fleet: expected str, got int; it is 3"),

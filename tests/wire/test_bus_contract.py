@@ -73,6 +73,22 @@ def test_messages_of_one_sender_keep_their_order(fleet: Fleet) -> None:
     assert [int.from_bytes(s.payload, "big") for s in got] == list(range(200))
 
 
+def test_a_reply_may_be_enough(fleet: Fleet) -> None:
+    asker, frozen, quick = fleet.join(), fleet.join(), fleet.join()
+    release = threading.Event()
+    frozen.serve("who/frozen", lambda request: release.wait(60))
+    quick.serve("who/a", lambda request: request.reply(b"a"))
+    settle(asker, "who/a")
+
+    quick.serve("who/b", lambda request: request.reply(b"b"))
+    settle(asker, "who/b")
+    begin = time.monotonic()
+    replies = asker.ask("who/*", b"", 40.0, lambda reply: reply.payload == b"b")
+    assert replies[-1].payload == b"b"
+    assert time.monotonic() - begin < 30, "the frozen one is not waited for"
+    release.set()
+
+
 def test_no_server_to_ask(fleet: Fleet) -> None:
     bus = fleet.join()
     begin = time.monotonic()

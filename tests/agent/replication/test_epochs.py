@@ -14,7 +14,7 @@ from mapweave.agent.replication.epochs import FOUR_DIGITS, LARGEST, newest_on_se
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.ingest import Ingest
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.bus import Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import NewestMap
@@ -62,7 +62,7 @@ def bus(hub: MemoryHub) -> Iterator[MemoryBus]:
 
 def test_a_server_reports_the_newest_map_on_its_disk(hub: MemoryHub, bus: MemoryBus, tmp_path: Path) -> None:
     with ExitStack() as stack:
-        store = Store(tmp_path / "s0.sqlite")
+        store = SqliteStore(tmp_path / "s0.sqlite")
         stack.callback(store.close)
         for map_id in (MapId("r0", 3), MapId("r0", 12), MapId("r1", 40), MapId("r0", 7)):
             store.apply(map_id, 5, [], 0)

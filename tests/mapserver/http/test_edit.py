@@ -21,7 +21,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.settings import MergeSettings
@@ -128,7 +128,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[MapServer]:
-    store = Store(tmp_path / "s0.sqlite")
+    store = SqliteStore(tmp_path / "s0.sqlite")
     for map_id, changes in logs().items():
         store.apply(map_id, 7, entries(map_id, changes), len(changes))
     store.close()

@@ -44,7 +44,7 @@ TABLE: dict[tuple[str, str], set[str]] = {
     ("POST", "/login"): ALL, ("POST", "/logout"): ALL, ("GET", "/session"): ANY,
     ("WS", "/live"): READ,
     ("GET", "/status"): ANY, ("GET", "/history"): READ, ("GET", "/explain"): READ, ("GET", "/route"): READ,
-    ("GET", "/robots"): READ, ("GET", "/missions"): READ, ("GET", "/map"): READ,
+    ("GET", "/robots"): READ, ("GET", "/missions"): READ, ("GET", "/map"): READ, ("GET", "/metrics"): READ,
     ("GET", "/nodes/{node}"): READ,
     ("GET", "/annotations"): READ, ("POST", "/annotations"): COMMAND,
     ("GET", "/plan-images/{sha256}.png"): READ,

@@ -18,7 +18,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest, IngestSettings
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -88,7 +88,7 @@ class Fleet:
     def start_server(self) -> None:
         self.seen.clear()
         self.bus = MemoryBus(self.hub)
-        self.store = Store(self.path)
+        self.store = SqliteStore(self.path)
         self.ingest = Ingest(self.bus, KEYS, self.store, "s0", self.seen.append, SERVER)
 
     def stop_server(self) -> None:

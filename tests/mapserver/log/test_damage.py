@@ -20,9 +20,9 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.explainer import ConstraintRecord
-from mapweave.mapserver.log import store as store_module
+from mapweave.mapserver.log import sql_store
 from mapweave.mapserver.log.integrity import checksum
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.storage.map_file import read_map_file
 from mapweave.wire.codec import encode_body, encode_change
 from tests.mapserver.log.acknowledged_fleet import (
@@ -156,7 +156,7 @@ def test_a_damaged_schema_that_is_no_text_is_reported_in_one_line(whole: Path, f
     )
     fleet.path.write_bytes(data)
     with pytest.raises(InvalidFile, match="damaged") as caught:
-        Store(fleet.path)
+        SqliteStore(fleet.path)
     assert "\n" not in str(caught.value)
 
 
@@ -231,15 +231,15 @@ def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog: pytest.Log
     disk.execute("UPDATE manual_constraint SET body = body || x'00' WHERE number = 2")
     disk.commit()
     disk.close()
-    store = Store(fleet.path)
+    store = SqliteStore(fleet.path)
     assert [constraint.stamp_ns for constraint in ConstraintRecord(store).constraints.made] == [0, 2, 3, 4]
     assert "1 damaged rows of table manual_constraint" in caplog.text
     store.close()
 
 
 def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store_module, "MAX_CONSTRAINTS", 7)
-    store = Store(fleet.path)
+    monkeypatch.setattr(sql_store, "MAX_CONSTRAINTS", 7)
+    store = SqliteStore(fleet.path)
     book = ConstraintRecord(store)
     constraint = book.constraints.made[0]
     for k in range(2):
@@ -248,7 +248,7 @@ def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.
         book.add(constraint)
     assert len(book.constraints.made) == 7
     store.close()
-    store = Store(fleet.path)
+    store = SqliteStore(fleet.path)
     assert ConstraintRecord(store).constraints.made == book.constraints.made
     store.close()
 

@@ -17,7 +17,7 @@ from mapweave.hybridmap.change import Change, NodeRetired
 from mapweave.hybridmap.node import NodeId
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest, IngestSettings
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
@@ -67,7 +67,7 @@ class Server:
     def start(self) -> None:
         self.lives.append([])
         self.bus = MemoryBus(self.hub)
-        self.store = Store(self.path)
+        self.store = SqliteStore(self.path)
         self.ingest = Ingest(self.bus, KEYS, self.store, "s0", self.lives[-1].append, SERVER)
 
     def stop(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 
 CHANGES = 400
@@ -22,14 +22,14 @@ SERVER = """
 import sys, time
 from pathlib import Path
 from mapweave.mapserver.log.ingest import Ingest
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
 
 path, endpoint = sys.argv[1:]
 bus = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
-store = Store(Path(path))
+store = SqliteStore(Path(path))
 print("up", flush=True)
 ingest = Ingest(bus, Keys(), store, "s0", lambda change: print(change.sequence, flush=True))
 sys.stdin.read()
@@ -133,7 +133,7 @@ def test_nothing_is_lost_when_processes_are_killed(tmp_path: Path) -> None:
                 life.kill()
 
     map_id = MapId("r0", 1)
-    journal, store = Journal(journal_path, "r0"), Store(store_path)
+    journal, store = Journal(journal_path, "r0"), SqliteStore(store_path)
     kept = journal.changes(map_id, 1, 2 * CHANGES)
     assert [change.sequence for change in kept] == list(range(1, CHANGES + 1))
     assert [change.body.id.number for change in kept] == list(range(1, CHANGES + 1))  # type: ignore[union-attr]

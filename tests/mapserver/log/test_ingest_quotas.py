@@ -17,7 +17,7 @@ from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log import ingest
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.intake import ADVICE
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
 from mapweave.wire.bus import Request
 from mapweave.wire.log_messages import Refusal
@@ -223,8 +223,8 @@ def test_a_beacon_beyond_all_logs_moves_only_its_own(
 
 
 def test_undecodable_changes_fill_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mapweave.mapserver.log.store.MOST_REFUSED_KEPT", 5)
-    store = Store(tmp_path / "s0.sqlite")
+    monkeypatch.setattr("mapweave.mapserver.log.sql_store.MOST_REFUSED_KEPT", 5)
+    store = SqliteStore(tmp_path / "s0.sqlite")
     entries = [Entry.read(MAP, sequence, b"\xc1" * 100_000) for sequence in range(1, 51)]
     store.apply(MAP, LOG_ID, entries)
     assert store.refused() == store.watermark(MAP) == 50

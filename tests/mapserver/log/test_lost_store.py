@@ -11,7 +11,7 @@ from mapweave.agent.replication.replicator import ReplicationSettings, Replicato
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -33,7 +33,7 @@ def delete(path: Path) -> None:
 @pytest.mark.parametrize("again", [False, True], ids=["deleted", "replaced"])
 def test_a_store_that_is_deleted_takes_nothing_more(tmp_path: Path, again: bool) -> None:
     path = tmp_path / "s0.sqlite"
-    store = Store(path)
+    store = SqliteStore(path)
     store.put_result("x", b"1")
     delete(path)
     if again:
@@ -45,7 +45,7 @@ def test_a_store_that_is_deleted_takes_nothing_more(tmp_path: Path, again: bool)
 
 def test_a_store_that_was_moved_takes_changes_when_it_is_put_back(tmp_path: Path) -> None:
     path = tmp_path / "s0.sqlite"
-    store = Store(path)
+    store = SqliteStore(path)
     path.rename(tmp_path / "elsewhere")
     with pytest.raises(InvalidFile, match="deleted or replaced"):
         store.put_result("x", b"1")
@@ -53,7 +53,7 @@ def test_a_store_that_was_moved_takes_changes_when_it_is_put_back(tmp_path: Path
     store.put_result("x", b"2")
     known = store.id
     store.close()
-    again = Store(path)
+    again = SqliteStore(path)
     assert again.result("x") == b"2" and again.id == known
     again.close()
 
@@ -77,7 +77,7 @@ def test_a_server_with_a_deleted_store_reports_it_and_gets_everything_again(tmp_
         assert robot.wait_acknowledged(30)
         # Acknowledged again, not because it was before.
         eventually(lambda: robot.unacknowledged() == 0)
-    kept = Store(path)
+    kept = SqliteStore(path)
     eventually(lambda: kept.watermark(MAP) == 7)
     assert [change.sequence for change in kept.replay(MAP)] == list(range(1, 8))
     kept.close()

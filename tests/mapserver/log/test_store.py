@@ -1,9 +1,9 @@
-"""The store: exactly once, in order, and nothing that is half done."""
+"""Both stores: exactly once, in order, and nothing that is half done."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,14 @@ from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, Node
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.opening import open_store
+from mapweave.mapserver.log.postgres_store import PostgresStore
+from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.log.store import Run, Store
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.log_messages import Refusal
+from tests.postgres import PostgresServer
 
 MAP, OTHER = MapId("r0", 1), MapId("r1", 1)
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)
@@ -49,14 +53,18 @@ def broken(sequence: int) -> Entry:
     return Entry.read(MAP, sequence, b"\xc1garbage")
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "s0.sqlite"
+@pytest.fixture(params=["sqlite", "postgres"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
+    """Where a store is made."""
+    if request.param == "sqlite":
+        return tmp_path / "s0.sqlite"
+    postgres: PostgresServer = request.getfixturevalue("postgres")
+    return postgres.database()
 
 
 @pytest.fixture
-def store(path: Path) -> Iterator[Store]:
-    store = Store(path)
+def store(place: Path | str) -> Iterator[Store]:
+    store = open_store(place)
     yield store
     store.close()
 
@@ -84,12 +92,14 @@ def test_an_answer_for_a_range_may_have_holes(store: Store) -> None:
     assert sequences(store) == [2, 5]
 
 
-def test_all_is_there_after_a_restart(path: Path) -> None:
-    store = Store(path)
+def test_all_is_there_after_a_restart(place: Path | str) -> None:
+    store = open_store(place)
+    store_id = store.id
     store.apply(MAP, 2**64 - 1, [entry(1, node_put(1, 3)), broken(2), entry(3)])
     store.apply(OTHER, 5, [])
     store.close()
-    store = Store(path)
+    store = open_store(place)
+    assert store.id == store_id
     assert store.maps() == [MAP, OTHER]
     assert (store.watermark(MAP), store.log_id(MAP)) == (3, 2**64 - 1)
     replayed = list(store.replay(MAP))
@@ -133,6 +143,25 @@ def test_another_log_of_the_same_name_is_refused(store: Store) -> None:
     assert sequences(store) == [1]
 
 
+def test_many_logs_in_one_transaction(store: Store) -> None:
+    store.apply(MAP, 5, [entry(1)])
+    foreign = Entry.read(OTHER, 1, encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER))))
+    taken, other, mine, again = store.apply_all(
+        [
+            Run(MAP, 6, [entry(2)]),
+            Run(OTHER, 7, [foreign]),
+            Run(MAP, 5, [entry(1), entry(2)]),
+            Run(MAP, 5, [entry(2), broken(3), entry(9)]),
+        ]
+    )
+    assert isinstance(taken, InvalidValue) and "another log goes by the name r0.1" in str(taken)
+    assert isinstance(other, Applied) and other.watermark == 1 and len(other.changes) == 1
+    assert isinstance(mine, Applied) and [change.sequence for change in mine.changes] == [2]
+    assert isinstance(again, Applied) and (again.watermark, len(again.refusals)) == (3, 1)
+    assert (sequences(store), sequences(store, OTHER)) == ([1, 2], [1])
+    assert store.apply_all([]) == []
+
+
 def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store) -> None:
     entries = [
         entry(1, node_put(1, landmarks=3)),
@@ -154,7 +183,7 @@ def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store) -> None
 @given(st.lists(st.lists(st.integers(1, 12), max_size=8), max_size=12))
 def test_any_input_makes_a_log(tmp_path_factory: pytest.TempPathFactory, batches: list[list[int]]) -> None:
     """Against the plain meaning: a set of what came, and the longest run from one."""
-    store = Store(tmp_path_factory.mktemp("store") / "s")
+    store = SqliteStore(tmp_path_factory.mktemp("store") / "s")
     expected = 0
     passed_on: list[int] = []
     for batch in batches:
@@ -167,17 +196,39 @@ def test_any_input_makes_a_log(tmp_path_factory: pytest.TempPathFactory, batches
     store.close()
 
 
-def test_a_transaction_that_fails_leaves_nothing(path: Path, store: Store) -> None:
-    store.apply(MAP, 5, [entry(1)])
-    # As if the disk were full at the third change of a batch.
-    store._database.connection.execute(
-        "CREATE TRIGGER full BEFORE INSERT ON change WHEN NEW.sequence = 4 "
-        "BEGIN SELECT RAISE(ABORT, 'database or disk is full'); END"
+def fill_the_disk(store: Store) -> Callable[[], None]:
+    """As if the disk were full at the fourth change of a log; returns what makes room."""
+    if isinstance(store, SqliteStore):
+        run = store._database.connection.execute
+        run(
+            "CREATE TRIGGER full BEFORE INSERT ON change WHEN NEW.sequence = 4 "
+            "BEGIN SELECT RAISE(ABORT, 'database or disk is full'); END"
+        )
+        return lambda: run("DROP TRIGGER full")
+    assert isinstance(store, PostgresStore)
+    rows = store._reader.connection
+    rows.execute(
+        "CREATE FUNCTION refuse() RETURNS trigger LANGUAGE plpgsql AS "
+        "$$ BEGIN RAISE disk_full USING MESSAGE = 'database or disk is full'; END $$"
     )
+    rows.execute(
+        "CREATE TRIGGER room BEFORE INSERT ON change FOR EACH ROW WHEN (NEW.sequence = 4) "
+        "EXECUTE FUNCTION refuse()"
+    )
+    return lambda: rows.execute("DROP TRIGGER room ON change")
+
+
+def test_a_transaction_that_fails_leaves_nothing(store: Store) -> None:
+    store.apply(MAP, 5, [entry(1)])
+    make_room = fill_the_disk(store)
     with pytest.raises(InvalidFile, match="disk is full"):
         store.apply(MAP, 5, [entry(2), broken(3), entry(4)])
+    third = MapId("r2", 1)
+    results = store.apply_all([Run(OTHER, 9, [], 4), Run(MAP, 5, [entry(4)], 4), Run(third, 9, [], 4)])
+    assert [(type(one), "disk is full" in str(one)) for one in results] == [(InvalidFile, True)] * 3
     assert (store.watermark(MAP), store.refused(), sequences(store)) == (1, 0, [1])
-    store._database.connection.execute("DROP TRIGGER full")
+    assert store.maps() == [MAP], "nothing of the other runs either"
+    make_room()
     assert store.apply(MAP, 5, [entry(2), broken(3), entry(4)]).watermark == 4
 
 
@@ -212,4 +263,4 @@ def test_a_journal_is_no_store(tmp_path: Path) -> None:
 
     Journal(tmp_path / "j", "r0").close()
     with pytest.raises(InvalidFile, match="is not a Mapweave map store"):
-        Store(tmp_path / "j")
+        SqliteStore(tmp_path / "j")

@@ -24,7 +24,7 @@ from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.server import MapServer
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -33,7 +33,7 @@ path = Path(sys.argv[1])
 if not path.exists():
     rng = np.random.default_rng(3)
     world = room(0, 0, 5, 4, 500, rng) + room(5, 0, 5, 4, 700, rng) + room(10, 0, 5, 4, 500, rng)
-    store = Store(path)
+    store = SqliteStore(path)
     for agent, rooms in (("a", (0, 5)), ("b", (5, 10)), ("c", (0, 10)), ("d", (0, 5))):
         map_id = MapId(agent, 1)
         stops = [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.6 * k) for x in rooms for k in range(6)]

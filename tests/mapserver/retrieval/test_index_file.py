@@ -16,6 +16,7 @@ from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.log.entry import Entry, Position
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.retrieval import index_file
 from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
@@ -212,7 +213,7 @@ def test_a_server_that_starts_again_has_its_places_at_once(
 ) -> None:
     caplog.set_level(logging.INFO, "mapweave.mapserver.retrieval.place_database")
     path = tmp_path / "store.db"
-    store = Store(path)
+    store = SqliteStore(path)
     put(store, [NodePut(node) for node in many(90)])
 
     def replayed() -> list[Node]:
@@ -252,7 +253,7 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_file(
 
 
 def test_a_running_server_saves_when_enough_is_new(tmp_path: Path) -> None:
-    store = Store(tmp_path / "store.db")
+    store = SqliteStore(tmp_path / "store.db")
     kept = tmp_path / f"store.db{SUFFIX}"
     places = PlaceDatabase(store, tmp_path / "store.db")
     nodes = many(120)

@@ -352,3 +352,34 @@ def test_without_keys_a_router_listens_on_its_own_machine_alone(endpoint: str) -
     with pytest.raises(SettingsError, match="mapweave keys init"):
         BusSettings(mode="router", listen=(endpoint,))
     BusSettings(mode="router", listen=("tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"))
+
+
+def test_routers_with_passwords_do_not_join(tmp_path: Path) -> None:
+    """Who connects would not know whom to."""
+    folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0", 7447)
+    with pytest.raises(SettingsError, match="with certificates, not with the passwords"):
+        folder.router("s0", (), ["tcp/127.0.0.1:7448"])
+
+
+def test_routers_with_keys_join_each_other_and_each_holds_to_the_rules(certified: Fleet) -> None:
+    """A robot at one router, a server at the other."""
+    fleet = certified
+    fleet.folder.add("s1", Role.SERVER)
+    fleet.renew()
+    listen = f"{fleet.endpoint.partition('/')[0]}/127.0.0.1:{free_port()}"
+    other = ZenohBus(fleet.folder.router("s1", [listen], [fleet.endpoint]))
+    fleet.open.append(other)
+    got: list[str] = []
+    other.subscribe(KEYS.agent_statuses(), lambda sample: got.append(sample.key))
+    other.serve(sent_by_any(KEYS.relocalize("s1")), answer)
+    r0 = fleet.join("r0")
+    eventually(lambda: asked(r0, sent_by(KEYS.relocalize("s1"), "r0")))
+    own, forged = KEYS.agent_status("r0"), KEYS.agent_status("r1")
+
+    def heard() -> bool:
+        for key in (forged, own):
+            r0.publish(key, b"x")
+        return own in got
+
+    eventually(heard)
+    assert forged not in got

@@ -11,6 +11,7 @@ from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.scenarios.disks import map_hash, read_disks
 from mapweave.wire.codec import encode_change
@@ -44,7 +45,7 @@ def disks(tmp_path):
     journal.close()
 
     def compare(kept: list[Change]):
-        store = Store(tmp_path / "s0.sqlite")
+        store = SqliteStore(tmp_path / "s0.sqlite")
         entries = [(c.sequence, encode_change(c)) for c in kept]
         fill(store, log_id, entries)
         store.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mapweave.agent.replication.journal import Journal
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.scenarios.run import TrialOptions, run_trial
 from mapweave.scenarios.scenario import load_scenario
 
@@ -76,7 +76,7 @@ def test_a_bad_day(tmp_path):
     killed = next(m.stamp_ns for m in trial.recording.moments if "r1 is killed" in m.text)
     assert min(stamps) < killed < max(stamps)
     # What the journal has the store has, in the same order: counted here without the trial's own count.
-    store = Store(options.out / "server" / "s0.sqlite")
+    store = SqliteStore(options.out / "server" / "s0.sqlite")
     for item in (journal.maps()[0],):
         assert [c.sequence for c in store.replay(item)] == list(range(1, journal.head(item) + 1))
     journal.close()

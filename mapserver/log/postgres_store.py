@@ -1,0 +1,246 @@
+"""The store in a PostgreSQL database, which several servers may share.
+
+Damage is PostgreSQL's to find: its pages have checksums where `initdb --data-checksums` made it, and a
+standby has good ones. So rows have no checksums of their own here, and nothing is salvaged.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import psycopg
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.entry import Position
+from mapweave.mapserver.log.sql_store import SqlStore
+from mapweave.mapserver.log.store import ID, Run, fresh_id
+from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
+
+log = logging.getLogger(__name__)
+
+VERSION = 1
+KEYS = {
+    "log": ("agent", "epoch"),
+    "change": ("agent", "epoch", "sequence"),
+    "damaged": ("agent", "epoch", "first"),
+    "node": ("agent", "epoch", "number"),
+    "refused": ("agent", "epoch", "sequence"),
+    "manual_constraint": ("number",),
+    "annotation": ("number",),
+    "result": ("name",),
+}
+"""Of the tables."""
+VALUES = {
+    "log": ("log_id", "watermark"),
+    "change": ("stamp_ns", "kind", "number", "wire_bytes", "body"),
+    "damaged": ("last",),
+    "node": ("landmarks",),
+    "refused": ("reason", "message"),
+    "manual_constraint": ("body",),
+    "annotation": ("body",),
+    "result": ("value",),
+}
+"""Their other columns."""
+TYPES = {
+    **dict.fromkeys(("agent", "log_id", "kind", "reason", "name"), 'TEXT COLLATE "C" NOT NULL'),
+    **dict.fromkeys(("body", "message", "value"), "BYTEA NOT NULL"),
+}
+"""Of columns that are no numbers."""
+SCHEMA_LOCK = 0x4D575354
+"""Advisory lock of who makes the tables: 'MWST'."""
+CHANNEL = "mapweave"
+"""Of the notifications about what has changed."""
+MOST_NOTIFIED = 7000
+"""Bytes; PostgreSQL takes less than 8000 (https://www.postgresql.org/docs/15/sql-notify.html)."""
+
+
+class PostgresStore(SqlStore):
+    """All logs in one database.
+
+    One session writes, another reads: a commit that waits for a standby holds up no answer. Where PostgreSQL
+    is away, every method fails with InvalidFile; the next call connects again.
+    """
+
+    shared = True
+
+    def __init__(self, address: str, name: str = "store", read_only: bool = False) -> None:
+        """Connect, and make the tables if there are none.
+
+        Args:
+            address: see PostgresAddress.read.
+            name: of the server, as PostgreSQL's lists of sessions show it.
+            read_only: change nothing; the tables must be there.
+
+        Raises:
+            InvalidValue: the address is none, or has a password.
+            InvalidFile: there is no connection, or the tables are of another version.
+        """
+        self.address = PostgresAddress.read(address)
+        self._write_lock, self._read_lock = threading.RLock(), threading.RLock()
+        self._writing: int | None = None
+        """The thread in a transaction."""
+        self._touched: dict[str, None] = {}
+        self._warnings: list[str] = []
+        self._warned = False
+        options = {"default_transaction_read_only": "on"} if read_only else {}
+        self._reader, self._writer = (
+            PostgresSession(self.address, f"mapweave {name}", options, not read_only, prepare)
+            for prepare in (self._check_version, self._prepare)
+        )
+        try:
+            if not read_only:
+                self._make()
+            self.id = int.from_bytes(self.result(ID) or b"", "big")
+        except InvalidFile:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the sessions. Idempotent."""
+        for lock, session in ((self._write_lock, self._writer), (self._read_lock, self._reader)):
+            with lock:
+                session.close()
+
+    def _make(self) -> None:
+        """Make the tables where there are none; servers that start together take turns."""
+        with self._transaction():
+            self._writer.connection.execute("SELECT pg_advisory_xact_lock(%s)", (SCHEMA_LOCK,))
+            if _version(self._writer.connection) is None:
+                for statement in _statements():
+                    self._writer.connection.execute(statement)
+                self._put("result", (ID, fresh_id().to_bytes(8, "big")))
+            else:
+                self._check_version(self._writer.connection)
+
+    def _check_version(self, connection: psycopg.Connection) -> None:
+        version = _version(connection)
+        if version != VERSION:
+            what = "no map store" if version is None else f"a map store of format {version}"
+            raise InvalidFile(f"{self.address.words}: has {what}, this program uses format {VERSION}")
+
+    def _prepare(self, connection: psycopg.Connection) -> None:
+        """A writer's session: what is acknowledged must survive."""
+        connection.add_notice_handler(self._note)
+        settings = connection.execute(
+            "SELECT current_setting('synchronous_commit'), current_setting('fsync')"
+        ).fetchone()
+        synchronous, fsync = settings or ("", "")
+        if synchronous in ("off", "local"):
+            connection.execute("SET synchronous_commit = on")
+        if fsync == "off" and not self._warned:
+            self._warned = True
+            log.warning(
+                "%s: runs with fsync=off: what is acknowledged is lost with the machine's power",
+                self.address.words,
+            )
+
+    def _note(self, diagnostic: psycopg.errors.Diagnostic) -> None:
+        if diagnostic.severity_nonlocalized == "WARNING":
+            self._warnings.append(diagnostic.message_primary or "")
+
+    def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
+        query = query.replace("?", "%s")
+        if self._writing == threading.get_ident():
+            return self._writer.connection.execute(query, values, binary=True).fetchall()
+        with self._read_lock, self._reader.guard():
+            return self._reader.connection.execute(query, values, binary=True).fetchall()
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        with self._write_lock, self._writer.guard():
+            connection = self._writer.connection
+            self._touched.clear()
+            self._writing = threading.get_ident()
+            try:
+                with connection.pipeline(), connection.transaction():
+                    yield
+                    self._notify(connection)
+                    self._warnings.clear()
+            finally:
+                self._writing = None
+            if self._warnings:
+                # Committed here, but not confirmed by the standby: the wait for it was cancelled.
+                raise InvalidFile(f"{self.address.words}: a commit is not confirmed ({self._warnings[0]})")
+
+    def _notify(self, connection: psycopg.Connection) -> None:
+        """Notify the other servers."""
+        if self._touched:
+            words = " ".join(self._touched)
+            connection.execute(
+                "SELECT pg_notify(%s, %s)", (CHANNEL, words if len(words) < MOST_NOTIFIED else "")
+            )
+
+    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
+        ids = {run.map_id: str(run.log_id) for run in runs}
+        # In one order everywhere: two servers that wait for each other's rows would wait for ever.
+        rows = [(map_id.agent, map_id.epoch, ids[map_id]) for map_id in sorted(ids)]
+        agents, epochs, log_ids = ([row[k] for row in rows] for k in range(3))
+        self._writer.connection.execute(
+            "INSERT INTO log SELECT *, 0 FROM unnest(%s::text[], %s::bigint[], %s::text[]) "
+            "ON CONFLICT (agent, epoch) DO NOTHING",
+            (agents, epochs, log_ids),
+        )
+        found = self._writer.connection.execute(
+            "SELECT agent, epoch, log_id, watermark FROM log WHERE (agent, epoch) IN "
+            "(SELECT * FROM unnest(%s::text[], %s::bigint[])) ORDER BY agent, epoch FOR UPDATE",
+            (agents, epochs),
+        ).fetchall()
+        return {MapId(agent, epoch): Position(int(log_id), mark) for agent, epoch, log_id, mark in found}
+
+    def _lock_table(self, table: str) -> None:
+        self._writer.connection.execute(f"LOCK TABLE {table} IN SHARE ROW EXCLUSIVE MODE")
+
+    def _write(self, query: str, values: Sequence[object]) -> None:
+        self._writer.connection.execute(query.replace("?", "%s"), values)
+
+    def _put(self, table: str, values: Sequence[object]) -> None:
+        # PostgreSQL's texts have no NUL, and are valid UTF-8.
+        clean = [_text(value) if isinstance(value, str) else value for value in values]
+        self._writer.connection.execute(INSERTS[table], clean)
+        if table == "log":
+            self._touched[f"log:{MapId(str(values[0]), int(str(values[1])))}"] = None
+        elif table in ("manual_constraint", "annotation"):
+            self._touched[table] = None
+        elif table == "result":
+            self._touched[f"result:{values[0]}"] = None
+
+
+def _version(connection: psycopg.Connection) -> int | None:
+    there = connection.execute("SELECT to_regclass('mapweave.schema_version') IS NOT NULL").fetchone()
+    if not there or not there[0]:
+        return None
+    row = connection.execute("SELECT version FROM mapweave.schema_version").fetchone()
+    return None if row is None else int(row[0])
+
+
+def _statements() -> Iterator[str]:
+    yield "CREATE SCHEMA IF NOT EXISTS mapweave"
+    yield "CREATE TABLE schema_version (version BIGINT NOT NULL)"
+    yield f"INSERT INTO schema_version VALUES ({VERSION})"
+    for table, keys in KEYS.items():
+        columns = [f"{name} {TYPES.get(name, 'BIGINT NOT NULL')}" for name in (*keys, *VALUES[table])]
+        yield f"CREATE TABLE {table} ({', '.join(columns)}, PRIMARY KEY ({', '.join(keys)}))"
+    # Bodies are as small as they get already.
+    yield "ALTER TABLE change ALTER COLUMN body SET STORAGE EXTERNAL"
+
+
+def _insert(table: str) -> str:
+    """A row in the place of one with the same key; a change that is stored stays as it is."""
+    keys, values = KEYS[table], VALUES[table]
+    marks = ", ".join(["%s"] * (len(keys) + len(values)))
+    update = ", ".join(f"{name} = EXCLUDED.{name}" for name in values)
+    does = "NOTHING" if table == "change" else f"UPDATE SET {update}"
+    columns, key = ", ".join((*keys, *values)), ", ".join(keys)
+    return f"INSERT INTO {table} ({columns}) VALUES ({marks}) ON CONFLICT ({key}) DO {does}"
+
+
+INSERTS = {table: _insert(table) for table in KEYS}
+
+
+def _text(value: str) -> str:
+    return value.replace("\0", "\ufffd").encode("utf-8", "replace").decode()

@@ -1,0 +1,332 @@
+"""What the stores have in common: the queries that SQLite and PostgreSQL both understand."""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any
+
+from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
+from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
+from mapweave.hybridmap.node import EdgeId, MapId, NodeId
+from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
+from mapweave.mapserver.log.integrity import Gap
+from mapweave.mapserver.log.store import MAX_CONSTRAINTS, MOST_REFUSED_KEPT, Run, Store, name_taken
+from mapweave.wire.codec import decode_body, element_of, unwrap_body
+from mapweave.wire.log_messages import Refusal
+
+log = logging.getLogger(__name__)
+
+READ_AT_ONCE = 256
+PRUNED_AT_ONCE = 256
+"""Elements of one map: a log is read through once for so many."""
+
+
+class SqlStore(Store):
+    """Tables as in mapweave.mapserver.log.integrity. Marks of values are `?`."""
+
+    @abstractmethod
+    def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
+        """The rows of a query, inside a transaction or outside.
+
+        Raises:
+            InvalidFile: they cannot be read.
+        """
+
+    @abstractmethod
+    def _transaction(self) -> AbstractContextManager[None]:
+        """All that is written inside is committed at the end, or nothing of it; one thread at a time.
+
+        Raises:
+            InvalidFile: it is not committed.
+        """
+
+    @abstractmethod
+    def _write(self, query: str, values: Sequence[object]) -> None:
+        """Inside a transaction."""
+
+    @abstractmethod
+    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
+        """The logs of these runs that are stored; only this transaction changes them until the commit."""
+
+    @abstractmethod
+    def _lock_table(self, table: str) -> None:
+        """Only this transaction changes it until the commit."""
+
+    @abstractmethod
+    def _put(self, table: str, values: Sequence[object]) -> None:
+        """Inside a transaction: put a row into a table, in the place of one with the same key."""
+
+    def maps(self) -> list[MapId]:
+        """All maps of which something is known."""
+        return [MapId(*row) for row in self._read("SELECT agent, epoch FROM log ORDER BY agent, epoch")]
+
+    def positions(self) -> dict[MapId, Position]:
+        """Which log is kept of each map, and how far it is settled."""
+        rows = self._read("SELECT agent, epoch, log_id, watermark FROM log")
+        return {MapId(agent, epoch): Position(int(log_id), mark) for agent, epoch, log_id, mark in rows}
+
+    def present(self) -> set[NodeId]:
+        """All nodes that are not retired, without reading their contents."""
+        query = (
+            "SELECT agent, epoch, number, kind FROM change WHERE kind IN (?, ?) "
+            "ORDER BY agent, epoch, sequence"
+        )
+        nodes: set[NodeId] = set()
+        for *element, kind in self._read(query, (NodePut.__name__, NodeRetired.__name__)):
+            (nodes.add if kind == NodePut.__name__ else nodes.discard)(NodeId(*element))
+        return nodes
+
+    def watermark(self, map_id: MapId) -> int:
+        """Up to which change the log is settled, 0 without a log."""
+        rows = self._read("SELECT watermark FROM log WHERE agent = ? AND epoch = ?", map_id)
+        return int(rows[0][0]) if rows else 0
+
+    def log_id(self, map_id: MapId) -> int | None:
+        """Id of the log of this name, None without one."""
+        rows = self._read("SELECT log_id FROM log WHERE agent = ? AND epoch = ?", map_id)
+        return int(rows[0][0]) if rows else None
+
+    def apply_all(self, runs: Sequence[Run]) -> list[Applied | MapweaveError]:
+        """Take the next changes of many logs in one transaction; see `Store`."""
+        try:
+            with self._transaction():
+                logs = self._begin(runs)
+                return [self._apply(run, logs) for run in runs]
+        except InvalidFile as error:
+            return [InvalidFile(str(error)) for _ in runs]
+
+    def replay(self, map_id: MapId, last: int = 0) -> Iterator[Change]:
+        """Every change behind `last` that was taken, in order; see `Store`."""
+        query = (
+            "SELECT sequence, stamp_ns, body FROM change "
+            "WHERE agent = ? AND epoch = ? AND sequence > ? ORDER BY sequence LIMIT ?"
+        )
+        while rows := self._read(query, (*map_id, last, READ_AT_ONCE)):
+            for last, stamp_ns, body in rows:
+                try:
+                    yield Change(map_id, last, stamp_ns, decode_body(body))
+                except InvalidMessage as error:
+                    log.error("change %d of %s cannot be read (%s); it is left out", last, map_id, error)
+
+    def prune(
+        self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]
+    ) -> None:
+        """Delete what logs say of some nodes and edges, for good; see `Store`."""
+        node_numbers, edge_numbers = _numbers(nodes), _numbers(edges)
+        with self._transaction():
+            for kinds, numbers in (
+                ((NodePut, NodeRetired), node_numbers),
+                ((EdgePut, EdgeRetired), edge_numbers),
+            ):
+                names = [kind.__name__ for kind in kinds]
+                for map_id, some in numbers:
+                    marks = ", ".join("?" * len(some))
+                    self._write(
+                        "DELETE FROM change WHERE agent = ? AND epoch = ? AND kind IN (?, ?) "
+                        f"AND number IN ({marks})",
+                        (*map_id, *names, *some),
+                    )
+            for map_id, some in node_numbers:
+                marks = ", ".join("?" * len(some))
+                self._write(
+                    f"DELETE FROM node WHERE agent = ? AND epoch = ? AND number IN ({marks})",
+                    (*map_id, *some),
+                )
+            for name, value in results.items():
+                self._put("result", (name, value))
+
+    def damaged(self, map_id: MapId | None = None) -> list[Gap]:
+        """Changes that were found damaged and are not restored yet, of one map or of all."""
+        query = (
+            "SELECT agent, epoch, first, last FROM damaged "
+            "WHERE CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?) ORDER BY agent, epoch, first"
+        )
+        agent, epoch = map_id or (None, None)
+        rows = self._read(query, (agent, agent, epoch))
+        return [Gap(MapId(agent, epoch), first, last) for agent, epoch, first, last in rows]
+
+    def restore(self, map_id: MapId, first: int, covered: int, entries: Sequence[Entry]) -> Iterator[Change]:
+        """Put changes that were damaged in their places again; see `Store`."""
+        changes: list[Change] = []
+        refusals: list[Refusal] = []
+        with self._transaction():
+            for gap in self.damaged(map_id):
+                if gap.first <= first <= gap.last:
+                    self._write(
+                        "DELETE FROM damaged WHERE agent = ? AND epoch = ? AND first = ?",
+                        (*map_id, gap.first),
+                    )
+                    if gap.first < first:
+                        self._put("damaged", (*map_id, gap.first, first - 1))
+                    if covered < gap.last:
+                        self._put("damaged", (*map_id, covered + 1, gap.last))
+            for entry in entries:
+                self._take(map_id, entry, changes, refusals, restored=True)
+        for refusal in refusals:
+            log.warning("refused %s %d: %s", map_id, refusal.sequence, refusal.reason)
+        if any(self._may_undo(change) for change in changes):
+            return self.replay(map_id, changes[0].sequence - 1)
+        return iter(changes)
+
+    def landmarks(self, node: NodeId) -> int | None:
+        """How many landmarks a node has; None if there is no such node."""
+        rows = self._read("SELECT landmarks FROM node WHERE agent = ? AND epoch = ? AND number = ?", node)
+        return int(rows[0][0]) if rows else None
+
+    def kept(self, agent: str) -> dict[MapId, tuple[int, int]]:
+        """Nodes and landmarks of each map of a robot."""
+        query = (
+            "SELECT epoch, count(*), CAST(sum(landmarks) AS BIGINT) FROM node WHERE agent = ? GROUP BY epoch"
+        )
+        return {MapId(agent, epoch): (nodes, total) for epoch, nodes, total in self._read(query, (agent,))}
+
+    def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
+        """The newest changes of a map that were refused, in order."""
+        query = (
+            "SELECT sequence, reason FROM refused WHERE agent = ? AND epoch = ? "
+            "ORDER BY sequence DESC LIMIT ?"
+        )
+        return [Refusal(*row) for row in reversed(self._read(query, (*map_id, newest)))]
+
+    def refused(self) -> int:
+        """How many changes of any map were refused."""
+        return int(self._read("SELECT count(*) FROM refused")[0][0])
+
+    def traffic(self, map_id: MapId | None = None) -> Traffic:
+        """What a map has cost on the wire, or all maps together if none is named."""
+        query = (
+            "SELECT count(*), CAST(coalesce(sum(wire_bytes), 0) AS BIGINT) FROM change "
+            "WHERE kind = ? AND (CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?))"
+        )
+        agent, epoch = map_id or (None, None)
+        node_puts, node_bytes = self._read(query, (NodePut.__name__, agent, agent, epoch))[0]
+        edge_puts, edge_bytes = self._read(query, (EdgePut.__name__, agent, agent, epoch))[0]
+        count = "SELECT count(*) FROM node WHERE CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?)"
+        nodes = self._read(count, (agent, agent, epoch))[0][0]
+        return Traffic(nodes, node_puts, node_bytes, edge_puts, edge_bytes)
+
+    def constraints(self) -> list[bytes]:
+        """The manual constraints, in order."""
+        return self._record("manual_constraint")
+
+    def add_constraint(self, body: bytes) -> None:
+        """Add a manual constraint; see `Store`."""
+        self._add_to_record("manual_constraint", body, MAX_CONSTRAINTS)
+
+    def annotations(self) -> list[bytes]:
+        """The annotations, in order."""
+        return self._record("annotation")
+
+    def add_annotation(self, body: bytes) -> None:
+        """Add an annotation; see `add_constraint`."""
+        self._add_to_record("annotation", body, MAX_ANNOTATIONS)
+
+    def put_result(self, name: str, value: bytes) -> None:
+        """Store another result of the server; see `Store`."""
+        with self._transaction():
+            self._put("result", (name, value))
+
+    def result(self, name: str) -> bytes | None:
+        """The result of this name."""
+        rows = self._read("SELECT value FROM result WHERE name = ?", (name,))
+        return bytes(rows[0][0]) if rows else None
+
+    def _apply(self, run: Run, logs: dict[MapId, Position]) -> Applied | MapweaveError:
+        stored_id, watermark = logs.get(run.map_id, (run.log_id, 0))
+        if stored_id != run.log_id and watermark > 0:
+            return name_taken(run.map_id)
+        before = watermark
+        changes: list[Change] = []
+        refusals: list[Refusal] = []
+        for entry in run.entries:
+            if entry.sequence <= watermark:
+                continue
+            if entry.sequence > watermark + 1 and run.covered is None:
+                break
+            self._take(run.map_id, entry, changes, refusals)
+            watermark = entry.sequence
+        watermark = max(watermark, run.covered or 0)
+        self._put("log", (*run.map_id, str(run.log_id), watermark))
+        logs[run.map_id] = Position(run.log_id, watermark)
+        return Applied(tuple(changes), tuple(refusals), watermark, before)
+
+    def _record(self, table: str) -> list[bytes]:
+        return [bytes(body) for (body,) in self._read(f"SELECT body FROM {table} ORDER BY number")]
+
+    def _add_to_record(self, table: str, body: bytes, most: int) -> None:
+        with self._transaction():
+            self._lock_table(table)
+            count, newest = self._read(f"SELECT count(*), coalesce(max(number), 0) FROM {table}")[0]
+            if count >= most:
+                raise InvalidValue(f"the record of {table.replace('_', ' ')}s is full: {most}")
+            self._put(table, (newest + 1, body))
+
+    def _take(
+        self,
+        map_id: MapId,
+        entry: Entry,
+        changes: list[Change],
+        refusals: list[Refusal],
+        restored: bool = False,
+    ) -> None:
+        """Store a change, or store it aside with the reason."""
+        reason = entry.change if isinstance(entry.change, str) else self._objection(entry.change)
+        if isinstance(entry.change, str) or reason:
+            refusals.append(Refusal(entry.sequence, reason))
+            count = "SELECT count(*) FROM refused WHERE agent = ? AND epoch = ?"
+            many = self._read(count, map_id)[0][0] >= MOST_REFUSED_KEPT
+            self._put("refused", (*map_id, entry.sequence, reason, b"" if many else entry.message))
+        else:
+            changes.append(entry.change)
+            self._insert(entry, entry.change, restored)
+
+    def _insert(self, entry: Entry, change: Change, restored: bool) -> None:
+        _, stamp_ns, body = unwrap_body(entry.message)
+        kind, number = type(change.body).__name__, element_of(change.body).number
+        values = (*change.map, entry.sequence, stamp_ns, kind, number, len(entry.message), body)
+        self._put("change", values)
+        later = (
+            "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND sequence > ? AND number = ? AND kind = ?"
+        )
+        if isinstance(change.body, NodePut) and not (
+            restored and self._read(later, (*change.map, entry.sequence, number, kind))
+        ):
+            self._put("node", (*change.map, number, len(change.body.node.landmarks)))
+
+    def _may_undo(self, change: Change) -> bool:
+        """Whether the log goes on behind a change with something that depends on its place in the order."""
+        if not isinstance(change.body, NodePut | EdgePut):
+            return True
+        query = (
+            "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND sequence > ? "
+            "AND (number = ? OR kind IN (?, ?)) LIMIT 1"
+        )
+        retired = (NodeRetired.__name__, EdgeRetired.__name__)
+        number = element_of(change.body).number
+        return bool(self._read(query, (*change.map, change.sequence, number, *retired)))
+
+    def _objection(self, change: Change) -> str:
+        """Why a decoded change is refused; empty if it is accepted."""
+        if isinstance(change.body, EdgePut) and len(change.body.edge.shared):
+            edge = change.body.edge
+            for end, highest in zip((edge.a, edge.b), edge.shared.max(axis=0), strict=True):
+                count = self.landmarks(end)
+                if count is not None and highest >= count:
+                    return f"edge {edge.id} shares landmark {highest} of {end}, which has {count}"
+        return ""
+
+
+def _numbers(elements: Iterable[NodeId]) -> list[tuple[MapId, Sequence[int]]]:
+    """The numbers of elements by their maps, so many at once."""
+    by_map: dict[MapId, list[int]] = {}
+    for element in sorted(elements):
+        by_map.setdefault(element.map, []).append(element.number)
+    return [
+        (map_id, numbers[first : first + PRUNED_AT_ONCE])
+        for map_id, numbers in by_map.items()
+        for first in range(0, len(numbers), PRUNED_AT_ONCE)
+    ]

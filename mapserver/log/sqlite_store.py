@@ -1,0 +1,87 @@
+"""The store in one SQLite file on the server's disk."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.entry import Position
+from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
+from mapweave.mapserver.log.sql_store import SqlStore
+from mapweave.mapserver.log.store import ID, Run, fresh_id
+from mapweave.storage.database import Database
+
+log = logging.getLogger(__name__)
+
+APPLICATION_ID = 0x4D575354
+"""'MWST' in the file's header."""
+
+VERSION = 2
+ADVICE = (
+    "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: robots send "
+    "again what they keep"
+)
+
+
+class SqliteStore(SqlStore):
+    """All logs in one SQLite file, which belongs to one process."""
+
+    shared = False
+
+    def __init__(self, path: Path) -> None:
+        """Open the store, or make one. Rows that are damaged are taken out, see `damaged`.
+
+        Raises:
+            InvalidFile: damaged as a whole, of another kind, or in use.
+        """
+        self._lock = threading.RLock()
+        self._database = Database(path, "map store", APPLICATION_ID, VERSION, SCHEMA, repair, ADVICE)
+        for gap in self.damaged():
+            log.error("%s: %s", path, _words(gap))
+        store_id = self.result(ID)
+        self.id = int.from_bytes(store_id, "big") if store_id else fresh_id()
+        if not store_id:
+            try:
+                self.put_result(ID, self.id.to_bytes(8, "big"))
+            except InvalidFile as error:
+                # Such a store cannot be written either, but can be read.
+                log.warning("%s", error)
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        with self._lock:
+            self._database.close()
+
+    def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
+        with self._lock, self._database.guard():
+            return self._database.connection.execute(query, values).fetchall()
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        with self._lock, self._database.transaction():
+            yield
+
+    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
+        query = "SELECT log_id, watermark FROM log WHERE agent = ? AND epoch = ?"
+        found = ((map_id, self._read(query, map_id)) for map_id in {run.map_id for run in runs})
+        return {map_id: Position(int(rows[0][0]), rows[0][1]) for map_id, rows in found if rows}
+
+    def _lock_table(self, table: str) -> None:
+        """Nothing: the whole file is this process's."""
+
+    def _write(self, query: str, values: Sequence[object]) -> None:
+        self._database.connection.execute(query, values)
+
+    def _put(self, table: str, values: Sequence[object]) -> None:
+        insert(self._database.connection, table, values)
+
+
+def _words(gap: Gap) -> str:
+    changes = f"change {gap.first}" if gap.first == gap.last else f"changes {gap.first} to {gap.last}"
+    return f"{changes} of {gap.map}: damaged, and left out until {gap.map.agent} sends them again"

@@ -1,0 +1,73 @@
+"""How each map stands in the merge, in a few words: for lists of robots, where an explanation is too long."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import NamedTuple
+
+from mapweave.hybridmap.manual_constraint import reason_of
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.merge.explanation.component_changes import joined_maps
+from mapweave.merge.pose_graph.merged_map import MergedMap
+
+
+class MapStanding(NamedTuple):
+    """Of one map.
+
+    Attributes:
+        newest: its newest node; None without nodes.
+        links: with other maps.
+        apart: why it is one with no other map; empty if it is, or if there is no other.
+    """
+
+    newest: NodeId | None
+    links: int
+    apart: str
+
+
+def map_standings(merged: MergedMap) -> dict[MapId, MapStanding]:
+    """The standing of every map, those that are set apart included."""
+    joined = {map_id for part in joined_maps(merged) if len(part) > 1 for map_id in part}
+    links: Counter[MapId] = Counter()
+    for link in merged.links:
+        if not link.within:
+            links.update((link.a.map, link.b.map))
+    refused: dict[MapId, Counter[str]] = {}
+    alike: Counter[MapId] = Counter()
+    for pair in merged.refused:
+        if pair.edge is not None or pair.a.map == pair.b.map:
+            continue
+        for map_id in (pair.a.map, pair.b.map):
+            if pair.link is None:
+                alike[map_id] += 1
+            else:
+                refused.setdefault(map_id, Counter())[pair.reason] += 1
+    accusations, out = merged.accusations(), dict[MapId, MapStanding]()
+    for map_id in sorted({*merged.maps, *merged.set_apart}):
+        nodes = merged.maps[map_id].nodes if map_id in merged.maps else ()
+        apart = ""
+        if map_id not in joined and len(merged.maps) + len(merged.set_apart) > 1:
+            constraint = merged.constraints.retired.get(map_id)
+            apart = (
+                (reason_of(constraint) if constraint is not None else "")
+                or accusations.get(map_id, "")
+                or _refused(refused.get(map_id, Counter()))
+                or _unverified(alike[map_id])
+            )
+        out[map_id] = MapStanding(max(nodes, default=None), links[map_id], apart)
+    return out
+
+
+def _refused(reasons: Counter[str]) -> str:
+    if not reasons:
+        return ""
+    (reason, count), total = reasons.most_common(1)[0], reasons.total()
+    many = "1 link was found and refused" if total == 1 else f"{total} links were found and all refused"
+    return f"{many}: {reason}{'' if count == total else f' ({count} of them)'}"
+
+
+def _unverified(count: int) -> str:
+    if not count:
+        return "none of its nodes looks like one of another map"
+    many = "1 pair of nodes looks" if count == 1 else f"{count} pairs of nodes look"
+    return f"{many} similar and no two have a common pose"

@@ -1,0 +1,173 @@
+"""A session with PostgreSQL: connects again when it was lost, and reports errors in one line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any
+
+import psycopg
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
+
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+
+SCHEME = "postgresql://"
+EXAMPLE = "postgresql://USER@HOST/DATABASE"
+CONNECT_TIMEOUT = 3
+"""For one host, s."""
+RETRY = 1.0
+"""s after a failed attempt before the next: what asks meanwhile gets the same error at once."""
+OPTIONS = {
+    # What is looked for is this program's own, whatever else is in the database.
+    "search_path": "mapweave",
+    # A frozen process must not hold up the other servers that share a record.
+    "idle_in_transaction_session_timeout": "10s",
+    "lock_timeout": "5s",
+    # A machine that lost its power says no goodbye: its session, with all locks, ends after some 11 s.
+    "tcp_keepalives_idle": "5s",
+    "tcp_keepalives_interval": "2s",
+    "tcp_keepalives_count": "3",
+    "tcp_user_timeout": "11s",
+}
+"""Of each session, at PostgreSQL's side."""
+KEEPALIVE = {
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 11_000,
+}
+"""The same at this side."""
+
+
+@dataclass(frozen=True)
+class PostgresAddress:
+    """Where a database is.
+
+    Attributes:
+        parameters: of libpq. No password is among them.
+        words: for people.
+    """
+
+    parameters: dict[str, Any]
+    words: str
+
+    @staticmethod
+    def read(text: str) -> PostgresAddress:
+        """Read what a person wrote.
+
+        Raises:
+            InvalidValue: it is no address, or has a password. The message does not repeat it.
+        """
+        try:
+            parameters = dict(conninfo_to_dict(text))
+        except psycopg.ProgrammingError:
+            parameters = {"port": "none"}
+        # Where a password has a slash or a colon, parts of it are read as a port and a database. libpq quotes
+        # them in its errors, and this message quotes nothing.
+        port, database = (str(parameters.get(name) or "") for name in ("port", "dbname"))
+        if set(port) - set("0123456789,") or "@" in database:
+            raise InvalidValue(f"the store's address cannot be read; it is written {EXAMPLE}")
+        if parameters.keys() & {"password", "sslpassword"}:
+            raise InvalidValue(
+                "the store's address has a password, which others on this machine can read: leave it out, "
+                "and put it into the file ~/.pgpass (or PGPASSFILE), or name a service file's entry"
+            )
+        if parameters.keys() & {"options"}:
+            raise InvalidValue(
+                "the store's address has `options`, which Mapweave sets itself: leave them out"
+            )
+        host = parameters.get("host") or parameters.get("service") or "localhost"
+        return PostgresAddress(parameters, f"{SCHEME}{host}/{parameters.get('dbname', '')}")
+
+    def conninfo(self, name: str, options: dict[str, str], writes: bool) -> str:
+        """For libpq.
+
+        Args:
+            name: of the session, as PostgreSQL's lists show it.
+            options: besides those of every session.
+            writes: of several hosts connect to the one that takes changes.
+        """
+        settings = " ".join(f"-c {key}={value}" for key, value in (OPTIONS | options).items())
+        defaults: dict[str, Any] = {"connect_timeout": CONNECT_TIMEOUT, "application_name": name, **KEEPALIVE}
+        if writes:
+            defaults["target_session_attrs"] = "read-write"
+        return make_conninfo("", **(defaults | self.parameters), options=settings)
+
+
+class PostgresSession:
+    """One connection at a time. Threads take turns: it is used under the caller's lock."""
+
+    def __init__(
+        self,
+        address: PostgresAddress,
+        name: str,
+        options: dict[str, str] | None = None,
+        writes: bool = True,
+        prepare: Callable[[psycopg.Connection], None] = lambda connection: None,
+    ) -> None:
+        """Take note of the address; the first use connects.
+
+        Args:
+            address: of the database.
+            name: of the session, as PostgreSQL's lists show it.
+            options: settings at PostgreSQL's side.
+            writes: of several hosts connect to the one that takes changes.
+            prepare: called with each new connection.
+        """
+        self.address = address
+        self._conninfo = address.conninfo(name, options or {}, writes)
+        self._prepare = prepare
+        self._connection: psycopg.Connection | None = None
+        self._failure, self._retry_at = "", 0.0
+        self._closed = False
+
+    @property
+    def connection(self) -> psycopg.Connection:
+        """That of now, or a new one.
+
+        Raises:
+            InvalidFile: there is none to be had.
+        """
+        if self._connection is not None and not self._connection.closed:
+            return self._connection
+        if self._closed:
+            raise InvalidFile(f"{self.address.words}: the map store is closed")
+        if time.monotonic() < self._retry_at:
+            raise InvalidFile(self._failure)
+        try:
+            with self.guard():
+                self._connection = psycopg.connect(self._conninfo, autocommit=True)
+                self._prepare(self._connection)
+        except InvalidFile as error:
+            self._drop()
+            self._failure, self._retry_at = str(error), time.monotonic() + RETRY
+            raise
+        return self._connection
+
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Turn PostgreSQL's errors into InvalidFile with one line; what is broken is not used again."""
+        try:
+            yield
+        except psycopg.Error as error:
+            if self._connection is not None and self._connection.broken:
+                self._drop()
+            reason = " ".join(str(error).split())
+            raise InvalidFile(f"{self.address.words}: the map store cannot be used ({reason})") from None
+
+    def drop(self) -> None:
+        """End the connection; the next use makes a new one."""
+        self._drop()
+
+    def close(self) -> None:
+        """End the connection for good. Idempotent."""
+        self._closed = True
+        self._drop()
+
+    def _drop(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with suppress(psycopg.Error):
+                connection.close()

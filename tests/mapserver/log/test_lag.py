@@ -1,0 +1,37 @@
+"""How long a change is known of and missing, against all announcements kept by brute force."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.agent_log import MOST_ANNOUNCED, AgentLog, PullSettings
+from mapweave.mapserver.log.entry import Applied
+
+STEPS = st.lists(
+    st.tuples(st.integers(1, 300), st.floats(0.001, 3.0), st.sampled_from([0.0, 0.0, 0.3, 1.0])), max_size=8
+)
+"""Announcements in a row, s between them, and which share of what is missing is settled then."""
+
+
+@given(STEPS)
+def test_the_lag_is_never_told_too_small(steps: list[tuple[int, float, float]]) -> None:
+    log = AgentLog(MapId("r0", 1), 7, PullSettings())
+    told: list[tuple[int, float]] = []
+    now, newest, watermark, began = 0.0, 0, 0, 0.0
+    for count, pause, share in steps:
+        for _ in range(count):
+            now, newest = now + pause, newest + 2
+            began = now if not told else began
+            log.announce(newest, now)
+            log.announce(newest - 1, now + 1.0)
+            told.append((newest, now))
+        watermark += int(share * (newest - watermark))
+        log.settled(Applied((), (), watermark))
+        told = [(number, at) for number, at in told if number > watermark]
+        true = now - told[0][1] if told else 0.0
+        assert true <= log.lag(now) <= now - began + 1e-9
+        if not told or watermark == 0:
+            assert log.lag(now) == true
+        assert len(log._announced) <= MOST_ANNOUNCED

@@ -1,0 +1,248 @@
+"""What only a PostgreSQL store does: it comes back, keeps its secrets, and agrees with the SQLite one."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from pathlib import Path
+
+import psycopg
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    rule,
+    run_state_machine_as_test,
+)
+
+from mapweave.cli import main
+from mapweave.hybridmap.change import Change, ChangeBody, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue, MapweaveError
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.opening import open_store
+from mapweave.mapserver.log.postgres_store import PostgresStore
+from mapweave.mapserver.log.store import Run, Store
+from mapweave.wire.codec import encode_body, encode_change
+from tests.mapserver.log.test_store import MAP, OTHER, broken, edge_put, entry, node_put
+from tests.postgres import PostgresServer, started
+from tests.waiting import eventually
+
+BODIES: list[ChangeBody] = [
+    node_put(1, 3), node_put(1, 7), node_put(2, 5), NodeRetired(NodeId(*MAP, 1)),
+    edge_put(11, 1, 2, [(2, 4)]), edge_put(12, 1, 2, [(6, 0)]),
+]  # fmt: skip
+FOREIGN: list[ChangeBody] = [node_put(1, 2, OTHER), NodeRetired(NodeId(*OTHER, 1))]
+
+
+def entries(map_id: MapId, first: int, picks: list[int]) -> list[Entry]:
+    """Changes from a place in a log on; some are broken."""
+    bodies = BODIES if map_id == MAP else FOREIGN
+    made = []
+    for sequence, pick in enumerate(picks, first):
+        if pick >= len(bodies):
+            made.append(Entry.read(map_id, sequence, b"\xc1\0\xff"))
+        else:
+            made.append(
+                Entry.read(map_id, sequence, encode_change(Change(map_id, sequence, 7, bodies[pick])))
+            )
+    return made
+
+
+RUNS = st.builds(
+    lambda map_id, log_id, first, picks, gap: Run(
+        map_id, log_id, entries(map_id, first, picks), None if gap is None else first + len(picks) + gap
+    ),
+    st.sampled_from([MAP, OTHER]), st.sampled_from([5, 5, 5, 2**64 - 1]), st.integers(1, 12),
+    st.lists(st.integers(0, 6), max_size=5), st.sampled_from([None, None, 0, 2]),
+)  # fmt: skip
+
+
+def seen(result: Applied | MapweaveError) -> object:
+    """What is to be compared of a result."""
+    if isinstance(result, MapweaveError):
+        return type(result), str(result)
+    changes = [(change.sequence, encode_body(change.body)) for change in result.changes]
+    return changes, result.refusals, result.watermark, result.before
+
+
+def content(store: Store) -> list[object]:
+    """All that can be seen of a store."""
+    return [
+        store.maps(), store.positions(), store.present(), store.refused(), store.damaged(),
+        store.constraints(), store.annotations(), store.result("poses"), store.kept("r0"), store.traffic(),
+        *((store.watermark(m), store.log_id(m), store.refusals(m, 3)) for m in (MAP, OTHER)),
+        *(store.traffic(m) for m in (MAP, OTHER)),
+        *([(c.sequence, c.stamp_ns, encode_body(c.body)) for c in store.replay(m, 2)] for m in (MAP, OTHER)),
+        *(store.landmarks(NodeId(*m, k)) for m in (MAP, OTHER) for k in (1, 2)),
+    ]  # fmt: skip
+
+
+def test_both_stores_give_the_same_for_the_same(postgres: PostgresServer, tmp_path: Path) -> None:
+    address = postgres.database()
+
+    class Both(RuleBasedStateMachine):
+        def __init__(self) -> None:
+            super().__init__()
+            with psycopg.connect(address, autocommit=True) as connection:
+                connection.execute("DROP SCHEMA IF EXISTS mapweave CASCADE")
+            self.folder = Path(tempfile.mkdtemp(dir=tmp_path))
+            self.open()
+
+        def open(self) -> None:
+            self.stores = [open_store(self.folder / "s"), open_store(address)]
+
+        @rule(runs=st.lists(RUNS, max_size=3))
+        def apply(self, runs: list[Run]) -> None:
+            one, other = ([*map(seen, store.apply_all(runs))] for store in self.stores)
+            assert one == other
+
+        @rule(body=st.binary(max_size=9))
+        def decide(self, body: bytes) -> None:
+            for store in self.stores:
+                store.add_constraint(body)
+                store.add_annotation(body[::-1])
+                store.put_result("poses", body)
+
+        @rule()
+        def reopen(self) -> None:
+            ids = [store.id for store in self.stores]
+            self.teardown()
+            self.open()
+            assert [store.id for store in self.stores] == ids
+
+        @invariant()
+        def same(self) -> None:
+            one, other = (content(store) for store in self.stores)
+            assert one == other
+
+        def teardown(self) -> None:
+            for store in self.stores:
+                store.close()
+
+    run_state_machine_as_test(Both, settings=settings(max_examples=8, stateful_step_count=8, deadline=None))
+
+
+def test_two_servers_share_a_store(postgres: PostgresServer) -> None:
+    address = postgres.database()
+    one, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
+    assert one.id == other.id
+    assert one.apply(MAP, 5, [entry(1), entry(2)]).before == 0
+    late = other.apply(MAP, 5, [entry(1), entry(2), entry(3)])
+    assert ([c.sequence for c in late.changes], late.before, late.watermark) == ([3], 2, 3)
+    done: list[object] = []
+
+    def write(store: PostgresStore, maps: list[MapId]) -> None:
+        for first in range(1, 40):
+            done.append(store.apply_all([Run(m, 5, entries(m, first, [0, 1]), first + 1) for m in maps]))
+            store.add_constraint(b"%d" % first)
+
+    # In opposite orders: neither may wait for the other for ever.
+    threads = [
+        threading.Thread(target=write, args=args) for args in ((one, [MAP, OTHER]), (other, [OTHER, MAP]))
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert len(done) == 78 and not any(isinstance(r, MapweaveError) for results in done for r in results)
+    for store in (one, other):
+        assert [c.sequence for c in store.replay(OTHER)] == list(range(1, 41))
+        assert len(store.constraints()) == 78, "none overwrites another"
+        store.close()
+
+
+def test_it_goes_on_when_postgresql_is_back(caplog: pytest.LogCaptureFixture) -> None:
+    servers = started()
+    server = next(servers)
+    try:
+        store = PostgresStore(server.database())
+        store.apply(MAP, 5, [entry(1)])
+        server.kill()
+        with pytest.raises(InvalidFile) as away:
+            store.apply(MAP, 5, [entry(2)])
+        assert "\n" not in str(away.value) and "the map store cannot be used" in str(away.value)
+        with pytest.raises(InvalidFile, match="the map store cannot be used"):
+            store.watermark(MAP)
+        assert [str(one) for one in store.apply_all([Run(MAP, 5, [entry(2)])] * 2)], "each has its error"
+        server.start()
+
+        def taken() -> bool:
+            (result,) = store.apply_all([Run(MAP, 5, [entry(1), entry(2)])])
+            return isinstance(result, Applied)
+
+        eventually(taken)
+        assert [change.sequence for change in store.replay(MAP)] == [1, 2]
+        store.close()
+        with pytest.raises(InvalidFile, match="is closed"):
+            store.watermark(MAP)
+    finally:
+        servers.close()
+
+
+def test_a_commit_that_no_standby_confirms_is_none(postgres: PostgresServer) -> None:
+    """The wait for a standby may be cancelled; PostgreSQL then commits, with a warning."""
+    store = PostgresStore(postgres.database(), "waits")
+    store.apply(MAP, 5, [entry(1)])
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute("ALTER SYSTEM SET synchronous_standby_names = 'absent'")
+        people.execute("SELECT pg_reload_conf()")
+        try:
+            results: list[Applied | MapweaveError] = []
+            run = Run(MAP, 5, [entry(2)])
+            writer = threading.Thread(target=lambda: results.extend(store.apply_all([run])))
+            # The setting reaches other sessions a little later.
+            eventually(lambda: people.execute("SHOW synchronous_standby_names").fetchone() == ("absent",))
+            writer.start()
+            waiting = "SELECT pid FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
+            eventually(lambda: people.execute(waiting).fetchall() or not writer.is_alive())
+            assert store.traffic().nodes == 0, "questions are answered meanwhile"
+            people.execute("SELECT pg_cancel_backend(pid) FROM pg_stat_activity WHERE wait_event = 'SyncRep'")
+            writer.join(30)
+            assert "is not confirmed" in str(results[0]) and isinstance(results[0], InvalidFile)
+        finally:
+            people.execute("ALTER SYSTEM RESET synchronous_standby_names")
+            people.execute("SELECT pg_reload_conf()")
+    eventually(lambda: isinstance(store.apply_all([Run(MAP, 5, [entry(2)])])[0], Applied))
+    store.close()
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "postgresql://anna:s3cret@host/maps",
+        "postgresql://anna@host/maps?password=s3cret",
+        "postgresql://anna:s3cret@host:p0rt/maps?nonsense=s3cret",
+        "postgresql://anna:s3/cret@host/maps",
+    ],
+)
+def test_a_password_in_the_address_is_refused_and_not_repeated(
+    address: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(InvalidValue, match="the store's address"):
+        PostgresStore(address)
+    assert main(["map", "show", address]) == 1
+    out, err = capsys.readouterr()
+    assert len(err.splitlines()) == 1
+    assert not any(part in out + err for part in ("s3cret", "anna", "s3", "cret"))
+
+
+def test_a_store_of_another_format_is_refused(postgres: PostgresServer) -> None:
+    address = postgres.database()
+    with pytest.raises(InvalidFile, match="no map store"):
+        PostgresStore(address, read_only=True)
+    PostgresStore(address).close()
+    with psycopg.connect(address, autocommit=True) as connection:
+        connection.execute("UPDATE mapweave.schema_version SET version = 99")
+    with pytest.raises(InvalidFile, match=r"format 99, this program uses format 1"):
+        PostgresStore(address)
+
+
+def test_texts_that_postgresql_does_not_take(postgres: PostgresServer) -> None:
+    store = PostgresStore(postgres.database())
+    refused = Entry(1, b"", "a reason with \0 and \udcff")
+    assert store.apply(MAP, 5, [refused, broken(2)]).watermark == 2
+    assert store.refusals(MAP)[0].reason == "a reason with \ufffd and ?"
+    store.close()
