@@ -8,9 +8,10 @@ robot goes through both: N stops at newly drawn places, with a full turn at each
 through the server's own merger one by one, with a merge after every drive. Printed are the active
 nodes after each drive; and how many of the views that are taken anywhere in the rooms, and of those that
 are taken again where a drive stopped, are answered rightly (within 0.25 m and 8 degrees of the truth) from
-the map after one drive and after ten, from the map in the end, and from that with its superseded nodes. Between two drives
-furniture may be moved: a share of the landmarks then is elsewhere for good, and queries are taken of the
-rooms as they are at last. Times are of this process alone. Ten drives take about a minute and a half.
+the map after one drive and after ten, from the map in the end, and from that with its superseded nodes.
+Between two drives furniture may be moved: a share of the landmarks then is elsewhere for good, and queries
+are taken of the rooms as they are at last. Times are of this process alone. Ten drives take about a minute
+and a half.
 
 Drives are 3.65 days apart, so a hundred are a year. After each the server prunes what has been superseded
 for long, in memory and in a store. After 60 drives and more there are also what a drive adds in the long run:

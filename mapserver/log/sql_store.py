@@ -112,9 +112,7 @@ class SqlStore(Store):
                 except InvalidMessage as error:
                     log.error("change %d of %s cannot be read (%s); it is left out", last, map_id, error)
 
-    def prune(
-        self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]
-    ) -> None:
+    def prune(self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]) -> None:
         """Delete what logs say of some nodes and edges, for good; see `Store`."""
         node_numbers, edge_numbers = _numbers(nodes), _numbers(edges)
         with self._transaction():

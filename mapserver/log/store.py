@@ -22,6 +22,8 @@ ID = "store id"
 """Among the results."""
 HISTORY = "history"
 """Among the results, too: see mapweave.mapserver.map_history."""
+PRUNING = "pruning"
+"""Likewise: see mapweave.mapserver.merging.pruning."""
 MOST_REFUSED_KEPT = 100
 """Refused changes of a map of which the bytes are kept; of further ones only the reason."""
 MAX_CONSTRAINTS = 10_000
@@ -105,9 +107,7 @@ class Store(Protocol):
         Those that cannot be read, or are out of bounds since they were taken, are left out.
         """
 
-    def prune(
-        self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]
-    ) -> None:
+    def prune(self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]) -> None:
         """Delete what logs say of some nodes and edges, for good, and store results that stand for them.
 
         All in one transaction. The logs' watermarks stay, so robots do not send them again.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
@@ -18,7 +18,7 @@ from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import NodeComparisons
-from mapweave.mapserver.merging.pruning import PrunePlan, Pruning, left_of
+from mapweave.mapserver.merging.pruning import PrunePlan, Pruning, plan_of
 from mapweave.mapserver.merging.verification_cache import VerificationCache
 from mapweave.mapserver.plausibility import implausible, scattered
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
@@ -338,34 +338,18 @@ class Merger:
         return PinnedFrames().moved(leave_out(sorted(kept), attempt)[0], self._pins)
 
     def plan_pruning(
-        self, now_ns: int, keep_days: float, staying: Container[NodeId] = ()
+        self, now_ns: int, keep_days: float, stays: Callable[[NodeId], bool] = lambda node: False
     ) -> PrunePlan | None:
-        """What is to be pruned after the merge that was made last; None: nothing now.
-
-        Args:
-            now_ns: the server's clock.
-            keep_days: superseded nodes are kept for so long.
-            staying: nodes that are not pruned.
-        """
-        merged = self._merged
-        due = self.pruning.due(merged.superseded, now_ns, keep_days)
-        due = {node for node in due if node not in staying}
-        if self._dirty or not due:
+        """What is to be pruned after the merge that was made last; see `plan_of`."""
+        if self._dirty:
             return None
-        nodes, marginals = left_of(merged, due, self.pruning.marginals, now_ns)
-        if not nodes:
-            return None
-        edges = {
-            edge_id
-            for hybrid_map in self.maps.values()
-            for node in nodes
-            if node in hybrid_map.graph
-            for _, _, edge_id in hybrid_map.graph.edges(node, keys=True)
-        }
-        return PrunePlan(nodes, tuple(sorted(edges)), tuple(marginals))
+        return plan_of(self._merged, self.maps.values(), self.pruning, now_ns, keep_days, stays)
 
     def prune(self, plan: PrunePlan) -> None:
         """Let the nodes of a plan go, as if their robots had retired them, and keep what is left of them."""
+        self.pruning.take(plan)
+        if not plan.nodes:
+            return
         for map_id, hybrid_map in list(self.maps.items()):
             for node in plan.nodes:
                 if node in hybrid_map.graph:
@@ -377,7 +361,6 @@ class Merger:
                 self._implausible.pop(map_id, None)
         self.alike.remove(plan.nodes)
         self.reaches.remove(plan.nodes)
-        self.pruning.take(plan)
         self._pipeline.replace_marginals(self.pruning.marginals)
 
     def restore_pruning(self, pruning: Pruning) -> None:

@@ -1,4 +1,4 @@
-"""Pruning: superseded nodes leave the map for good, so that a map that is driven through for years stays small.
+"""Pruning: superseded nodes leave the map for good, so that it stays small when it is driven for years.
 
 A node that has been superseded without a break for `keep_superseded_days` is marginalised
 (mapweave.merge.pose_graph.marginalization). What is left of it: marginal links between the nodes that remain,
@@ -11,24 +11,24 @@ person's words or constraints name; those of maps with anything held against the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, fields, is_dataclass
 
 from mapweave.hybridmap.constraint_subject import Linked
-from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.explanation import MARGINAL
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
+from mapweave.mapserver.log.store import PRUNING
 from mapweave.merge.pose_graph.component import Component
 from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.pose_graph.marginalization import MARGINAL, is_marginal, marginal_links
+from mapweave.merge.pose_graph.marginalization import is_marginal, marginal_links
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.messages import KeptPruned, KeptPruning, decode, encode
 
 DAY_NS = 86_400_000_000_000
-STATE = "pruning"
-"""Among the results of a store."""
 PART = "pruned {}"
-"""Likewise, with a number: what was pruned at one time."""
+"""Among the results of a store, with a number: what was pruned at one time."""
 
 
 @dataclass(frozen=True)
@@ -54,16 +54,16 @@ class Pruning:
         marginals: links that are left of them.
     """
 
-    def __init__(self) -> None:
-        """Nothing was pruned yet."""
+    def __init__(self, marginals: Iterable[Link] = ()) -> None:
+        """Nothing was pruned yet but, elsewhere, that of which these links are left."""
         self.pruned = PrunedNodes()
-        self.marginals: tuple[Link, ...] = ()
+        self.marginals = tuple(marginals)
         self._since: dict[NodeId, int] = {}
         self._looked_ns = 0
         self._parts = 0
 
-    def due(self, superseded: Collection[NodeId], now_ns: int, keep_days: float) -> set[NodeId]:
-        """Nodes that are superseded for long enough. There are none but once a day.
+    def due(self, superseded: Collection[NodeId], now_ns: int, keep_days: float) -> set[NodeId] | None:
+        """Nodes that are superseded for long enough; None: it is not asked more often than once a day.
 
         Args:
             superseded: by the newest merge.
@@ -71,16 +71,18 @@ class Pruning:
             keep_days: for so long they are kept.
         """
         self._since = {node: min(self._since.get(node, now_ns), now_ns) for node in superseded}
-        if now_ns - self._looked_ns < DAY_NS and now_ns >= self._looked_ns:
-            return set()
+        # A clock that was put back must not hold it up.
+        if 0 <= now_ns - self._looked_ns < DAY_NS:
+            return None
         self._looked_ns = now_ns
         return {node for node, since in self._since.items() if now_ns - since >= keep_days * DAY_NS}
 
     def take(self, plan: PrunePlan) -> None:
         """It is done."""
-        self.marginals = plan.marginals
-        self.pruned = PrunedNodes({**self.pruned.nodes, **plan.nodes})
-        self._parts += 1
+        if plan.nodes:
+            self.marginals = plan.marginals
+            self.pruned = PrunedNodes({**self.pruned.nodes, **plan.nodes})
+            self._parts += 1
         for node in plan.nodes:
             del self._since[node]
 
@@ -88,34 +90,69 @@ class Pruning:
         """Results of the store that say what this will be when a plan is done; see `restore`."""
         links = tuple(Linked.of(link.a, link.b, link.a_from_b) for link in plan.marginals)
         since = tuple((node, stamp) for node, stamp in self._since.items() if node not in plan.nodes)
-        state = KeptPruning(links, since, self._looked_ns, self._parts + 1)
-        return {
-            STATE: encode(state),
-            PART.format(self._parts): encode(KeptPruned(tuple(plan.nodes.items()))),
-        }
+        state = encode(KeptPruning(links, since, self._looked_ns, self._parts + bool(plan.nodes)))
+        if not plan.nodes:
+            return {PRUNING: state}
+        return {PRUNING: state, PART.format(self._parts): encode(KeptPruned(tuple(plan.nodes.items())))}
 
-    def restore(self, records: Iterator[bytes | None]) -> None:
+    def restore(self, result: Callable[[str], bytes | None]) -> None:
         """Read it again.
 
         Args:
-            records: the results `STATE`, and each `PART` from 0, as they are asked for.
+            result: gives what is stored by a name.
 
         Raises:
             InvalidMessage: a record is damaged.
         """
-        state = next(records)
+        state = result(PRUNING)
         if state is None:
             return
         kept = decode(state, KeptPruning)
         nodes: dict[NodeId, PrunedNode] = {}
         for number in range(kept.parts):
-            part = next(records)
-            if part is None:
-                raise InvalidMessage(f"part {number} is missing")
-            nodes.update(decode(part, KeptPruned).nodes)
+            part = result(PART.format(number))
+            nodes.update(decode(part, KeptPruned).nodes if part else ())
         self.pruned, self._since = PrunedNodes(nodes), dict(kept.since)
-        self.marginals = tuple(Link(k.a, k.b, k.a_from_b, evidence={MARGINAL: 1.0}) for k in kept.links)
+        self.marginals = tuple(marginal_of(link) for link in kept.links)
         self._looked_ns, self._parts = kept.looked_ns, kept.parts
+
+
+def marginal_of(kept: Linked) -> Link:
+    """A marginal link as it is kept."""
+    return Link(kept.a, kept.b, kept.a_from_b, evidence={MARGINAL: 1.0})
+
+
+def plan_of(
+    merged: MergedMap,
+    maps: Iterable[HybridMap],
+    pruning: Pruning,
+    now_ns: int,
+    keep_days: float,
+    stays: Callable[[NodeId], bool],
+) -> PrunePlan | None:
+    """What is to be pruned after a merge; None: it is not asked more often than once a day.
+
+    Args:
+        merged: the merged map.
+        maps: of which it was made.
+        pruning: so far.
+        now_ns: the server's clock.
+        keep_days: superseded nodes are kept for so long.
+        stays: whether a node is not pruned in any case.
+    """
+    due = pruning.due(merged.superseded, now_ns, keep_days)
+    if due is None:
+        return None
+    due = {node for node in due if not stays(node)}
+    nodes, marginals = left_of(merged, due, pruning.marginals, now_ns)
+    edges = {
+        edge_id
+        for hybrid_map in maps
+        for node in nodes
+        if node in hybrid_map.graph
+        for _, _, edge_id in hybrid_map.graph.edges(node, keys=True)
+    }
+    return PrunePlan(nodes, tuple(sorted(edges)), tuple(marginals))
 
 
 def left_of(
@@ -125,7 +162,7 @@ def left_of(
 
     Args:
         merged: the map.
-        due: of its superseded nodes those that shall leave it; some of them stay all the same, see the module.
+        due: of its superseded nodes those that shall leave it; some stay all the same, see the module.
         marginals: links that are left of nodes before them.
         now_ns: the time, ns since 1970.
 

@@ -23,6 +23,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
 from mapweave.merge.pose_graph.component import Component
@@ -30,8 +31,6 @@ from mapweave.merge.pose_graph.factors import Factors, Rows, believable
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.optimization import optimized
 
-MARGINAL = "marginal"
-"""Name among the evidence of a link that is left of removed nodes."""
 NEIGHBOURS = 24
 """Pairs of each node that may be in the tree, the nearest; more if these do not connect what is connected."""
 TURN = 1.0
