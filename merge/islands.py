@@ -9,7 +9,7 @@ the merge without retired areas, and whether a link by hand is contradicted the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 
 import networkx as nx
@@ -60,18 +60,20 @@ class Islands:
         self._without_areas: Islands | None = None
         self._without_hand: Islands | None = None
         self._marginals: Sequence[Link] = ()
+        self._standing: Set[Pair] = frozenset()
         self._fused: dict[Pair, tuple[Link, Link, Link | None]] = {}
 
-    def replace_marginals(self, marginals: Sequence[Link]) -> None:
+    def replace_marginals(self, marginals: Sequence[Link], standing: Set[Pair]) -> None:
         """Nodes were removed: these links are left of them, and of those that were removed before.
 
         They join what they are about before all other links, and never fall: nodes are removed long after
-        their links were decided.
+        their links were decided. So it is with verified links that were decided by what is gone.
 
         Args:
             marginals: all that count from now on, see `mapweave.merge.pose_graph.marginalization`.
+            standing: verified links that are not decided again, by their nodes.
         """
-        self._marginals = marginals
+        self._marginals, self._standing = marginals, standing
         pairs = {link.pair for link in marginals}
         self._fused = {pair: entry for pair, entry in self._fused.items() if pair in pairs}
         # Much of what is remembered is about nodes that are gone.
@@ -127,8 +129,9 @@ class Islands:
     ) -> tuple[MergedMap, StandingDecisions]:
         links, refused = self._with_marginals(maps, *_sorted_out(verdicts))
         undone = apply_constraints(maps, links, constraints, self._cut_maps)
-        others = [link for link in undone.links if not is_marginal(link)]
-        certain = [*undone.certain, *filter(is_marginal, undone.links)]
+        decided = {link.key for link in undone.links if is_marginal(link) or link.key in self._standing}
+        others = [link for link in undone.links if link.key not in decided]
+        certain = [*undone.certain, *(link for link in undone.links if link.key in decided)]
         everything = undone.maps, others, [*refused, *undone.refused], self._settings, self._cache
         small = sum(len(hybrid_map.nodes) for hybrid_map in maps.values()) <= self._exact
         before = None if small or not earlier else StandingDecisions.union(earlier)
@@ -155,7 +158,8 @@ class Islands:
         against = [refusal for refusal in refused if refusal.pair not in inside]
         for pair, marginal in inside.items():
             link = verified.get(pair)
-            if link is None:
+            # What is not decided for good must not become certain by what is weakly known already.
+            if link is None or pair not in self._standing:
                 out.append(marginal)
                 continue
             known = self._fused.get(pair)
@@ -215,7 +219,7 @@ class Islands:
 
     def _reference(self) -> Islands:
         reference = _Reference(self._settings, self._exact)
-        reference.replace_marginals(self._marginals)
+        reference.replace_marginals(self._marginals, self._standing)
         return reference
 
     def _ties(

@@ -79,13 +79,17 @@ class KeptPruning:
 
     Attributes:
         links: marginal links.
+        standing: verified links that are not decided again, by their nodes.
         since: superseded nodes, and since when, ns since 1970.
+        linked_since: the nodes of verified links, and since when they hold.
         looked_ns: when it was last looked whether any had to go.
         parts: how many `KeptPruned` there are.
     """
 
     links: tuple[Linked, ...] = ()
+    standing: tuple[tuple[NodeId, NodeId], ...] = ()
     since: tuple[tuple[NodeId, Stamp], ...] = ()
+    linked_since: tuple[tuple[NodeId, NodeId, Stamp], ...] = ()
     looked_ns: Stamp = 0
     parts: int = 0
 

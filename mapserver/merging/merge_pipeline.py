@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
@@ -33,9 +34,9 @@ class MergePipeline:
         self._superseder = NodeSuperseder(reaches)
         self._remover = LandmarkRemover()
 
-    def replace_marginals(self, marginals: Sequence[Link]) -> None:
+    def replace_marginals(self, marginals: Sequence[Link], standing: Set[Pair]) -> None:
         """See `Islands.replace_marginals`."""
-        self._islands.replace_marginals(marginals)
+        self._islands.replace_marginals(marginals, standing)
 
     def merged(
         self,

@@ -361,12 +361,12 @@ class Merger:
                 self._implausible.pop(map_id, None)
         self.alike.remove(plan.nodes)
         self.reaches.remove(plan.nodes)
-        self._pipeline.replace_marginals(self.pruning.marginals)
+        self._pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
 
     def restore_pruning(self, pruning: Pruning) -> None:
         """Go on with what another process has pruned, before anything is merged."""
         self.pruning = pruning
-        self._pipeline.replace_marginals(pruning.marginals)
+        self._pipeline.replace_marginals(pruning.marginals, pruning.standing)
 
     def status(self) -> str:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
@@ -397,5 +397,5 @@ class Merger:
 
     def _new_pipeline(self) -> MergePipeline:
         pipeline = MergePipeline(self.settings, self.reaches)
-        pipeline.replace_marginals(self.pruning.marginals)
+        pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
         return pipeline

@@ -11,8 +11,10 @@ person's words or constraints name; those of maps with anything held against the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, fields, is_dataclass
+
+import numpy as np
 
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.explanation import MARGINAL
@@ -20,6 +22,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
 from mapweave.mapserver.log.store import PRUNING
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component import Component
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.marginalization import is_marginal, marginal_links
@@ -27,6 +30,9 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.messages import KeptPruned, KeptPruning, decode, encode
 
 DAY_NS = 86_400_000_000_000
+AT_ONCE = 300
+"""Nodes of one component that leave at once, near each other; the others on the days after. The merge waits
+for it: for 300 about two seconds."""
 PART = "pruned {}"
 """Among the results of a store, with a number: what was pruned at one time."""
 
@@ -39,11 +45,13 @@ class PrunePlan:
         nodes: with what is left of each.
         edges: robots' edges at them.
         marginals: all marginal links from then on.
+        standing: all verified links that are not decided again from then on, by their nodes.
     """
 
     nodes: Mapping[NodeId, PrunedNode]
     edges: tuple[EdgeId, ...]
     marginals: tuple[Link, ...]
+    standing: frozenset[Pair]
 
 
 class Pruning:
@@ -52,35 +60,51 @@ class Pruning:
     Attributes:
         pruned: nodes that have left the map.
         marginals: links that are left of them.
+        standing: verified links that were decided by what is gone, by their nodes.
     """
 
     def __init__(self, marginals: Iterable[Link] = ()) -> None:
         """Nothing was pruned yet but, elsewhere, that of which these links are left."""
         self.pruned = PrunedNodes()
         self.marginals = tuple(marginals)
+        self.standing = frozenset[Pair]()
         self._since: dict[NodeId, int] = {}
+        self._linked_since: dict[Pair, int] = {}
         self._looked_ns = 0
         self._parts = 0
 
-    def due(self, superseded: Collection[NodeId], now_ns: int, keep_days: float) -> set[NodeId] | None:
-        """Nodes that are superseded for long enough; None: it is not asked more often than once a day.
+    def due(self, merged: MergedMap, now_ns: int, keep_days: float) -> tuple[set[NodeId], set[Pair]] | None:
+        """Nodes that are superseded, and pairs that are linked, for long enough.
 
         Args:
-            superseded: by the newest merge.
+            merged: by the newest merge.
             now_ns: the server's clock.
             keep_days: for so long they are kept.
+
+        Returns:
+            None: it is not asked more often than once a day.
         """
-        self._since = {node: min(self._since.get(node, now_ns), now_ns) for node in superseded}
+        self._since = {node: min(self._since.get(node, now_ns), now_ns) for node in merged.superseded}
+        linked = self._linked_since
+        self._linked_since = {
+            link.pair: min(linked.get(link.pair, now_ns), now_ns)
+            for link in merged.links
+            if not is_marginal(link)
+        }
         # A clock that was put back must not hold it up.
         if 0 <= now_ns - self._looked_ns < DAY_NS:
             return None
         self._looked_ns = now_ns
-        return {node for node, since in self._since.items() if now_ns - since >= keep_days * DAY_NS}
+        least = now_ns - keep_days * DAY_NS
+        lasting = {pair for pair, since in self._linked_since.items() if since <= least}
+        # What a link says stays for good: one that was believed only now may not be true.
+        doubted = {node for pair in self._linked_since.keys() - lasting for node in pair}
+        return {node for node, since in self._since.items() if since <= least} - doubted, lasting
 
     def take(self, plan: PrunePlan) -> None:
         """It is done."""
         if plan.nodes:
-            self.marginals = plan.marginals
+            self.marginals, self.standing = plan.marginals, plan.standing
             self.pruned = PrunedNodes({**self.pruned.nodes, **plan.nodes})
             self._parts += 1
         for node in plan.nodes:
@@ -90,7 +114,9 @@ class Pruning:
         """Results of the store that say what this will be when a plan is done; see `restore`."""
         links = tuple(Linked.of(link.a, link.b, link.a_from_b) for link in plan.marginals)
         since = tuple((node, stamp) for node, stamp in self._since.items() if node not in plan.nodes)
-        state = encode(KeptPruning(links, since, self._looked_ns, self._parts + bool(plan.nodes)))
+        linked_since = tuple((*pair, stamp) for pair, stamp in self._linked_since.items())
+        parts = self._parts + bool(plan.nodes)
+        state = encode(KeptPruning(links, tuple(plan.standing), since, linked_since, self._looked_ns, parts))
         if not plan.nodes:
             return {PRUNING: state}
         return {PRUNING: state, PART.format(self._parts): encode(KeptPruned(tuple(plan.nodes.items())))}
@@ -114,6 +140,8 @@ class Pruning:
             nodes.update(decode(part, KeptPruned).nodes if part else ())
         self.pruned, self._since = PrunedNodes(nodes), dict(kept.since)
         self.marginals = tuple(marginal_of(link) for link in kept.links)
+        self.standing = frozenset(kept.standing)
+        self._linked_since = {(a, b): stamp for a, b, stamp in kept.linked_since}
         self._looked_ns, self._parts = kept.looked_ns, kept.parts
 
 
@@ -140,11 +168,18 @@ def plan_of(
         keep_days: superseded nodes are kept for so long.
         stays: whether a node is not pruned in any case.
     """
-    due = pruning.due(merged.superseded, now_ns, keep_days)
+    due = pruning.due(merged, now_ns, keep_days)
     if due is None:
         return None
-    due = {node for node in due if not stays(node)}
-    nodes, marginals = left_of(merged, due, pruning.marginals, now_ns)
+    superseded, linked = due
+    open_ = {link.pair for link in merged.links if not is_marginal(link)} - linked - pruning.standing
+    open_ |= {refusal.pair for refusal in merged.refused if refusal.link is not None}
+    leaving = {node for node in superseded if not stays(node)}
+    nodes, marginals = left_of(merged, leaving, pruning.marginals, open_, now_ns)
+    # What was decided with the help of the nodes that go cannot be decided again without them.
+    parts = {merged.component_of(node) for node in nodes}
+    standing = {pair for pair in linked if merged.component_of(pair[0]) in parts} | pruning.standing
+    standing = {pair for pair in standing if nodes.keys().isdisjoint(pair)}
     edges = {
         edge_id
         for hybrid_map in maps
@@ -152,11 +187,11 @@ def plan_of(
         if node in hybrid_map.graph
         for _, _, edge_id in hybrid_map.graph.edges(node, keys=True)
     }
-    return PrunePlan(nodes, tuple(sorted(edges)), tuple(marginals))
+    return PrunePlan(nodes, tuple(sorted(edges)), tuple(marginals), frozenset(standing))
 
 
 def left_of(
-    merged: MergedMap, due: Set[NodeId], marginals: Iterable[Link], now_ns: int
+    merged: MergedMap, due: Set[NodeId], marginals: Iterable[Link], taken: Set[Pair], now_ns: int
 ) -> tuple[dict[NodeId, PrunedNode], list[Link]]:
     """What is left of superseded nodes of a merged map.
 
@@ -164,6 +199,7 @@ def left_of(
         merged: the map.
         due: of its superseded nodes those that shall leave it; some stay all the same, see the module.
         marginals: links that are left of nodes before them.
+        taken: pairs with verified links that may yet be decided otherwise.
         now_ns: the time, ns since 1970.
 
     Returns:
@@ -177,15 +213,24 @@ def left_of(
         removed = {node for node in graph.nodes[1:] if node in due and node.map not in held}
         if not removed or not isinstance(graph, Component):
             continue
+        removed = _nearest(graph, removed)
         earlier = [links[pair] for pair in sorted(links.keys() & in_force) if pair[0] in graph.rows]
         for link in earlier:
             del links[link.pair]
-        links |= {link.pair: link for link in marginal_links(graph, removed, earlier)}
+        links |= {link.pair: link for link in marginal_links(graph, removed, earlier, taken)}
         for node in sorted(removed):
             by = merged.superseded[node].by
             by_from_node = merged.pose(by).inverse() @ merged.pose(node)
             nodes[node] = PrunedNode(by, by_from_node, now_ns)
     return nodes, [links[pair] for pair in sorted(links)]
+
+
+def _nearest(graph: Component, nodes: Set[NodeId]) -> set[NodeId]:
+    """Those nodes that are nearest to the first of them, at most `AT_ONCE`."""
+    names = sorted(nodes)
+    places = graph.means[graph.index(names), :2]
+    order = np.argsort(np.linalg.norm(places - places[0], axis=1), kind="stable")
+    return {names[k] for k in order[:AT_ONCE].tolist()}
 
 
 def named_nodes(value: object) -> Iterator[NodeId]:

@@ -24,7 +24,7 @@ nodes stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Set
+from collections.abc import Collection, Iterable, Set
 
 import networkx as nx
 import numpy as np
@@ -35,6 +35,7 @@ from scipy.spatial import cKDTree
 from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component import Component
 from mapweave.merge.pose_graph.factors import Factors, Rows, believable
 from mapweave.merge.pose_graph.links import Link
@@ -59,13 +60,17 @@ def is_marginal(link: Link) -> bool:
     return MARGINAL in link.evidence
 
 
-def marginal_links(graph: Component, removed: Set[NodeId], earlier: Iterable[Link]) -> list[Link]:
+def marginal_links(
+    graph: Component, removed: Set[NodeId], earlier: Iterable[Link], taken: Set[Pair] = frozenset()
+) -> list[Link]:
     """The marginal links of a graph without some of its nodes.
 
     Args:
         graph: a solved component.
         removed: some of its nodes, not all.
         earlier: its marginal links so far, as this made them.
+        taken: pairs, smaller id first, between which there shall be none where others do as well: a link
+            that may yet be refuted is verified there.
 
     Returns:
         Those of them at which nothing changes, as they are, and new ones: at most one between two nodes,
@@ -94,7 +99,7 @@ def marginal_links(graph: Component, removed: Set[NodeId], earlier: Iterable[Lin
             own = part.take(labels[part.a] == label, seat)
             nodes = tuple(graph.nodes[row] for row in rows[inside].tolist())
             piece = Component(nodes[0], nodes, means[inside], own)
-            out += _approximation(piece, np.flatnonzero(left[inside]))
+            out += _approximation(piece, np.flatnonzero(left[inside]), taken)
     return sorted(out, key=lambda link: link.pair)
 
 
@@ -131,9 +136,12 @@ def _among(graph: Component, part: Factors, links: Iterable[Link]) -> list[Link]
     return [link for link in links if about.issuperset(link.pair)]
 
 
-def _approximation(graph: Component, left: Rows) -> list[Link]:
+def _approximation(graph: Component, left: Rows, taken: Set[Pair]) -> list[Link]:
     """Links that stand for the marginal distribution of some nodes of a graph."""
-    pairs = _near(graph.means[left])
+    nodes = [graph.nodes[row] for row in left.tolist()]
+    seat = {node: k for k, node in enumerate(nodes)}
+    barred = [(seat[a], seat[b]) for a, b in taken if a in seat and b in seat]
+    pairs = _near(graph.means[left], barred)
     starts, ends = ([graph.nodes[left[k]] for k in column.tolist()] for column in pairs.T)
     poses = graph.relative(starts, ends)
     chosen = _chosen(pairs, np.linalg.slogdet(poses.covariances)[1])
@@ -177,8 +185,14 @@ def _weights(places: Array, pairs: Rows, means: Array, information: Array) -> Ar
     return weights
 
 
-def _near(means: Array) -> Rows:
-    """(K, 2) rows of near poses, smaller first; so many that they are connected."""
+def _near(means: Array, barred: Collection[tuple[int, int]]) -> Rows:
+    """(K, 2) rows of near poses, smaller first; so many that they are connected.
+
+    Args:
+        means: (N, 3) m, m, rad.
+        barred: pairs that are left out, unless nothing else connects all.
+    """
+    codes = np.array([a * len(means) + b for a, b in barred], np.int64)
     headings = means[:, 2:]
     places = np.hstack([means[:, :2], TURN * np.cos(headings), TURN * np.sin(headings)])
     index, count = cKDTree(places), len(means)
@@ -188,7 +202,10 @@ def _near(means: Array) -> Rows:
         near = np.asarray(index.query(places, k + 1)[1])
         pairs = np.column_stack([np.repeat(np.arange(count), k + 1), near.ravel()])
         pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
+        every, pairs = pairs, pairs[~np.isin(pairs[:, 0] * count + pairs[:, 1], codes)]
         ties = sparse.coo_matrix((np.ones(len(pairs), np.int8), tuple(pairs.T)), (count, count))
-        if k == count - 1 or connected_components(ties, directed=False)[0] == 1:
+        if connected_components(ties, directed=False)[0] == 1:
             return pairs
+        if k == count - 1:
+            return every
         k *= 2

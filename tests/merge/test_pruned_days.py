@@ -34,6 +34,8 @@ class Pruned(Daily):
         self.true: set[Pair] = set()
         self.gone: set[NodeId] = set()
         self.past: list[frozenset[NodeId]] = []
+        self.linked: list[set[Pair]] = []
+        self.standing: set[Pair] = set()
 
     def day(self) -> MergedMap:
         """One more, and what is pruned after it."""
@@ -41,15 +43,21 @@ class Pruned(Daily):
         self.true |= today.true
         merged = self.merged()
         self.past.append(today.past)
+        self.linked.append({link.pair for link in merged.links if not is_marginal(link)})
+        held = set.intersection(*self.linked[-1 - KEPT :]) if len(self.linked) > KEPT else set[Pair]()
         due = self.past[-1 - KEPT] - self.gone if len(self.past) > KEPT else frozenset[NodeId]()
+        due = due - {node for pair in self.linked[-1] - held for node in pair}
         for graph in merged.graphs:
             assert isinstance(graph, Component)
             removed = {node for node in graph.nodes[1:] if node in due}
             if removed:
                 inside = [link for link in self.marginals if link.a in graph.rows]
-                left = marginal_links(graph, removed, inside)
+                taken = self.linked[-1] - held - self.standing
+                taken |= {refusal.pair for refusal in merged.refused if refusal.link is not None}
+                left = marginal_links(graph, removed, inside, taken)
                 others = [link for link in self.marginals if link not in inside]
                 self.marginals = sorted([*others, *left], key=lambda link: link.pair)
+                self.standing |= {pair for pair in held if pair[0] in graph.rows}
                 self.prune(removed)
         return merged
 
@@ -64,7 +72,8 @@ class Pruned(Daily):
         for pair in [pair for pair in self.links if not removed.isdisjoint(pair)]:
             del self.links[pair]
             self.verdicts.drop(pair)
-        self.islands.replace_marginals(self.marginals)
+        self.standing = {pair for pair in self.standing if removed.isdisjoint(pair)}
+        self.islands.replace_marginals(self.marginals, self.standing)
 
 
 def false_links(merged: MergedMap, true: set[Pair]) -> set[Pair]:
