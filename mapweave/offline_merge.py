@@ -19,6 +19,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.pruning import Pruning
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.own_maps import maps_of, marginal_links
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import link_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
@@ -115,6 +116,7 @@ def merge_parts(
     store: Path | None = None,
     pins: Sequence[Pin] = (),
     marginals: Iterable[Edge] = (),
+    standing: Iterable[Pair] = (),
 ) -> MergedMap:
     """Merge robots' maps as the map server does.
 
@@ -126,6 +128,7 @@ def merge_parts(
         store: the server's store from which they come: what that server has compared is not compared again.
         pins: that hold frames, oldest first.
         marginals: links that are left of nodes which a server has pruned.
+        standing: verified links that this server no longer decides again, by their nodes.
 
     Raises:
         InvalidValue: a map cannot be merged; writing the others would lose it.
@@ -133,7 +136,7 @@ def merge_parts(
     merger = Merger(settings=settings)
     merger.constrain(constraints)
     merger.pin(pins)
-    merger.restore_pruning(Pruning(marginals=[link_of(edge) for edge in marginals]))
+    merger.restore_pruning(Pruning([link_of(edge) for edge in marginals], standing))
     changes = [
         (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()
     ]

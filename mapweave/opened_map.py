@@ -21,7 +21,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log import sqlite_store
 from mapweave.mapserver.log.opening import is_postgres
 from mapweave.mapserver.log.salvage import Salvage, all_of, salvage
@@ -60,6 +60,7 @@ class OpenedMap:
             merged yet.
         maps: the robots' maps in it, also those of a journal that are empty.
         complaints: what of each map could not be read, in one line each; key None: what belongs to no map.
+        standing: verified links that a store's server no longer decides again, by their nodes.
     """
 
     path: Path | str
@@ -67,6 +68,7 @@ class OpenedMap:
     content: MapFile
     maps: tuple[MapId, ...]
     complaints: Mapping[MapId | None, str]
+    standing: frozenset[tuple[NodeId, NodeId]] = frozenset()
 
     @property
     def name(self) -> str:
@@ -99,7 +101,7 @@ class OpenedMap:
         of_store = self.path if self.source is MapSource.STORE and isinstance(self.path, Path) else None
         pins = Annotations(self.content.annotations).pins
         marginals = marginal_links(self.content)
-        return merge_parts(maps, constraints, progress, settings, of_store, pins, marginals)
+        return merge_parts(maps, constraints, progress, settings, of_store, pins, marginals, self.standing)
 
     def file(self, merged: MergedMap) -> MapFile:
         """The content of a map file that holds the whole map.
@@ -218,7 +220,8 @@ def _of_salvaged(
     )
     complaint = _lost(path, salvaged, bad + worse + worst + wrong)
     maps = tuple(sorted(salvaged.maps))
-    return OpenedMap(path, MapSource.STORE, content, maps, {None: complaint} if complaint else {})
+    standing = frozenset(pair for kept in pruning for pair in kept.standing)
+    return OpenedMap(path, MapSource.STORE, content, maps, {None: complaint} if complaint else {}, standing)
 
 
 def _title(maps: Collection[MapId]) -> str:

@@ -63,11 +63,11 @@ class Pruning:
         standing: verified links that were decided by what is gone, by their nodes.
     """
 
-    def __init__(self, marginals: Iterable[Link] = ()) -> None:
-        """Nothing was pruned yet but, elsewhere, that of which these links are left."""
+    def __init__(self, marginals: Iterable[Link] = (), standing: Iterable[Pair] = ()) -> None:
+        """Nothing was pruned yet but, elsewhere, that of which these links are left; see the attributes."""
         self.pruned = PrunedNodes()
         self.marginals = tuple(marginals)
-        self.standing = frozenset[Pair]()
+        self.standing = frozenset(standing)
         self._since: dict[NodeId, int] = {}
         self._linked_since: dict[Pair, int] = {}
         self._looked_ns = 0
