@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from mapweave.agent.mission import Answer, Driven, Question
+from mapweave.agent.mission import Answer, AnswerContent, Driven, Question, WhoIsNear
 from mapweave.agent.mission_control import MissionControl
-from mapweave.agent.replication.queries import Said, best, decode_answer, encode_query, settles
+from mapweave.agent.replication.queries import best, decode_answer, encode_query, settles
 from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.agent_status import AgentStatus, Status, one_line
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
@@ -197,11 +197,15 @@ class FleetClient:
             self._answered.put(self._answer(question))
 
     def _answer(self, question: Question) -> Answer:
+        # An older server does not answer that: the robot maps as without one.
+        optional = isinstance(question, WhoIsNear)
+        if optional and not self.server_in_reach():
+            return Answer(question.number, None, NO_ANSWER)
         try:
             key, payload = encode_query(self._keys, question, self._agent)
         except InvalidValue as unspeakable:
             return Answer(question.number, None, str(unspeakable))
-        answers: list[Said] = []
+        answers: list[AnswerContent] = []
         error, retry_after = NO_ANSWER, 0.0
 
         def enough(reply: Reply) -> bool:
@@ -220,10 +224,11 @@ class FleetClient:
         while not self._bus.ask(key, payload, max(end - time.monotonic(), ASK_AGAIN), enough):
             # No reply: a server or router may have died with the question. Without any it is not repeated.
             now = time.monotonic()
-            if now >= end or not (self._servers or now - self._server_lost_at < FAILOVER):
+            if optional or now >= end or not (self._servers or now - self._server_lost_at < FAILOVER):
                 break
             time.sleep(ASK_AGAIN)
         if answers:
             return Answer(question.number, best(answers))
-        self._trouble, self._trouble_at = one_line(error), time.monotonic()
+        if not optional:
+            self._trouble, self._trouble_at = one_line(error), time.monotonic()
         return Answer(question.number, None, error, retry_after)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from mapweave.agent.observation import Command
+from mapweave.hybridmap.nearby import NearbyAnswer
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import Pose2
@@ -129,7 +130,31 @@ class MayIDrive:
     route: tuple[NodeId, ...]
 
 
-Question = WhereAmI | WhichWay | WhatIsKnown | MayIDrive
+@dataclass(frozen=True)
+class WhoIsNear:
+    """Question to the fleet: which robots are around this one?
+
+    Attributes:
+        number: of the question; the answer repeats it.
+        starts: nodes around the robot, the best first, each with `node_from_robot`.
+        sigma: standard deviation of its position from there, m.
+        heading_sigma: likewise of its heading, rad.
+        radius: of its footprint, m.
+        height: of its body, m.
+        speed: its limit, m/s.
+    """
+
+    number: int
+    starts: tuple[tuple[NodeId, Pose2], ...]
+    sigma: float
+    heading_sigma: float
+    radius: float
+    height: float
+    speed: float
+
+
+Question = WhereAmI | WhichWay | WhatIsKnown | MayIDrive | WhoIsNear
+AnswerContent = RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer | NearbyAnswer
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +169,6 @@ class Answer:
     """
 
     number: int
-    content: RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer | None
+    content: AnswerContent | None
     error: str = ""
     retry_after: float = 0.0

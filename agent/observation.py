@@ -73,6 +73,8 @@ class Observation:
         battery: charge, as a share; None if the robot does not tell.
         kidnapped: whether the robot notices that it has been lifted. The wheels have not measured how it is
             moved; once this ends, it is at an unknown place.
+        left_out: (K, 4) px in the ideal image, regions of it in which other robots may stand, so that
+            nothing there is a landmark: left, top, right, bottom. No driver gives it.
     """
 
     stamp_ns: int
@@ -82,6 +84,7 @@ class Observation:
     bumped: bool = False
     battery: float | None = None
     kidnapped: bool = False
+    left_out: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,7 @@ from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.ranger_monitor import not_exploring
+from mapweave.agent.robots_in_view import RobotsInView, nodes_around
 from mapweave.agent.sensor_health.sensor_monitor import Fault, SensorMonitor
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
@@ -107,6 +108,7 @@ class Pipeline:
         self._changes: list[ChangeBody] = []
         self._driven: Driven | None = None
         self._sensors = SensorMonitor(description)
+        self._others = RobotsInView(description)
         self._command: Command | None = None
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
@@ -237,6 +239,7 @@ class Pipeline:
             self._lose_pose()
         self._take_over(driven)
         self._feel(observation)
+        observation = self._others.mark(observation, answers, lambda: self._mapper.landmarks)
         match self._mission:
             case _ if self._in_the_air(observation) or self._put_elsewhere:
                 pass
@@ -250,6 +253,7 @@ class Pipeline:
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers, self._held)
                 self._mapper.drove(self._navigator.traverse, self._navigator.refined)
+        questions = [*questions, *self._who_is_near()]
         if self._blind and not self._lifted:
             command = self._sensors.trial
         safe, warning = self._safe(command if driven is None or self._lifted else driven.command, observation)
@@ -258,6 +262,20 @@ class Pipeline:
         own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
         self._command = safe if own else None
         return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
+
+    def _who_is_near(self) -> list[Question]:
+        """Ask for the robots around this one, if it is time and it knows where it is."""
+        if not self._others.due:
+            return []
+        fix = self.fix
+        match self._mission:
+            case Explore() | Carried() if self._located and self.map.nodes:
+                starts = nodes_around(self.map, self._mapper.map_from_robot.mean)
+                return [self._others.question(starts, self._mapper.since_anchor)]
+            case GoTo() if fix is not None:
+                starts = ((fix.node, fix.node_from_robot.mean),)
+                return [self._others.question(starts, fix.node_from_robot)]
+        return []
 
     @property
     def _explores(self) -> bool:
@@ -401,6 +419,7 @@ class Pipeline:
             calibration.switched()
             self._description, self._lens = calibration.description, calibration.lens
             self._sift = Sift(self._lens, self._settings.sift)
+            self._others.description = self._description
         calibration.watch(image, *self._mapper.tracks)
         if calibration.pending is not None:
             self._mapper.recalibrate(*calibration.pending)

@@ -27,7 +27,7 @@ from mapweave.agent.drivers.messages import (
     encode_step,
 )
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.hybridmap import annotation, constraint_subject, explanation, floor_plan, query
+from mapweave.hybridmap import annotation, constraint_subject, explanation, floor_plan, nearby, query
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.camera import Camera
@@ -279,13 +279,23 @@ def answers() -> dict[str, tuple[Any, ...]]:
     return {
         "server/s0/relocalize": (
             query.RelocalizeAnswer(query.Certainty.FOUND, (where,), "41 landmarks agree"),
-            query.RelocalizeAnswer(query.Certainty.UNKNOWN, (), "no place agrees", (similar,)),
+            query.RelocalizeAnswer(
+                query.Certainty.UNKNOWN, (), "no place agrees", (similar,), "1 of 4 shards did not answer"
+            ),
         ),
         "server/s0/route": (route, query.RouteAnswer(legs, "2 nodes"), query.RouteAnswer(legs, "", LIFT)),
         "server/s0/known": (query.KnownRequest(MAP, 1.25, -2.5, 8.5), query.KnownAnswer(views, "2 views")),
         "server/s0/reserve": (
             query.ReserveRequest("r0", NODE, Pose2(0.1, 0.0, 0.2), (NEXT, FAR)),
             query.ReserveAnswer(1, "r1", FAR, "r1 drives there", True),
+        ),
+        "server/s0/nearby": (
+            nearby.NearbyRequest(
+                "r0", ((NODE, Pose2(0.1, 0.0, 0.2)), (NEXT, Pose2())), 0.05, 0.01, 0.16, 0.3, 0.3
+            ),
+            nearby.NearbyAnswer(
+                (nearby.NearbyRobot("r1", Pose2(1.5, -0.25, 3.0), 0.125, 0.16, 0.3, 0.3, 0.5),), ""
+            ),
         ),
         "server/s0/explain": (
             query.ExplainRequest((NODE, FAR), True, ((NODE, NEXT),)),
@@ -351,6 +361,11 @@ def changes() -> list[dict[str, Any]]:
     return [*vectors, vector("attachment", "of a change", KEYS.change(MAP), mark, Mark.decode(mark))]
 
 
+def _sensed(data: bytes) -> dict[str, Any]:
+    """An observation as a driver gives it."""
+    return {name: value for name, value in shown(decode_observation(data)).items() if name != "left_out"}
+
+
 def _refusal(data: bytes) -> Any:
     reply = decode_refusal(data)
     assert reply is not None
@@ -383,7 +398,7 @@ def others() -> list[dict[str, Any]]:
         ("RobotDescription", "answer", "robot/b0/describe", encode_description(webcam), decode_description),
         ("RobotDescription", "fisheye", "robot/b0/describe", encode_description(wide), decode_description),
         ("step question", "", "robot/b0/step", encode_step(StepRequest(7, Command(0.25, -0.5))), decode_step),
-        ("step answer", "raw image", "robot/b0/step", encode_observation(observation), decode_observation),
+        ("step answer", "raw image", "robot/b0/step", encode_observation(observation), _sensed),
         ("map file", "the answer, and a file", "server/s0/map", pack_map_file(map_file()), unpack_map_file),
     )  # fmt: skip
     return [

@@ -135,12 +135,15 @@ class RelocalizeAnswer:
         candidates: where the robot may be.
         reason: of the outcome.
         similar: if the place is unknown, what came nearest to being recognised, best first.
+        partial: in words, what of the map could not be searched; empty if all of it was. A partial answer is
+            never certain.
     """
 
     certainty: Certainty
     candidates: Annotated[tuple[Whereabouts, ...], Meta(max_length=MAX_CANDIDATES)]
     reason: Words
     similar: Annotated[tuple[SimilarPlace, ...], Meta(max_length=MAX_CANDIDATES)] = ()
+    partial: Words = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.plausibility import fragments
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
+from mapweave.mapserver.retrieval.ranking import Ranked
 from mapweave.mapserver.wire_limits import FARTHEST
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
@@ -20,7 +21,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 class Places(Protocol):
     """Finds nodes, but for some; for example mapweave.mapserver.retrieval.place_database.PlaceDatabase."""
 
-    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
+    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
         """At most k nodes with how much they look like a view, best first."""
         ...
 
@@ -60,11 +61,12 @@ class ActiveNodes:
         self._windows = tuple(about for about in windows if isinstance(about, RetiredWindow))
         self._hidden = self._inactive.union(merged.superseded)
 
-    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+    def query(self, view: View, k: int = 5) -> Ranked:
         """At most k active nodes with their similarity to a view, best first."""
         ranked = self._places.query(view, k, exclude=self._hidden)
         # A retired map's robot may have mapped on.
-        return [(node, score) for node, score in ranked if node.map not in self._left_out]
+        kept = ((node, score) for node, score in ranked if node.map not in self._left_out)
+        return Ranked(kept, ranked.missing)
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node without its faded landmarks; None if it is inactive or unknown."""

@@ -40,15 +40,8 @@ class AnnotationRecord:
             store: where it is kept.
             base: annotations of before, of a map that is there from the start.
         """
-        self._store = store
-        made: list[Annotation] = []
-        for body in store.annotations():
-            try:
-                made.append(decode(body, Annotation))
-            except InvalidMessage as error:
-                log.error("an annotation cannot be read (%s); it is left out", error)
-        own = Annotations(tuple(made))
-        self._annotations = base + own if base is not None and base.made else own
+        self._store, self._base = store, base
+        self._annotations = self._read()
 
     @property
     def annotations(self) -> Annotations:
@@ -63,7 +56,25 @@ class AnnotationRecord:
             InvalidFile: the disk does not take it; then nothing has changed.
         """
         self._store.add_annotation(encode(annotation))
-        self._annotations = Annotations((*self._annotations.made, annotation))
+        if self._store.shared:
+            self.reload()
+        else:
+            self._annotations = Annotations((*self._annotations.made, annotation))
+
+    def reload(self) -> bool:
+        """Read the record again, to which another server may have added; returns whether it differs."""
+        before, self._annotations = self._annotations, self._read()
+        return before != self._annotations
+
+    def _read(self) -> Annotations:
+        made: list[Annotation] = []
+        for body in self._store.annotations():
+            try:
+                made.append(decode(body, Annotation))
+            except InvalidMessage as error:
+                log.error("an annotation cannot be read (%s); it is left out", error)
+        own = Annotations(tuple(made))
+        return self._base + own if self._base is not None and self._base.made else own
 
 
 class Annotator:

@@ -59,17 +59,7 @@ class ConstraintRecord:
         """
         self._store = store
         self._base = base or BaseMap()
-        made: list[ManualConstraint] = []
-        for body in store.constraints():
-            try:
-                made.append(decode(body, ManualConstraint))
-            except InvalidMessage as error:
-                log.error("a manual constraint cannot be read (%s); it is left out", error)
-        both = dict.fromkeys((*self._base.constraints.made, *made))
-        # By date only where there are two records: clocks differ, and one record is in order.
-        self._constraints = ManualConstraints(
-            sorted(both, key=lambda one: one.stamp_ns) if self._base.constraints.made else made
-        )
+        self._constraints = self._read()
 
     @property
     def constraints(self) -> ManualConstraints:
@@ -88,7 +78,28 @@ class ConstraintRecord:
             InvalidFile: the disk does not take it; then nothing has changed.
         """
         self._store.add_constraint(encode(constraint))
-        self._constraints = ManualConstraints([*self._constraints.made, constraint])
+        if self._store.shared:
+            self.reload()
+        else:
+            self._constraints = ManualConstraints([*self._constraints.made, constraint])
+
+    def reload(self) -> bool:
+        """Read the record again, to which another server may have added; returns whether it differs."""
+        before, self._constraints = self._constraints, self._read()
+        return before.made != self._constraints.made
+
+    def _read(self) -> ManualConstraints:
+        made: list[ManualConstraint] = []
+        for body in self._store.constraints():
+            try:
+                made.append(decode(body, ManualConstraint))
+            except InvalidMessage as error:
+                log.error("a manual constraint cannot be read (%s); it is left out", error)
+        if not self._base.constraints.made:
+            return ManualConstraints(made)
+        # By date only where there are two records: clocks differ, and one record is in order.
+        both = dict.fromkeys((*self._base.constraints.made, *made))
+        return ManualConstraints(sorted(both, key=lambda one: one.stamp_ns))
 
 
 class Explainer:

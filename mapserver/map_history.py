@@ -55,12 +55,19 @@ class MapHistory:
         self._lock = threading.Lock()
         self._kept = KeptHistory()
         self._links: Collection[Link] | None = None
-        record = None if store is None else store.result(HISTORY)
+        self.reload()
+
+    def reload(self) -> None:
+        """Read the record, which the server that leads may have written."""
+        record = None if self._store is None else self._store.result(HISTORY)
         if record is not None:
             try:
-                self._kept = decode(record, KeptHistory)
+                kept = decode(record, KeptHistory)
             except InvalidMessage as error:
                 self.failed(f"the record of what happened before was damaged ({error}); a new one begins")
+                return
+            with self._lock:
+                self._kept = kept
 
     @property
     def events(self) -> tuple[MapEvent, ...]:
@@ -84,6 +91,9 @@ class MapHistory:
         """Take note of what has changed with a merge, and keep it."""
         if not merged.maps and not merged.set_apart:
             return  # Nothing is read yet: what was one is no less so.
+        if self._store is not None and not self._store.leads:
+            self._links = merged.links
+            return  # The server that leads writes the record.
         before, now = self._kept.parts, tuple(joined_maps(merged))
         same = now == before
         joined = () if same else joinings(before, merged)
@@ -162,7 +172,7 @@ class MapHistory:
         kept = replace(state, events=(*self._kept.events, *more)[-self._most :])
         with self._lock:
             self._kept = kept
-        if self._store is None:
+        if self._store is None or not self._store.leads:
             return
         try:
             self._store.put_result(HISTORY, encode(kept))

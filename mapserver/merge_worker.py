@@ -18,6 +18,7 @@ from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.merger_counters import MergerCounters
+from mapweave.mapserver.merging.node_comparisons import Compare, compare
 from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
@@ -49,6 +50,7 @@ class MergeWorker:
         merge: MergeSettings | None = None,
         keeper: VerificationCacheKeeper | None = None,
         history: MapHistory | None = None,
+        compare: Compare = compare,
         observe: Callable[[float], None] = lambda seconds: None,
         pruning: PruningRecord | None = None,
     ) -> None:
@@ -61,6 +63,7 @@ class MergeWorker:
             merge: how maps are merged.
             keeper: of the verification cache.
             history: records what joins and parts.
+            compare: compares nodes.
             observe: called with the time that a merge has taken, s.
             pruning: prunes what has been superseded for long; None: nothing is.
         """
@@ -69,7 +72,7 @@ class MergeWorker:
         self._history = history or MapHistory()
         self._observe = observe
         self._share = share
-        self._merger = Merger(places, merge)
+        self._merger = Merger(places, merge, compare)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False

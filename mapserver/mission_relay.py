@@ -71,12 +71,21 @@ class MissionRelay:
         self.roster: Roster | None = None
         self._turn = threading.RLock()
         self._reports: dict[str, MissionReport] = {}
+        self.reload()
+
+    def reload(self) -> None:
+        """Read the record, to which other servers may have added."""
         try:
-            kept = store.result(KEPT)
+            kept = self._store.result(KEPT)
             missions = Missions() if kept is None else decode(kept, Missions)
-            self._reports = {report.order.id: report for report in missions.reports}
         except InvalidMessage as error:
             log.warning("the record of missions is lost: %s", error)
+            return
+        with self._turn:
+            for report in missions.reports:
+                before = self._reports.get(report.order.id)
+                if before is None or report.supersedes(before):
+                    self._reports[report.order.id] = report
 
     def missions(self) -> Missions:
         """All that are known, oldest first."""

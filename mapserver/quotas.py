@@ -119,7 +119,8 @@ class Quotas:
             excess.last = self.clock()
             self._totals[what] = self._totals.get(what, 0) + count
         if before.bit_length() != after.bit_length():
-            log.warning("%s is over its quota: %d %s held back so far", robot, after, what)
+            words = "%s is over its quota: %d %s held back so far"
+            log.warning(words, robot, after, what, extra={"robot": robot})
 
     def ask(self, robot: str) -> None:
         """A robot asks something. People (no name) have no quota here: HTTP has its own limits.

@@ -29,15 +29,19 @@ from mapweave.mapserver.annotator import AnnotationRecord, Annotator
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
+from mapweave.mapserver.cluster.cluster import Cluster
+from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.opening import open_store
+from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, News
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.metrics import Metrics, Sources
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
+from mapweave.mapserver.mission_relay import KEPT as MISSIONS
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.plan_service import PlanService
@@ -64,11 +68,13 @@ class ServerSettings:
         admission_control: how questions that take long are shared out.
         merge: how maps are merged.
         quotas: what it takes of one robot.
+        cluster: among whose processes the place index is split.
     """
 
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
+    cluster: ClusterSettings = field(default_factory=ClusterSettings)
 
 
 STATUS_EVERY = 0.5
@@ -122,7 +128,8 @@ class MapServer:
         except InvalidFile:
             self._store.close()
             raise
-        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()])
+        self._cluster = Cluster(s.cluster)
+        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()], self._cluster.index)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._metrics = Metrics()
@@ -131,8 +138,9 @@ class MapServer:
             self._store, s.merge.keep_superseded_days, self._said, base.maps if base else ()
         )  # fmt: skip
         self._worker = MergeWorker(
-            clock, MERGE_SHARE, self._places, s.merge, findings, self._history, self._metrics.merged, pruning
-        )
+            clock, MERGE_SHARE, self._places, s.merge, findings, self._history, self._cluster.compare,
+            self._metrics.merged, pruning,
+        )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
         self._pins, self._floors = self._annotations.annotations.pins, self._annotations.annotations.floors
@@ -144,10 +152,12 @@ class MapServer:
         )
         self._blockages = Blockages()
         self._quotas = Quotas(s.quotas, clock.monotonic)
+        self._traffic, self._lost = self._store.traffic(), self._damaged()
 
     def __enter__(self) -> MapServer:
         """Begin to serve."""
         worker, clock = self._worker, self._schedule
+        self._cluster.start()
         worker.start()
         base = self._base
         self._ingest = Ingest(
@@ -187,6 +197,7 @@ class MapServer:
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
         clock.every(EVERY, self._places.save_if_worthwhile)
+        self._store.follow(self._follow)
         return self
 
     def __exit__(
@@ -201,6 +212,7 @@ class MapServer:
         self._admission.close()
         self._ingest.close()
         self._broadcast.close()
+        self._cluster.close()
         self._worker.close()
         self._places.close()
         self._store.close()
@@ -225,17 +237,24 @@ class MapServer:
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
         merged = self._worker.answers.merged
-        traffic = self._store.traffic()
+        failure = self._ingest.failure
+        try:
+            self._traffic, self._lost = self._store.traffic(), self._damaged()
+        except InvalidFile as error:
+            failure = str(error)
+        traffic = self._traffic
         return {
             **merged.counts(),
+            **({"leads": self._store.leads} if self._store.shared else {}),
             "over_quota": ", ".join(self._quotas.over())[:1000],
-            "damaged": self._damaged(),
-            "event": self._ingest.failure or self._worker.event,
+            "damaged": self._lost,
+            "event": failure or self._worker.event,
             "settled": self._worker.settled,
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,
             "summary": merged.summary(),
             "version": version("mapweave"),
+            "cluster": self._cluster.status,
             **self._admission.counters(),
         }
 
@@ -380,6 +399,18 @@ class MapServer:
             self._quotas.over, self._damaged, lambda: {"ingest": ingest.waiting, **worker.queues()},
             lambda: bool(ingest.failure), lambda: worker.settled,
         )  # fmt: skip
+
+    def _follow(self, news: News) -> None:
+        """Take over what another server has written to the store; in the store's thread."""
+        self._ingest.follow(news)
+        if news.names(CONSTRAINTS) and self._constraints.reload():
+            self._constrain()
+        if news.names(ANNOTATIONS) and self._annotations.reload():
+            self._apply_annotations(self._annotations.annotations)
+        if news.names(MISSIONS):
+            self._missions.reload()
+        if news.names(HISTORY) and not self._store.leads:
+            self._history.reload()
 
     def _damaged(self) -> int:
         """Changes that are damaged on the disk."""

@@ -11,6 +11,7 @@ from functools import partial
 from mapweave.hybridmap.errors import Busy, InvalidMessage, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
+from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.query import (
     KnownRequest,
@@ -25,6 +26,7 @@ from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.mission_relay import MissionRelay
+from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.packed_map import PackedMap
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
@@ -100,6 +102,7 @@ class Services:
         self._roster = roster
         self._relays = relays
         self._reservations = Reservations()
+        self._nearby = Nearby()
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
             lambda: places().annotations, images,
@@ -109,6 +112,7 @@ class Services:
             keys.route(name): guarded(self._route),
             keys.known(name): guarded(self._known),
             keys.reserve(name): self._reserve_in_name,
+            keys.nearby(name): self._nearby_in_name,
         }
         self._closing: list[Closing] = [
             *(bus.serve(question, answer) for question, answer in of_robots.items()),
@@ -209,6 +213,15 @@ class Services:
         self._reservations.ask(replace(request, route=()), router, self._clock())
         number, closure = closed
         return encode(ReserveAnswer(number, "", None, f"the way ahead is {rule_words(closure)}", True))
+
+    def _nearby_in_name(self, request: Request) -> None:
+        guarded(lambda payload: self._around(payload, robot_of(request.key)))(request)
+
+    def _around(self, payload: bytes, robot: str) -> bytes:
+        request = decode(payload, NearbyRequest)
+        if robot not in ("", request.robot):
+            raise InvalidMessage(f"{robot} does not say where {request.robot} is")
+        return encode(self._nearby.ask(request, self._answers().merged, self._clock()))
 
     def _known(self, payload: bytes) -> bytes:
         request = decode(payload, KnownRequest)

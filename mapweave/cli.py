@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import re
 import sys
@@ -43,6 +44,7 @@ from mapweave.commands.examples import add_examples
 from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
+from mapweave.json_log import json_line
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help, with examples."
 NEGATIVE = re.compile(r"-[0-9.][0-9.,=e+-]*$")
@@ -114,10 +116,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{arguments.command} {MissingExtra([extra])}", file=sys.stderr)
         return MISSING_EXTRA
     except MapweaveError as error:
-        print(f"mapweave: {error}", file=sys.stderr)
+        _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
-        print("mapweave: interrupted", file=sys.stderr)
+        _complain("interrupted")
         return INTERRUPTED
     except BrokenPipeError:
         return FAILED
@@ -129,8 +131,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         elif isinstance(error, NotADirectoryError):
             reason = "cannot be made: what it should be in is a file"
         where = f"{error.filename}: " if error.filename else ""
-        print(f"mapweave: {where}{reason}", file=sys.stderr)
+        _complain(f"{where}{reason}")
         return FAILED
+
+
+def _complain(words: str) -> None:
+    """Say why the command ends, as all else that a process logs."""
+    print(json_line(words, logging.ERROR) or f"mapweave: {words}", file=sys.stderr)
 
 
 if __name__ == "__main__":

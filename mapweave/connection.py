@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from mapweave.hybridmap.errors import NotConnected
+from mapweave.wire.credentials import Role
 
 if TYPE_CHECKING:
     from mapweave.wire.bus_settings import BusSettings
@@ -72,6 +73,11 @@ def _key_hint(holder: Credentials | None) -> str:
     """A router drops what a key may not do, without a word."""
     if holder is None:
         return ""
+    if holder.role is Role.ROBOT:
+        return (
+            f"; or {holder.name} may not ask this: its key is a robot's, use a viewer's or an operator's; "
+            "or it was revoked or has expired: `mapweave keys list` at the server and the server's log say so"
+        )
     return (
         f"; or the key of {holder.name} was revoked, has expired or may not do this: `mapweave keys list` at "
         "the server and the server's log say so"

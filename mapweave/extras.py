@@ -20,6 +20,7 @@ MODULES = {
         "uvicorn",
         "wsproto",
     ),
+    "cluster": ("ray",),
     "postgres": ("psycopg",),
     "sim": ("pybullet",),
     "eval": ("evo",),

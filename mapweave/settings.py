@@ -9,6 +9,7 @@ from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
+from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.quotas import QuotaSettings
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.settings_file import build, read_toml
@@ -22,7 +23,8 @@ class NetworkSettings:
         fleet: name that robots, server and simulator share.
         endpoints: Zenoh endpoints of routers, tried in order; when one fails a robot goes on with the next.
             A server or router listens at all of them.
-        routers: of a server or router: endpoints of other routers that it joins.
+        routers: of a router: the endpoint of another one that it joins. Of a server: likewise if `endpoints`
+            are given, where it listens; else endpoints of routers, tried in order, of which it is a client.
         server: name of the map server that must have a change before the agent may forget it.
         keys: key file of this robot or person; for a server or router the folder of `mapweave keys init`.
     """
@@ -45,6 +47,7 @@ class Settings:
         admission_control: how a map server shares out the questions that take long.
         quotas: what a map server takes of one robot at most.
         merge: how maps are merged.
+        cluster: of machines that help a map server.
     """
 
     network: NetworkSettings = field(default_factory=NetworkSettings)
@@ -53,6 +56,7 @@ class Settings:
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
+    cluster: ClusterSettings = field(default_factory=ClusterSettings)
 
 
 def load_settings(path: Path | None) -> Settings:

@@ -17,7 +17,10 @@ from mapweave.settings import Settings
 
 ROLES = (
     ("a robot: `mapweave agent`, `replay`", "`[network]`, `[robot]`, `[agent]`"),
-    ("the server: `mapweave server`", "`[network]`, `[admission_control]`, `[merge]`, `[quotas]`"),
+    (
+        "the server: `mapweave server`",
+        "`[network]`, `[admission_control]`, `[merge]`, `[quotas]`, `[cluster]`",
+    ),
     ("people who ask a server: `mapweave relocalize`, `map`", "`[network]`"),
     ("people with map files: `mapweave map`", "`[merge]`"),
     ("simulation and recordings: `mapweave sim`, `evaluate`", "`[agent]`, `[merge]`"),

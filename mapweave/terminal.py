@@ -17,6 +17,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
+from mapweave.json_log import JsonFormatter, json_line
+
 PLAIN_WIDTH = 10_000
 """Characters of a line that is not on a terminal: none is wrapped."""
 EVERY = 10.0
@@ -33,13 +35,25 @@ def plain_or_terminal(stderr: bool = True, quiet: bool = False) -> Console:
     return Console(file=stream, quiet=quiet, width=None if stream.isatty() else PLAIN_WIDTH)
 
 
-def log_with_time() -> None:
-    """Let warnings of any part be lines of the log, with the time like all others."""
-    logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
+def log_with_time(log_format: str = "text", **fields: str) -> None:
+    """Let warnings of any part be lines of the log, with the time like all others.
+
+    Args:
+        log_format: `text`, or `json` for one object a line, see `mapweave.json_log`.
+        fields: that every object has.
+    """
+    if log_format == "text":
+        logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
+    else:
+        handler = logging.StreamHandler()
+        handler.setFormatter(JsonFormatter(**fields))
+        logging.basicConfig(handlers=[handler])
 
 
 def stamped(line: str) -> str:
     """An event as a line of a log, with the time."""
+    if (as_json := json_line(line)) is not None:
+        return as_json
     return f"{datetime.now().strftime(STAMP)} {' '.join(line.split())}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -10,6 +11,9 @@ from pathlib import Path
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_reader import reading
 
+LEAST_FREE = 1 << 16
+"""Bytes; a disk with less takes no page of SQLite with its place in the write-ahead log."""
+DISK_ERRORS = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN)
 BUSY = 1.0
 """How long to wait for a file that another process is about to close, s."""
 
@@ -97,6 +101,8 @@ class Database:
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF
             if code == sqlite3.SQLITE_CORRUPT:
                 raise self._damaged(str(error)) from None
+            if code in DISK_ERRORS and (reason := _disk_trouble(self._file.parent)):
+                raise InvalidFile(f"{self.path}: {self.what}: {reason}") from None
             advice = self._advice if code == sqlite3.SQLITE_NOTADB else ""
             raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error}){advice}") from None
         except UnicodeDecodeError:
@@ -166,3 +172,16 @@ class Database:
 
     def _damaged(self, reason: str) -> InvalidFile:
         return InvalidFile(f"{self.path}: {self.what} is damaged ({reason}){self._advice}")
+
+
+def _disk_trouble(folder: Path) -> str:
+    """Why nothing can be written there, where SQLite only says that it failed; empty if that is not why."""
+    try:
+        disk = os.statvfs(folder)
+    except OSError:
+        return ""
+    if disk.f_flag & os.ST_RDONLY:
+        return "the disk is read-only; a damaged disk becomes so by itself: see the system's log"
+    if disk.f_bavail * disk.f_frsize < LEAST_FREE:
+        return "the disk is full; make room, and what waits is written"
+    return ""

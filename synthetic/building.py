@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import View
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link
-from synthetic.world import Sensing, World, room, take_node
+from synthetic.world import Sensing, World, room, take_node, take_view
 
 WIDTH, DEPTH = 5.0, 4.0
 """Of a room, m."""
@@ -115,6 +116,14 @@ class Building:
                 edge_id = EdgeId(map_id.agent, map_id.epoch, 2 * k - 1)
                 earlier = NodeId(map_id.agent, map_id.epoch, 2 * k - 2)
                 yield map_id, EdgePut(Edge(edge_id, earlier, node_id, step, EdgeKind.MAPPED))
+
+    def view(
+        self, robot: int, k: int, node_from_robot: Pose2, rng: np.random.Generator
+    ) -> tuple[View, Pose2]:
+        """What a robot sees beside a node, and `world_from_robot`."""
+        world_from_robot = Pose2.from_vector(self.truth[robot, k]) @ node_from_robot
+        in_room = self._corner(robot, k).inverse() @ world_from_robot
+        return take_view(_room(self.seed, int(self.rooms[robot, k])), in_room, rng)[0], world_from_robot
 
     def _corner(self, robot: int, k: int) -> Pose2:
         """World pose of the room's corner: rooms differ in what they show alone."""

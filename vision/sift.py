@@ -66,6 +66,7 @@ LEAST_ROUNDNESS = 0.04
 """The same mean squared gradient in the weakest direction, as a share of that in the strongest."""
 CONTRAST = 0.02
 """SIFT's contrast threshold; lower finds more and weaker features."""
+NOTHING: Array = np.zeros((0, 4))
 CELLS = 4
 """The image is cut into CELLS x CELLS cells;"""
 CROWDING = 2.5
@@ -84,10 +85,15 @@ class Sift:
         # More are asked for than kept, so that the spread has something to choose from.
         self._detector = cv2.SIFT.create(nfeatures=2 * self._settings.most, contrastThreshold=CONTRAST)
 
-    def extract(self, image: NDArray[np.uint8]) -> Features:
-        """Find the features of a grey image (H, W)."""
+    def extract(self, image: NDArray[np.uint8], left_out: Array = NOTHING) -> Features:
+        """Find the features of an image.
+
+        Args:
+            image: (H, W) grey.
+            left_out: (K, 4) px in the ideal image, regions without features: left, top, right, bottom.
+        """
         image = self._lens.rectified(image)
-        keypoints, descriptors = self.describe(image)
+        keypoints, descriptors = self.describe(image, left_out)
         if not keypoints:
             return Features(
                 np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, CODE_BYTES), np.uint8), np.zeros(0)
@@ -99,13 +105,16 @@ class Sift:
             return Features(self._lens.distort(raw), raw, codes, responses)
         return Features(raw, self._lens.undistort(raw), codes, responses)
 
-    def describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]:
+    def describe(
+        self, image: NDArray[np.uint8], left_out: Array = NOTHING
+    ) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]:
         """The same before they are coded: keypoints, strongest first, and (N, 128) SIFT."""
         # In one call: descriptors of those that are left out cost less than a second image pyramid.
         found, descriptors = self._detector.detectAndCompute(image, None)
         if not found:
             return [], np.zeros((0, 128), np.float32)
-        kept = self._spread(found, self._trackable(found, image), image.shape[1], image.shape[0])
+        chosen = self._outside(found, self._trackable(found, image), left_out)
+        kept = self._spread(found, chosen, image.shape[1], image.shape[0])
         return [found[k] for k in kept], np.asarray(descriptors, np.float32)[kept]
 
     def _trackable(self, keypoints: Sequence[cv2.KeyPoint], image: NDArray[np.uint8]) -> list[int]:
@@ -125,6 +134,16 @@ class Sift:
         weak, strong = middle - half, middle + half
         enough = (weak >= LEAST_TEXTURE) & (weak >= LEAST_ROUNDNESS * strong)
         return [int(k) for k in np.flatnonzero(enough)]
+
+    def _outside(self, keypoints: Sequence[cv2.KeyPoint], chosen: list[int], left_out: Array) -> list[int]:
+        """Numbers of those that lie in no region that is left out."""
+        if not len(left_out) or not chosen:
+            return chosen
+        at = np.array([keypoints[k].pt for k in chosen], dtype=np.float64)
+        pixels = (at if self._lens.rectifies else self._lens.undistort(at))[:, None]
+        inside: NDArray[np.bool_] = (pixels >= left_out[:, :2]) & (pixels <= left_out[:, 2:])
+        hits = np.any(np.all(inside, axis=2), axis=1).tolist()
+        return [k for k, hit in zip(chosen, hits, strict=True) if not hit]
 
     def _spread(
         self, keypoints: Sequence[cv2.KeyPoint], chosen: Sequence[int], width: int, height: int

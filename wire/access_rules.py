@@ -14,9 +14,9 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.senders import sent_by
 
 ASKS = (
-    "relocalize", "route", "known", "reserve", "mission", "missions", "robots", "map", "explain", "constrain",
-    "constraints", "annotate", "annotations", "resolve", "plans", "plan_image", "put_plan_image", "history",
-    "status",
+    "relocalize", "route", "known", "reserve", "nearby", "mission", "missions", "robots", "map", "explain",
+    "constrain", "constraints", "annotate", "annotations", "resolve", "plans", "plan_image",
+    "put_plan_image", "history", "status",
 )  # fmt: skip
 """Every question to a server, by the last part of its key."""
 COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})
@@ -24,7 +24,7 @@ COMMANDS = frozenset({"constrain", "annotate", "put_plan_image", "mission"})
 SIGNED = frozenset({"constrain", "annotate", "mission"})
 """Those whose sender is recorded: people ask them under keys that end with their name alone."""
 WATCHES = ("liveliness_query", "declare_liveliness_subscriber")
-OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve"})
+OF_ROBOTS = frozenset({"relocalize", "route", "known", "reserve", "nearby"})
 """Those of robots, each in its own name."""
 
 

@@ -46,7 +46,8 @@ class BusSettings:
         mode: a client of a router, or the router itself.
         endpoints: routers that a client tries; it takes the first that answers.
         listen: where a router waits for clients.
-        routers: other routers that a router joins; all their clients reach each other then.
+        routers: another router that a router joins: the clients of both reach each other then. At most one,
+            so that routers form no circle.
         session: id of the Zenoh session, hexadecimal; empty for a random one.
         timestamps: whether what is published gets a time, without which nothing is kept for late subscribers.
         attempt: of a client to open a connection, s: so long a host that does not answer holds up the end of
@@ -78,6 +79,13 @@ class BusSettings:
         used = self.endpoints if self.mode == "client" else self.listen
         if not used:
             raise SettingsError("bus: give at least one endpoint, for example " + DEFAULT_ENDPOINT)
+        if len(self.routers) > 1:
+            # In a circle, a router that is silent for longer than its lease and then comes back is not found
+            # any more (Zenoh 1.10: its transports are open again, and no routes lead there).
+            raise SettingsError(
+                f"a router joins one other, not {len(self.routers)}: a router that freezes for seconds would "
+                "be lost in a circle of them; a map server without --listen takes several, as their client"
+            )
         if self.routers and self.credentials is not None and not self.credentials.certified:
             # Who connects with a password does not learn who is at the other end.
             raise SettingsError("routers join each other with certificates, not with the passwords of a lab")

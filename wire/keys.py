@@ -15,7 +15,9 @@
                                                       plans, plan_image and put_plan_image
     mapweave/1/<fleet>/server/<server>/mission        question: a mission; also missions, robots
     mapweave/1/<fleet>/server/<server>/reserve        question: may the next edges be driven?
-    mapweave/1/<fleet>/server/<server>/relocalize/<agent>  the same of a robot; also route, known, reserve
+    mapweave/1/<fleet>/server/<server>/nearby         question: which robots are around this one?
+    mapweave/1/<fleet>/server/<server>/relocalize/<agent>  the same of a robot; also route, known, reserve,
+                                                      nearby
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/server/<server>/constrain/<who>  the same of a person with a key; also annotate and
                                                       missions, see mapweave.wire.senders
@@ -201,6 +203,14 @@ class Keys:
     def any_reserve(self) -> str:
         """Pattern: any server."""
         return f"{self.root}/server/*/reserve"
+
+    def nearby(self, server: str) -> str:
+        """Where a server says which robots are around a robot."""
+        return self._of_server("nearby", server)
+
+    def any_nearby(self) -> str:
+        """Pattern: any server."""
+        return f"{self.root}/server/*/nearby"
 
     def explain(self, server: str) -> str:
         """Explanations by a server."""

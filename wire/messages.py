@@ -22,6 +22,7 @@ from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
+from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pruned_node import PrunedNode
@@ -113,6 +114,8 @@ LIMITS: dict[type, Limit] = {
     RouteAnswer: Limit("route", 2**23),
     ReserveRequest: Limit("reserve request", 2**16),
     ReserveAnswer: Limit("reservation", 2**14),
+    NearbyRequest: Limit("nearby request", 2**12),
+    NearbyAnswer: Limit("nearby robots", 2**14),
     KnownRequest: Limit("known request", 256),
     KnownAnswer: Limit("known", 16 * MAX_KNOWN + 2**13),
     ExplainRequest: Limit("explain request", 2**16),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,19 @@ SIGNIFICANT = 3.5
 """Sigmas from the declared value at which a parameter is declared wrongly."""
 
 
+class Lengths(Enum):
+    """What besides the wheels shows how far a robot has gone."""
+
+    FLOOR = "floor"
+    """The floor, with the camera's declared height; or nothing, where none is seen."""
+    RANGERS = "rangers"
+    """Proximity sensors, and no floor."""
+    BOTH = "both"
+    """Both, and they agree."""
+    CONTRADICT = "contradict"
+    """Both, and one of them is wrong: the sensors are left out."""
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Parameters with their covariance.
@@ -28,6 +42,7 @@ class Estimate:
         pairs: how many image pairs it is made of.
         floor_tracks: tracks on the floor in all of them.
         keep_wheels: whether the wheels' scale was held instead of the height.
+        lengths: what besides the wheels shows how far the robot has gone.
     """
 
     vector: Array
@@ -36,6 +51,7 @@ class Estimate:
     pairs: int
     floor_tracks: int
     keep_wheels: bool = False
+    lengths: Lengths = Lengths.FLOOR
 
     @property
     def geometry(self) -> DriveGeometry:
@@ -51,13 +67,15 @@ class Estimate:
     def shown(self) -> NDArray[np.bool_]:
         """(10,) which parameters the drive shows: better than useful, and much better than assumed.
 
-        Without the floor nothing tells a scale.
+        Without the floor nothing tells a scale, but for proximity sensors that of the wheels.
         """
         assumed = np.array([PRIOR_SIGMAS[p] for p in P])
         if self.keep_wheels:
             assumed[[P.WHEEL_SCALE, P.HEIGHT]] = assumed[[P.HEIGHT, P.WHEEL_SCALE]]
         shown = np.asarray((self.sigmas < useful(self.declared)) & (self.sigmas < 0.5 * assumed))
-        shown[[P.WHEEL_SCALE, P.HEIGHT, P.LEFT]] &= self.floor_tracks >= LEAST_FLOOR
+        floor = self.floor_tracks >= LEAST_FLOOR
+        shown[[P.HEIGHT, P.LEFT]] &= floor
+        shown[P.WHEEL_SCALE] &= floor or self.lengths is Lengths.RANGERS
         return shown
 
     @property

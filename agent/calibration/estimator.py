@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, motions_over, predict
-from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.floor_scale import floor_scale
 from mapweave.agent.calibration.pair_information import (
     FloorMatches,
@@ -26,6 +26,7 @@ from mapweave.agent.calibration.pair_information import (
     with_floor,
 )
 from mapweave.agent.calibration.parameter_sigmas import DELAY_SHARE, MODEL_SIGMAS, PRIOR_SIGMAS, useful
+from mapweave.agent.calibration.ranger_scale import RangedScale
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.hybridmap.pose import Array
 
@@ -54,6 +55,8 @@ LEAST_SIGMA = 0.2
 """Least standard deviation of a track as a share of what is assumed beforehand: lenses are not quite as they
 were calibrated. In simulation tracks scatter by a fifth of a pixel or less; taken for half a pixel, wheels
 that slip count for more than what is seen."""
+AGREEMENT = 2.5
+"""Sigmas within which floor and proximity sensors must agree on the wheels' scale to bear each other out."""
 ROUNDS = 3
 """Of a batch: reductions of all pairs."""
 INNER = 6
@@ -69,6 +72,7 @@ class Estimator:
         informations: what they are reduced to.
         reduced_at: (10,) parameters at which each was reduced.
         floor_tracks: tracks that lie on the floor.
+        ranged: the wheels' scale by proximity sensors; None if they do not show it.
     """
 
     def __init__(self, declared: DriveGeometry, sigma: float, keep_wheels: bool = False) -> None:
@@ -93,6 +97,7 @@ class Estimator:
         self._reduced_sigmas: list[float] = []
         self._floor: tuple[float, float] | None = None
         self.floor_tracks = 0
+        self.ranged: RangedScale | None = None
         self.pairs: list[ImagePair] = []
         self.informations: list[PairInformation] = []
         self._covariance = np.diag(prior**2)
@@ -146,6 +151,10 @@ class Estimator:
         b = np.stack([i.vector for i in self.informations])
         measured, spread = self._floor or (0.0, 1.0)
         fixed = np.outer(floor, floor) / spread**2
+        lengths = self._lengths()
+        shows = self.ranged is not None and lengths is not Lengths.CONTRADICT
+        tight, ranged = (self.ranged.sigma**-2, self.ranged.log) if self.ranged and shows else (0.0, 0.0)
+        fixed[P.WHEEL_SCALE, P.WHEEL_SCALE] += tight
         for _ in range(iterations):
             predicted = predict(self.vector, wheels, first, last)
             off = predicted.since(at)
@@ -168,6 +177,7 @@ class Estimator:
             hessian = jacobian.reshape(-1, COUNT).T @ pulled + self._prior + fixed
             gradient: Array = scores.sum(0) - self._prior @ (self.vector - self.declared)
             gradient = gradient + floor * (measured - floor @ self.vector) / spread**2
+            gradient[P.WHEEL_SCALE] += tight * (ranged - self.vector[P.WHEEL_SCALE])
             self.vector = self.vector + np.linalg.solve(hessian, gradient)
         self._learn_scene()
         inverse_hessian = np.asarray(np.linalg.inv(hessian), np.float64)
@@ -182,6 +192,7 @@ class Estimator:
             len(self.pairs),
             self.floor_tracks,
             self._keep_wheels,
+            lengths,
         )
 
     def batch(self, pairs: Sequence[ImagePair], wheels: WheelTrack) -> Estimate:
@@ -220,6 +231,17 @@ class Estimator:
         pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) / FLOOR_BELOW
         self._floor = None if found is None else (float(used + found.log), math.hypot(found.sigma, pitch))
         self.floor_tracks = 0 if found is None else found.tracks
+
+    def _lengths(self) -> Lengths:
+        """What besides the wheels shows how far the robot has gone."""
+        if self.ranged is None:
+            return Lengths.FLOOR
+        if self._floor is None:
+            return Lengths.RANGERS
+        by_floor = self._floor[0] + self.declared[P.HEIGHT]
+        sigma = math.hypot(self._floor[1], PRIOR_SIGMAS[P.HEIGHT], self.ranged.sigma)
+        agree = abs(by_floor - self.ranged.log) < AGREEMENT * sigma
+        return Lengths.BOTH if agree else Lengths.CONTRADICT
 
     def _jacobian(
         self, wheels: WheelTrack, first: Array, last: Array, at: CameraMotions, off: Array

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import WheelTrack
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
-from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.floor_tiles import FloorTiles
 from mapweave.agent.calibration.image_pairs import (
@@ -26,6 +26,7 @@ from mapweave.agent.calibration.image_pairs import (
 )
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.parameter_sigmas import useful
+from mapweave.agent.calibration.ranger_scale import RangerScale
 from mapweave.agent.calibration.report import Cause, causes
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, RobotDescription
@@ -54,13 +55,16 @@ SETTLED = 0.5
 LASTING = 1.5
 """A parameter is wrong if all solutions say so while the pairs grow by this factor: what a few have in common
 by chance, more do not bear out. Without, one of nine simulated robots got three false names within 23 s."""
-WORTH = 2.0
+WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
+WORTH[P.WHEEL_SCALE] = 1.0
+"""Two lengths that agree are used as soon as they are sure enough to name the wheels."""
 
 NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
 """Named, but not used by themselves. The wheels' scales and drift are what all else is measured by, and the
 floor shows the height only as a multiple of the way: on KITTI 03, where the road is not flat, the scale is up
-to 8 % off in the middle of the drive. A camera aside or rolled shows too weakly."""
+to 8 % off in the middle of the drive. A camera aside or rolled shows too weakly. Only where proximity sensors
+bear out what the floor shows, two lengths against one, is the wheels' scale used."""
 
 
 class OnlineCalibration:
@@ -91,6 +95,7 @@ class OnlineCalibration:
         self._first_s = self._first_way = 0.0
         self._ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self._begin: Array = np.zeros((0, 2))
+        self._ranger_scale = RangerScale(description)
         self._tiles = FloorTiles(description.camera, self._plain)
         self._floor: NDArray[np.float32] = np.zeros((0, 0), np.float32)
         self._since_solution = 0
@@ -121,6 +126,7 @@ class OnlineCalibration:
         way, turn = self._counts[-1] if self._counts else (0.0, 0.0)
         self._stamps.append(stamp)
         self._counts.append((way + wheels.forward, turn + wheels.turn))
+        self._ranger_scale.step(wheels, observation.proximity)
         return self._correction.step(observation, self._geometry)
 
     def watch(
@@ -210,6 +216,7 @@ class OnlineCalibration:
         self._parts_left -= 1
         if self._parts_left:
             self._estimator.find_floor()
+            self._estimator.ranged = self._ranger_scale.scale()
             return ()
         estimate = self._estimator.solve(self._wheels(), STEPS)
         before, self._last = self._last, estimate
@@ -242,13 +249,16 @@ class OnlineCalibration:
             & (off > WORTH * useful(estimate.declared))
             & (off > SIGNIFICANT * estimate.sigmas)
         )
-        change[NAMED_ONLY] = False
+        named_only = [p for p in NAMED_ONLY if not (p is P.WHEEL_SCALE and estimate.lengths is Lengths.BOTH)]
+        change[named_only] = False
         change &= self._lasting(change, self._changed_since)
         if not change.any():
             return
-        # What is shown but differs less goes along: the estimates belong together.
-        along = estimate.shown & settled & (off > estimate.sigmas)
-        along[NAMED_ONLY] = False
+        # What is shown but differs less goes along: the estimates belong together. The wheels' scale brings
+        # nothing along: only lengths tell of it.
+        belongs = change.any(where=np.arange(COUNT) != P.WHEEL_SCALE)
+        along = belongs & estimate.shown & settled & (off > estimate.sigmas)
+        along[named_only] = False
         self._next = DriveGeometry.of(np.where(change | along, estimate.vector, target))
         self.pending = corrected(self._declared, self._next)
 

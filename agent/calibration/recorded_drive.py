@@ -13,6 +13,7 @@ from mapweave.agent.calibration.estimate import Estimate
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.image_pairs import ImagePairs, sigma_of
 from mapweave.agent.calibration.pair_information import ImagePair
+from mapweave.agent.calibration.ranger_scale import RangerScale
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
@@ -60,11 +61,12 @@ def calibrate(
     lens = Lens(camera, description.distortion)
     images = ImagePairs(camera, Lens(camera) if lens.rectifies else lens)
     stamps, ways, turns = list[float](), list[float](), list[float]()
-    pairs = []
+    pairs, rangers = [], RangerScale(description)
     for observation in observations:
         stamps.append(1e-9 * observation.stamp_ns)
         ways.append(observation.odometry.forward)
         turns.append(observation.odometry.turn)
+        rangers.step(observation.odometry, observation.proximity)
         if observation.image is not None:
             pair = images.step(stamps[-1], lens.rectified(observation.image))
             if pair is not None:
@@ -86,10 +88,13 @@ def calibrate(
     held = pairs[HELD_OUT - 1 :: HELD_OUT]
     others = [pair for k, pair in enumerate(pairs) if k % HELD_OUT != HELD_OUT - 1]
     part = Estimator(declared, sigma, keep_wheels)
+    part.ranged = rangers.scale()
     trained = part.batch(others, wheels)
     misses = (_miss(part, held, wheels, v) for v in (declared.vector, trained.usable.vector))
     before, after = (camera.fx * miss for miss in misses)
-    return DriveCalibration(Estimator(declared, sigma, keep_wheels).batch(pairs, wheels), before, after)
+    whole = Estimator(declared, sigma, keep_wheels)
+    whole.ranged = part.ranged
+    return DriveCalibration(whole.batch(pairs, wheels), before, after)
 
 
 def _miss(estimator: Estimator, pairs: list[ImagePair], wheels: WheelTrack, vector: Array) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate
+from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.parameter_sigmas import useful
 from mapweave.agent.drive_geometry import Parameter
 from mapweave.hybridmap.pose import Array
@@ -33,6 +33,7 @@ class Cause:
         estimated: likewise.
         sigma: of the estimate, likewise.
         sigmas: how many sigmas the two are apart.
+        lengths: what shows the wheels' scale.
     """
 
     parameter: Parameter
@@ -40,14 +41,18 @@ class Cause:
     estimated: float
     sigma: float
     sigmas: float
+    lengths: Lengths = Lengths.FLOOR
 
     def __str__(self) -> str:
         """One line."""
         d, e = self.declared, self.estimated
         times = e / d if self.parameter in LOGARITHMIC else 1.0
+        seen, instead = {
+            Lengths.RANGERS: ("what is ahead comes nearer", " (or its sensors read wrong by as much)"),
+            Lengths.BOTH: ("the floor moves, and what is ahead comes nearer,", ""),
+        }.get(self.lengths, ("the floor moves", " (or the camera were lower by as much)"))
         texts = {
-            P.WHEEL_SCALE: f"the floor moves as if the wheels went {times:.3f} times as far as they report "
-            "(or the camera were lower by as much)",
+            P.WHEEL_SCALE: f"{seen} as if the wheels went {times:.3f} times as far as they report{instead}",
             P.TURN_SCALE: f"in turns the image turns {times:.3f} times as far as the wheels report: axle or "
             "wheel sizes",
             P.DRIFT: f"driving ahead, the image turns by {e - d:+.2f} deg/m that the wheels do not report: "
@@ -98,8 +103,9 @@ def causes(estimate: Estimate, declared: Array | None = None) -> list[Cause]:
     off = np.abs(estimate.vector - declared)
     wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > useful(estimate.declared))
     value, was, sigma = readable(estimate.vector), readable(declared), readable_sigmas(estimate)
+    lengths = estimate.lengths
     found = [
-        Cause(p, float(was[p]), float(value[p]), float(sigma[p]), float(off[p] / estimate.sigmas[p]))
+        Cause(p, float(was[p]), float(value[p]), float(sigma[p]), float(off[p] / estimate.sigmas[p]), lengths)
         for p in P
         if wrong[p]
     ]

@@ -13,12 +13,12 @@ from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.node import Node
-from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 from mapweave.registration.levelling import level
 from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import RecognitionSettings, recognise
 from mapweave.vision.lens import Lens
-from mapweave.vision.sift import Sift
+from mapweave.vision.sift import NOTHING, Sift
 
 
 class Expected(NamedTuple):
@@ -80,6 +80,7 @@ class NodeDetector:
         image: NDArray[np.uint8],
         wanted: Iterable[Expected],
         settings: RecognitionSettings = EXPECTED,
+        left_out: Array = NOTHING,
     ) -> tuple[int, NodeLocalizer] | None:
         """Search for nodes, in their order.
 
@@ -87,11 +88,12 @@ class NodeDetector:
             image: (H, W) grey.
             wanted: nodes that may be in view.
             settings: what a recognition takes.
+            left_out: regions of the image that are not used; see Observation.
 
         Returns:
             Leg of the first that is found, and what follows its landmarks from this image on; or None.
         """
-        features = self._sift.extract(image)
+        features = self._sift.extract(image, left_out)
         view = features.view(self._description.camera)
         for candidate in wanted:
             recognition = recognise(candidate.node, view, settings, self._rng)

@@ -118,6 +118,11 @@ class Mapper:
         return self._tracking.pose.mean
 
     @property
+    def since_anchor(self) -> PoseGaussian:
+        """Pose since the anchor view, and how well it is known."""
+        return self._tracking.pose
+
+    @property
     def map_from_robot(self) -> PoseGaussian:
         """Pose in the agent's map."""
         return self._cartographer.map_from_anchor @ self._tracking.pose
@@ -208,7 +213,7 @@ class Mapper:
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
         if observation.image is not None:
-            features = self._extract(observation.image).result()
+            features = self._extract(observation.image, observation.left_out).result()
             self._begin_at(self._tracking.take(observation, features, HERE))
 
     def lose(self) -> None:
@@ -257,7 +262,7 @@ class Mapper:
             self._leaves.append(self._tracking.take(observation, features, pose))
 
         self._use_extracted()
-        self._extracting = self._extract(observation.image), take
+        self._extracting = self._extract(observation.image, observation.left_out), take
 
     def finish(self, observation: Observation) -> bool:
         """End the episode: its views become nodes, and the current image becomes the next anchor.
@@ -268,7 +273,7 @@ class Mapper:
         self._use_extracted()
         if observation.image is None or self._anchor is None:
             return False
-        features = self._extract(observation.image)
+        features = self._extract(observation.image, observation.left_out)
         self._tracking.remember(force=True)
         node = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
         if node is not None:
@@ -290,9 +295,9 @@ class Mapper:
             self._tracking.follow(anchor, self.typical_depth)
         return node is not None
 
-    def _extract(self, image: NDArray[np.uint8]) -> Future[Features]:
-        """Have the features of an image extracted."""
-        return self._extraction.submit(self._sift.extract, image)
+    def _extract(self, image: NDArray[np.uint8], left_out: Array) -> Future[Features]:
+        """Have the features of an image extracted, without those of some regions."""
+        return self._extraction.submit(self._sift.extract, image, left_out)
 
     def _use_extracted(self) -> None:
         """Use the features of the image before. Nothing was tracked since."""

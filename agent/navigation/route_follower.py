@@ -211,7 +211,9 @@ class RouteFollower:
     def _detect_goal(self, observation: Observation) -> NodeLocalizer | None:
         if observation.image is None:
             return None
-        detection = self._detector.find(observation.image, [self._expected(self._last)])
+        detection = self._detector.find(
+            observation.image, [self._expected(self._last)], left_out=observation.left_out
+        )
         return None if detection is None else detection[1]
 
     def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
@@ -264,7 +266,7 @@ class RouteFollower:
         """Search the image for nodes, furthest first; returns whether the fix is now on one of them."""
         if observation.image is None or not wanted:
             return False
-        detection = self._detector.find(observation.image, wanted)
+        detection = self._detector.find(observation.image, wanted, left_out=observation.left_out)
         if detection is not None:
             self._reference, localizer = detection
             self.fix = Fix.of(localizer)

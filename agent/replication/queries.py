@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI
+from mapweave.agent.mission import AnswerContent, MayIDrive, Question, WhatIsKnown, WhereAmI, WhoIsNear
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
     Certainty,
@@ -23,8 +24,6 @@ from mapweave.hybridmap.query import (
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode, encode_view
 from mapweave.wire.senders import sent_by
-
-Said = RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer
 
 FARTHEST = 100.0
 """m; no robot sees a node, or drives from one node to the next, from further away. Nodes of recordings from
@@ -51,11 +50,15 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
     if isinstance(question, MayIDrive):
         reserve = ReserveRequest(robot, question.start, question.start_from_robot, question.route)
         return sent_by(keys.any_reserve(), robot), encode(reserve)
+    if isinstance(question, WhoIsNear):
+        q = question
+        who = NearbyRequest(robot, q.starts, q.sigma, q.heading_sigma, q.radius, q.height, q.speed)
+        return sent_by(keys.any_nearby(), robot), encode(who)
     request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
     return sent_by(keys.any_route(), robot), encode(request)
 
 
-def decode_answer(question: Question, payload: bytes) -> Said:
+def decode_answer(question: Question, payload: bytes) -> AnswerContent:
     """A server's answer to a question.
 
     Raises:
@@ -70,6 +73,8 @@ def decode_answer(question: Question, payload: bytes) -> Said:
         return decode(payload, KnownAnswer)
     if isinstance(question, MayIDrive):
         return decode(payload, ReserveAnswer)
+    if isinstance(question, WhoIsNear):
+        return decode(payload, NearbyAnswer)
     route = decode(payload, RouteAnswer)
     for leg in route.legs:
         _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
@@ -86,7 +91,7 @@ def decode_answer(question: Question, payload: bytes) -> Said:
     return route
 
 
-def settles(answer: Said) -> bool:
+def settles(answer: AnswerContent) -> bool:
     """Whether no other server's answer is waited for.
 
     One that is new, or gets its store again, does not know yet what others do. And a robot drives only where
@@ -100,15 +105,17 @@ def settles(answer: Said) -> bool:
     return False
 
 
-def best(answers: Sequence[Said]) -> Said:
+def best(answers: Sequence[AnswerContent]) -> AnswerContent:
     """The one of several servers' answers that a robot acts on; of equals the first."""
 
-    def rank(answer: Said) -> tuple[bool, float]:
+    def rank(answer: AnswerContent) -> tuple[bool, float]:
         match answer:
             case ReserveAnswer():
                 return not answer.closed, answer.granted
             case KnownAnswer():
                 return False, -len(answer.views)
+            case NearbyAnswer():
+                return False, -len(answer.robots)
         return not settles(answer), 0.0
 
     return min(answers, key=rank)

@@ -288,16 +288,35 @@ class Replicator:
             )
         elif not state.acknowledged.get(server, 0) < ack.watermark <= state.newest:
             return
+        servers = [server, *self._sharing(server, ack)]
         try:
-            self._journal.acknowledge(server, state.map, ack.watermark, reset=lost)
+            for name in servers:
+                self._journal.acknowledge(name, state.map, ack.watermark, reset=lost and name == server)
         except MapweaveError as error:
             # The server sends it again, because the next beacon shows that it was not noted.
             log.warning("%s", error)
             return
         with self._changed:
-            state.acknowledged[server] = ack.watermark
+            state.acknowledged |= {
+                name: ack.watermark
+                for name in servers
+                if name == server or ack.watermark > state.acknowledged.get(name, 0)
+            }
             self._last_ack = time.monotonic()
             self._changed.notify_all()
+
+    def _sharing(self, server: str, ack: Ack) -> list[str]:
+        """Other servers with the same store: what one acknowledges, all of them have.
+
+        As far as they are known: each has acknowledged something since this program began.
+        """
+        known = {
+            name
+            for state in self._logs.values()
+            for name, store in state.stores.items()
+            if store == ack.store
+        }
+        return sorted(known - {server}) if ack.store else []
 
     def _answer(self, question: Request) -> None:
         try:

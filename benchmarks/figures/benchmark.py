@@ -1,8 +1,8 @@
-"""docs/figures.md of stored results, and the results themselves.
+"""docs/figures.md and docs/scale.md of stored results, and the results themselves.
 
     python -m benchmarks.figures [--run NAME ... [--data DIR]]
 
-Without --run the page is written of the results in docs/figures/. With it the named measurements run first,
+Without --run the pages are written of the results in docs/figures/. With it the named measurements run first,
 one after the other, each in a process of its own.
 """
 
@@ -15,18 +15,21 @@ from pathlib import Path
 from benchmarks.figures.measurements import MEASUREMENTS
 from benchmarks.figures.page import page
 from benchmarks.figures.results import FOLDER, load, run, store
+from benchmarks.figures.scale import scale_page
 from mapweave.hybridmap.errors import MapweaveError
 
 PAGE = FOLDER.with_suffix(".md")
+SCALE = FOLDER.with_name("scale.md")
 
 
-def written_page() -> str:
-    """The page as the stored results have it.
+def written_pages() -> dict[Path, str]:
+    """The pages as the stored results have them.
 
     Raises:
         MapweaveError: a result is missing or cannot be read.
     """
-    return page({name: load(name) for name in MEASUREMENTS})
+    results = {name: load(name) for name in MEASUREMENTS}
+    return {PAGE: page(results), SCALE: scale_page(results)}
 
 
 def main() -> None:
@@ -39,8 +42,9 @@ def main() -> None:
     try:
         for name in arguments.run:
             print(store(name, run(MEASUREMENTS[name], arguments.data)))
-        PAGE.write_text(written_page(), encoding="utf-8")
-        print(PAGE)
+        for path, text in written_pages().items():
+            path.write_text(text, encoding="utf-8")
+            print(path)
     except (MapweaveError, OSError) as problem:
         print(f"figures: {problem}", file=sys.stderr)
         raise SystemExit(1) from None

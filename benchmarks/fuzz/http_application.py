@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from mapweave.mapserver.http.rates import Rates
 from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.web import Questions
 from mapweave.mapserver.schedule import LockstepSchedule
@@ -24,7 +25,7 @@ class HttpApplication:
         bus = MemoryBus(MemoryHub())
         server = MapServer(bus, Keys("demo"), folder / "s0.sqlite", "s0", schedule=LockstepSchedule())
         server.__enter__()
-        self._app = SameSite(Questions(server, 2.0).app, "127.0.0.1")
+        self._app = SameSite(Questions(server, 2.0, rates=Rates(1e9)).app, "127.0.0.1")
 
     async def answer(self, data: bytes) -> int:
         """Ask, and return the status.

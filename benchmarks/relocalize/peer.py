@@ -18,6 +18,7 @@ from scipy.cluster.vq import kmeans2
 from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
+from mapweave.mapserver.retrieval.ranking import Ranked
 
 BRANCHES, LEVELS = 24, 3
 """13 824 words."""
@@ -104,10 +105,10 @@ class WordIndex:
         norms = np.sqrt(np.asarray(weighted.multiply(weighted).sum(axis=1)).ravel())
         self._by_word = (sparse.diags(1.0 / np.maximum(norms, 1e-9)) @ weighted).T.tocsr()
 
-    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+    def query(self, view: View, k: int = 5) -> Ranked:
         """The k nodes of the largest cosine with a view, best first."""
         words, counts = np.unique(self._vocabulary.words(decode(view.codes)), return_counts=True)
         scores = np.asarray((counts * self._idf[words]) @ self._by_word[words]).ravel()
         best = np.argpartition(-scores, min(k, len(scores) - 1))[:k]
         best = best[np.argsort(-scores[best], kind="stable")]
-        return [(self._ids[n], float(scores[n])) for n in best.tolist() if scores[n] > 0]
+        return Ranked((self._ids[n], float(scores[n])) for n in best.tolist() if scores[n] > 0)

@@ -87,7 +87,7 @@ class Access:
                 too many attempts.
         """
         if self._logins is None:
-            return Person("", Role.OPERATOR if is_loopback(_address(connection)) else Role.VIEWER)
+            return Person("", Role.OPERATOR if is_loopback(address_of(connection)) else Role.VIEWER)
         given = connection.headers.get("Authorization")
         if given is not None:
             scheme, _, token = given.partition(" ")
@@ -169,7 +169,7 @@ class Access:
         except (msgspec.MsgspecError, UnicodeDecodeError):
             raise InvalidValue('send JSON: {"token": "mapweave_..."}') from None
         login = self._checked(request, token, self._failed_logins)
-        log.info("%s %s logs in from %s", login.role, login.name, _address(request))
+        log.info("%s %s logs in from %s", login.role, login.name, address_of(request))
         reply = Reply({"name": login.name, "role": str(login.role)})
         reply.set_cookie(
             _cookie(request), self._sessions.begin(login), max_age=int(LIFE), path="/",
@@ -193,7 +193,7 @@ class Access:
     def _checked(self, connection: HTTPConnection, token: str, failures: Failures) -> Login:
         """Whose token it is; too many bad ones of an address are not looked at for a while."""
         assert self._logins is not None
-        address = _address(connection)
+        address = address_of(connection)
         if wait := failures.wait(address):
             raise HTTPException(
                 HTTPStatus.TOO_MANY_REQUESTS,
@@ -229,7 +229,8 @@ def _unauthorized(words: str) -> HTTPException:
     return HTTPException(HTTPStatus.UNAUTHORIZED, words, {"WWW-Authenticate": "Bearer"})
 
 
-def _address(connection: HTTPConnection) -> str:
+def address_of(connection: HTTPConnection) -> str:
+    """Of the client, or, behind a proxy on this machine, of the one for which that asks."""
     return "" if connection.client is None else connection.client.host[:64]
 
 

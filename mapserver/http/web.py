@@ -25,7 +25,8 @@
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
 An error comes back as one JSON object with `error`. A busy server answers 503 with
-Retry-After in whole seconds and `retry_after` exactly. The pages are in `static/`.
+Retry-After in whole seconds and `retry_after` exactly; who asks more than `rates.QUESTIONS` gets 429 with
+Retry-After. The pages are in `static/`.
 """
 
 from __future__ import annotations
@@ -65,9 +66,10 @@ from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.live import Live
-from mapweave.mapserver.http.login import PERSON, PUBLIC, Access
+from mapweave.mapserver.http.login import PERSON, PUBLIC, Access, address_of
 from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.http.plans import plan_answers
+from mapweave.mapserver.http.rates import LIMITED, Rates
 from mapweave.mapserver.http.reply import PATIENCE, Reply, busy, refusal
 from mapweave.mapserver.http.same_site import SameSite, is_loopback
 from mapweave.mapserver.http.serving import HttpThread, Limits
@@ -185,18 +187,21 @@ class Questions:
         app: the application.
     """
 
-    def __init__(self, server: Answering, patience: float, logins: Logins | None = None) -> None:
+    def __init__(
+        self, server: Answering, patience: float, logins: Logins | None = None, rates: Rates | None = None
+    ) -> None:
         """Make the application.
 
         Args:
             server: answers.
             patience: time limit for a body, and for an answer, s.
             logins: of the fleet's members; None on a fleet without keys.
+            rates: of people's questions; the usual ones by default.
         """
         self._server = server
         self._access = access = Access(logins, patience)
         self._patience = patience
-        self._open = 0
+        self._open, self._rates = 0, rates or Rates()
         # The question is the router's word for it, by which roles decide.
         answering: list[tuple[str, str, str, Answer]] = [
             ("GET", "/status", "status", self._status),
@@ -240,7 +245,9 @@ class Questions:
             self._open += 1
             try:
                 if question != PUBLIC:
-                    request.scope[PERSON] = self._access.check(request, question)
+                    person = request.scope[PERSON] = self._access.check(request, question)
+                    if question in LIMITED:
+                        self._rates.ask(person.name or address_of(request))
                 content = await answer(request)
                 return content if isinstance(content, Response) else Reply(content)
             except HTTPException as error:

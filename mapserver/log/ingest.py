@@ -25,13 +25,14 @@ from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.node import MapId, check_name
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.following import settled, unseen, up_to
 from mapweave.mapserver.log.inbox import Inbox
 from mapweave.mapserver.log.ingest_counters import IngestCounters
 from mapweave.mapserver.log.intake import Intakes
 from mapweave.mapserver.log.pull_schedule import AT_ONCE, PullSchedule
 from mapweave.mapserver.log.pulled import Piece, Pulled
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.store import News, Store
 from mapweave.mapserver.quotas import Quotas
 from mapweave.wire.bus import Bus, Closing, Request, Sample
 from mapweave.wire.codec import MAX_CHANGE_BYTES
@@ -138,13 +139,14 @@ class Ingest:
         self._intakes = Intakes(store, self._quotas, retired)
         self._unknown: dict[MapId, None] = {}
         self._pulls = PullSchedule()
-        self._work: Inbox[Sample | Pulled | Piece] = Inbox()
+        self._work: Inbox[Sample | Pulled | Piece | News] = Inbox()
         self._declared: list[Closing] = []
         self._pullers = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="pull")
         self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
         self._stopping, self._failure = False, ""
-        maps = self._store.maps()
-        stored = (change for map_id in maps for change in self._store.replay(map_id))
+        positions = self._store.positions()
+        maps = sorted(positions)
+        stored = (change for m in maps for change in settled(store, m, positions[m]))
         for map_id in maps:
             for refusal in self._store.refusals(map_id)[:1]:
                 self._note_refusal(map_id, words_of(refusal))
@@ -153,7 +155,7 @@ class Ingest:
         for change in stored:
             self._on_change(change)
         for map_id in maps:
-            watermark, log_id = self._store.watermark(map_id), self._store.log_id(map_id) or 0
+            log_id, watermark = positions[map_id]
             refusals = tuple(self._store.refusals(map_id))
             self._logs[map_id] = AgentLog(
                 map_id, log_id, self._settings.pull, watermark, watermark, refusals=refusals,
@@ -190,6 +192,10 @@ class Ingest:
     def failure(self) -> str:
         """Why the disk does not take changes at present; empty if it does."""
         return self._failure
+
+    def follow(self, news: News) -> None:
+        """Pass on what other servers have written to the store; from any thread, in the ingest's own."""
+        self._work.put("", news, bounded=False)
 
     def close(self) -> None:
         """Stop listening; received changes are applied, missing ones will be pulled next time."""
@@ -235,13 +241,16 @@ class Ingest:
             self._pulls.asks(agent)
             self._pullers.submit(self._pull, agent_log, asked)
 
-    def _take(self, robot: str, item: Sample | Pulled | Piece) -> AgentLog | None:
+    def _take(self, robot: str, item: Sample | Pulled | Piece | News) -> AgentLog | None:
         """Process one item of the inbox. Returns the log that may go on now."""
         try:
             if isinstance(item, Pulled):
                 return self._take_pulled(item)
             if isinstance(item, Piece):
                 return self._take_piece(item)
+            if isinstance(item, News):
+                self._take_news(item)
+                return None
             if item.attachment:
                 return self._take_change(item)
             return self._take_head(item)
@@ -324,6 +333,29 @@ class Ingest:
             agent_log.pulled(time.monotonic(), gained=gained)
         return agent_log
 
+    def _take_news(self, news: News) -> None:
+        """Go on where other servers have brought the logs."""
+        try:
+            for map_id, (log_id, watermark) in self._store.positions(news.maps).items():
+                agent_log = self._logs.get(map_id)
+                if agent_log is None or (agent_log.log_id != log_id and agent_log.watermark == 0):
+                    agent_log = self._logs[map_id] = AgentLog(map_id, log_id, self._settings.pull)
+                if agent_log.log_id != log_id or watermark <= agent_log.watermark:
+                    continue
+                self._intakes.of(map_id.agent).recount()
+                for change in up_to(watermark, self._store.replay(map_id, agent_log.watermark)):
+                    self._pass_on([change])
+                    agent_log.settled(Applied((), (), change.sequence))
+                agent_log.settled(Applied((), (), watermark))
+                agent_log.refusals = tuple(self._store.refusals(map_id))
+                for refusal in agent_log.refusals[:1]:
+                    self._note_refusal(map_id, words_of(refusal))
+                self._pulls.answers(map_id.agent)
+                self._pulls.note(agent_log, time.monotonic())
+        except InvalidFile as error:
+            # With the next news everything is looked at.
+            log.warning("%s", error)
+
     def _restore(self, agent_log: AgentLog, first: int, covered: int, entries: list[Entry]) -> None:
         """Put damaged changes in their places again and pass them on."""
         try:
@@ -389,15 +421,16 @@ class Ingest:
             agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)
             self._refuse(agent_log.map, agent_log.log_id, reason)
             return
-        fits, full = self._intakes.of(agent_log.map.agent).fitting(entries)
-        if full:
-            if not fits:
-                self._rest(agent_log, full)
-                return
-            covered = None if covered is None else entries[fits].sequence - 1
-            entries = entries[:fits]
         try:
+            fits, full = self._intakes.of(agent_log.map.agent).fitting(entries)
+            if full:
+                if not fits:
+                    self._rest(agent_log, full)
+                    return
+                covered = None if covered is None else entries[fits].sequence - 1
+                entries = entries[:fits]
             applied = self._store.apply(agent_log.map, agent_log.log_id, entries, covered)
+            changes = tuple(unseen(self._store, agent_log, applied))
         except (InvalidFile, InvalidValue) as error:
             # Nothing is lost: it is not acknowledged, so the agent keeps it and it is pulled later.
             self._commit_failed(agent_log, error)
@@ -409,7 +442,7 @@ class Ingest:
             log.warning("refused %s %d: %s", agent_log.map, refusal.sequence, refusal.reason)
             self._note_refusal(agent_log.map, words_of(refusal))
         self._count(applied=len(applied.changes), refused=len(applied.refusals))
-        self._pass_on(applied.changes)
+        self._pass_on(changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.
         self._acknowledge(agent_log)
         for at in received:
@@ -447,7 +480,11 @@ class Ingest:
     def _tell_newest(self, request: Request) -> None:
         """Which numbers an agent must not give to a new map: it may have lost its disk."""
         _, agent = self._keys.parse_ack(request.key)
-        maps = (*self._store.maps(), *self._taken)
+        try:
+            maps = (*self._store.maps(), *self._taken)
+        except InvalidFile as error:
+            request.refuse(str(error))
+            return
         epochs = (known.epoch for known in maps if known.agent == agent)
         request.reply(NewestMap(max(epochs, default=0)).encode())
 

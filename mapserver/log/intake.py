@@ -25,7 +25,7 @@ class Intake:
     def __init__(
         self, agent: str, quotas: Quotas, store: Store, retired: Callable[[], Collection[MapId]]
     ) -> None:
-        """Count what is kept of the robot."""
+        """Take note of the robot; what is kept of it is counted before its first change."""
         self._agent, self._quotas, self._store, self._retired = agent, quotas, store, retired
         rate, now = quotas.settings.changes, quotas.clock()
         self._changes = TokenBucket(rate, now)
@@ -33,7 +33,7 @@ class Intake:
         self._beacons = TokenBucket(rate, now)
         self._current: AgentLog | None = None
         self._nodes = self._landmarks = 0
-        self._count()
+        self._stale = True
 
     def beacon(self) -> bool:
         """Whether a beacon is looked at; the next one says the same."""
@@ -77,11 +77,20 @@ class Intake:
             self._current.forget_ahead()
         self._current = agent_log
 
+    def recount(self) -> None:
+        """Another server has taken some of its changes: count again before the next."""
+        self._stale = True
+
     def fitting(self, entries: Sequence[Entry]) -> tuple[int, str]:
         """How many of these changes, in order, the robot's quota of nodes has room for, and why not more.
 
         Those that fit count as kept from now on.
+
+        Raises:
+            InvalidFile: the store cannot be read.
         """
+        if self._stale:
+            self._count()
         count, reason = self._fitting(entries)
         if reason:
             # People may have retired a map meanwhile.
@@ -107,6 +116,7 @@ class Intake:
         return len(entries), ""
 
     def _count(self) -> None:
+        self._stale = False
         kept, retired = self._store.kept(self._agent), self._retired()
         counts = [count for map_id, count in kept.items() if map_id not in retired]
         self._nodes = sum(nodes for nodes, _ in counts)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,8 +17,9 @@ import psycopg
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.entry import Position
+from mapweave.mapserver.log.postgres_follower import CHANNEL, LOG, RECORD, PostgresFollower, words_of
 from mapweave.mapserver.log.sql_store import SqlStore
-from mapweave.mapserver.log.store import ID, Run, fresh_id
+from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, News, Run, fresh_id
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 
 log = logging.getLogger(__name__)
@@ -53,10 +54,6 @@ TYPES = {
 """Of columns that are no numbers."""
 SCHEMA_LOCK = 0x4D575354
 """Advisory lock of who makes the tables: 'MWST'."""
-CHANNEL = "mapweave"
-"""Of the notifications about what has changed."""
-MOST_NOTIFIED = 7000
-"""Bytes; PostgreSQL takes less than 8000 (https://www.postgresql.org/docs/15/sql-notify.html)."""
 
 
 class PostgresStore(SqlStore):
@@ -82,6 +79,8 @@ class PostgresStore(SqlStore):
         """
         self.address = PostgresAddress.read(address)
         self._write_lock, self._read_lock = threading.RLock(), threading.RLock()
+        self._name, self._session_id = name, 0
+        self._follower: PostgresFollower | None = None
         self._writing: int | None = None
         """The thread in a transaction."""
         self._touched: dict[str, None] = {}
@@ -100,8 +99,19 @@ class PostgresStore(SqlStore):
             self.close()
             raise
 
+    @property
+    def leads(self) -> bool:
+        """Whether this server writes the results of merging; see `Store`."""
+        return self._follower is not None and self._follower.leads
+
+    def follow(self, changed: Callable[[News], None]) -> None:
+        """Have what other servers write reported; see `Store`."""
+        self._follower = PostgresFollower(self.address, self._name, lambda: self._session_id, changed)
+
     def close(self) -> None:
         """End the sessions. Idempotent."""
+        if self._follower is not None:
+            self._follower.close()
         for lock, session in ((self._write_lock, self._writer), (self._read_lock, self._reader)):
             with lock:
                 session.close()
@@ -126,6 +136,7 @@ class PostgresStore(SqlStore):
     def _prepare(self, connection: psycopg.Connection) -> None:
         """A writer's session: what is acknowledged must survive."""
         connection.add_notice_handler(self._note)
+        self._session_id = connection.info.backend_pid
         settings = connection.execute(
             "SELECT current_setting('synchronous_commit'), current_setting('fsync')"
         ).fetchone()
@@ -170,10 +181,7 @@ class PostgresStore(SqlStore):
     def _notify(self, connection: psycopg.Connection) -> None:
         """Notify the other servers."""
         if self._touched:
-            words = " ".join(self._touched)
-            connection.execute(
-                "SELECT pg_notify(%s, %s)", (CHANNEL, words if len(words) < MOST_NOTIFIED else "")
-            )
+            connection.execute("SELECT pg_notify(%s, %s)", (CHANNEL, words_of([*self._touched])))
 
     def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
         ids = {run.map_id: str(run.log_id) for run in runs}
@@ -203,11 +211,12 @@ class PostgresStore(SqlStore):
         clean = [_text(value) if isinstance(value, str) else value for value in values]
         self._writer.connection.execute(INSERTS[table], clean)
         if table == "log":
-            self._touched[f"log:{MapId(str(values[0]), int(str(values[1])))}"] = None
-        elif table in ("manual_constraint", "annotation"):
-            self._touched[table] = None
+            self._touched[f"{LOG}:{values[0]}.{values[1]}"] = None
+        elif table in (CONSTRAINTS, ANNOTATIONS):
+            self._touched[f"{RECORD}:{table}"] = None
         elif table == "result":
-            self._touched[f"result:{values[0]}"] = None
+            # The names with spaces, of images, are not followed.
+            self._touched[f"{RECORD}:{str(values[0]).replace(' ', '_')}"] = None
 
 
 def _version(connection: psycopg.Connection) -> int | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -14,7 +14,15 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue,
 from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
 from mapweave.mapserver.log.integrity import Gap
-from mapweave.mapserver.log.store import MAX_CONSTRAINTS, MOST_REFUSED_KEPT, Run, Store, name_taken
+from mapweave.mapserver.log.store import (
+    ANNOTATIONS,
+    CONSTRAINTS,
+    MAX_CONSTRAINTS,
+    MOST_REFUSED_KEPT,
+    Run,
+    Store,
+    name_taken,
+)
 from mapweave.wire.codec import decode_body, element_of, unwrap_body
 from mapweave.wire.log_messages import Refusal
 
@@ -64,9 +72,13 @@ class SqlStore(Store):
         """All maps of which something is known."""
         return [MapId(*row) for row in self._read("SELECT agent, epoch FROM log ORDER BY agent, epoch")]
 
-    def positions(self) -> dict[MapId, Position]:
-        """Which log is kept of each map, and how far it is settled."""
-        rows = self._read("SELECT agent, epoch, log_id, watermark FROM log")
+    def positions(self, maps: Collection[MapId] | None = None) -> dict[MapId, Position]:
+        """Which log is kept of each of these maps, or of all, and how far it is settled."""
+        query = "SELECT agent, epoch, log_id, watermark FROM log"
+        if maps is None:
+            rows = self._read(query)
+        else:
+            rows = [row for m in maps for row in self._read(f"{query} WHERE agent = ? AND epoch = ?", m)]
         return {MapId(agent, epoch): Position(int(log_id), mark) for agent, epoch, log_id, mark in rows}
 
     def present(self) -> set[NodeId]:
@@ -209,19 +221,19 @@ class SqlStore(Store):
 
     def constraints(self) -> list[bytes]:
         """The manual constraints, in order."""
-        return self._record("manual_constraint")
+        return self._record(CONSTRAINTS)
 
     def add_constraint(self, body: bytes) -> None:
         """Add a manual constraint; see `Store`."""
-        self._add_to_record("manual_constraint", body, MAX_CONSTRAINTS)
+        self._add_to_record(CONSTRAINTS, body, MAX_CONSTRAINTS)
 
     def annotations(self) -> list[bytes]:
         """The annotations, in order."""
-        return self._record("annotation")
+        return self._record(ANNOTATIONS)
 
     def add_annotation(self, body: bytes) -> None:
         """Add an annotation; see `add_constraint`."""
-        self._add_to_record("annotation", body, MAX_ANNOTATIONS)
+        self._add_to_record(ANNOTATIONS, body, MAX_ANNOTATIONS)
 
     def put_result(self, name: str, value: bytes) -> None:
         """Store another result of the server; see `Store`."""

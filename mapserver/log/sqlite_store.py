@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
 from mapweave.mapserver.log.sql_store import SqlStore
-from mapweave.mapserver.log.store import ID, Run, fresh_id
+from mapweave.mapserver.log.store import ID, News, Run, fresh_id
 from mapweave.storage.database import Database
 
 log = logging.getLogger(__name__)
@@ -33,6 +33,7 @@ class SqliteStore(SqlStore):
     """All logs in one SQLite file, which belongs to one process."""
 
     shared = False
+    leads = True
 
     def __init__(self, path: Path) -> None:
         """Open the store, or make one. Rows that are damaged are taken out, see `damaged`.
@@ -52,6 +53,9 @@ class SqliteStore(SqlStore):
             except InvalidFile as error:
                 # Such a store cannot be written either, but can be read.
                 log.warning("%s", error)
+
+    def follow(self, changed: Callable[[News], None]) -> None:
+        """Nothing: no other server writes to the file."""
 
     def close(self) -> None:
         """Close the file. Idempotent."""

@@ -7,7 +7,7 @@ servers share (mapweave.mapserver.log.postgres_store).
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -47,6 +47,28 @@ class Run:
     covered: int | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class News:
+    """What other servers have written to a store that they share.
+
+    Attributes:
+        maps: whose logs have grown; None: any may have.
+        records: names of results, `manual_constraint` or `annotation`; None: any may have changed.
+    """
+
+    maps: frozenset[MapId] | None
+    records: frozenset[str] | None
+
+    def names(self, record: str) -> bool:
+        """Whether this record may have changed."""
+        return self.records is None or record in self.records
+
+
+EVERYTHING = News(None, None)
+CONSTRAINTS, ANNOTATIONS = "manual_constraint", "annotation"
+"""Records, by the names of their tables."""
+
+
 class Store(Protocol):
     """Its methods may be called from any thread. What they return as done survives a loss of power.
 
@@ -58,11 +80,21 @@ class Store(Protocol):
     id: int
     shared: bool
 
+    @property
+    def leads(self) -> bool:
+        """Whether this server writes the results of merging: one of those that share a store does."""
+
+    def follow(self, changed: Callable[[News], None]) -> None:
+        """Have what other servers write reported from now on, from a thread of the store's.
+
+        Before this server leads, it is called once more: what the leader before wrote is known then.
+        """
+
     def maps(self) -> list[MapId]:
         """All maps of which something is known."""
 
-    def positions(self) -> dict[MapId, Position]:
-        """Which log is kept of each map, and how far it is settled."""
+    def positions(self, maps: Collection[MapId] | None = None) -> dict[MapId, Position]:
+        """Which log is kept of each of these maps, or of all, and how far it is settled."""
 
     def present(self) -> set[NodeId]:
         """All nodes that are not retired, without reading their contents."""

@@ -17,7 +17,7 @@ from mapweave.mapserver.merging.copies import Copies
 from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
-from mapweave.mapserver.merging.node_comparisons import NodeComparisons
+from mapweave.mapserver.merging.node_comparisons import Compare, NodeComparisons, compare
 from mapweave.mapserver.merging.pruning import PrunePlan, Pruning, plan_of
 from mapweave.mapserver.merging.verification_cache import VerificationCache
 from mapweave.mapserver.plausibility import implausible, scattered
@@ -45,12 +45,18 @@ class Merger:
     another day. Except for that the result depends on the maps, not on the order of changes.
     """
 
-    def __init__(self, places: PlaceDatabase | None = None, settings: MergeSettings | None = None) -> None:
+    def __init__(
+        self,
+        places: PlaceDatabase | None = None,
+        settings: MergeSettings | None = None,
+        compare: Compare = compare,
+    ) -> None:
         """Start with no maps.
 
         Args:
             places: is filled with the nodes that come; give it to a Relocalizer too.
             settings: how.
+            compare: compares nodes.
         """
         # A database in which there is nothing yet is one.
         self.places = PlaceDatabase() if places is None else places
@@ -59,7 +65,7 @@ class Merger:
         self.counters = MergerCounters()
         self.reaches = ReachabilityCache()
         self.settings = settings or MergeSettings()
-        self._comparisons = NodeComparisons(self.places, self.node, self.counters)
+        self._comparisons = NodeComparisons(self.places, self.node, self.counters, compare)
         self._verdicts = Verdicts()
         self.pruning = Pruning()
         self._pipeline = self._new_pipeline()

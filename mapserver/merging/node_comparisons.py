@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import islice
 
 from mapweave.hybridmap.node import Edge, EdgeKind, Node, NodeId
@@ -15,6 +15,7 @@ from mapweave.mapserver.merging.verification_cache import (
 )
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
+from mapweave.mapserver.retrieval.ranking import IncompleteSearch
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.pairs import PairTable
@@ -22,6 +23,22 @@ from mapweave.merge.pose_graph.verdicts import Verdict
 from mapweave.merge.pose_graph.verification import verify
 
 log = logging.getLogger(__name__)
+
+
+Compare = Callable[[Sequence[tuple[Node, Node]]], list[Verdict]]
+"""Gives the verdicts on pairs of nodes, in order."""
+
+
+def compare(pairs: Sequence[tuple[Node, Node]]) -> list[Verdict]:
+    """Compare pairs of nodes; what was found depends on these nodes alone."""
+    verdicts = list[Verdict]()
+    for a, b in pairs:
+        try:
+            verdicts.append(verify(bounded(a), bounded(b)))
+        except Exception as error:  # a defect with two nodes must not hold up all others
+            log.exception("%s and %s cannot be compared", a.id, b.id)
+            verdicts.append(RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})"))
+    return verdicts
 
 
 class NodeComparisons:
@@ -36,6 +53,7 @@ class NodeComparisons:
         places: PlaceDatabase,
         node_of: Callable[[NodeId], Node | None],
         counters: MergerCounters,
+        compare: Compare = compare,
     ) -> None:
         """Begin with no nodes.
 
@@ -43,8 +61,9 @@ class NodeComparisons:
             places: says which nodes look alike.
             node_of: gives a node by its id.
             counters: of what is done.
+            compare: compares nodes, here or elsewhere.
         """
-        self._places, self._node_of = places, node_of
+        self._places, self._node_of, self._compare = places, node_of, compare
         self._counters = counters
         self._pairs = PairTable()
         self._uncompared: dict[NodeId, None] = {}
@@ -82,7 +101,10 @@ class NodeComparisons:
             node: was added, or written again.
             before: its pairs as it was.
         """
-        self._pairs.put(node.id, self._places.overlaps(node, self._node_of, before))
+        try:
+            self._pairs.put(node.id, self._places.overlaps(node, self._node_of, before))
+        except IncompleteSearch:  # it must not pass for compared, here or in what is kept for the next start
+            self.postpone([node])
 
     def put_overlaps(self, node_id: NodeId, overlaps: Mapping[NodeId, float]) -> None:
         """Take overlaps of a node with others that are known already."""
@@ -120,6 +142,9 @@ class NodeComparisons:
                 source = cached if cached is not None and cached.knows(node) else self._places
                 try:
                     self._pairs.put(node_id, source.overlaps(node, self._node_of))
+                except IncompleteSearch:
+                    self.postpone([node])
+                    return
                 except Exception:  # a defect with one node must not hold up all others
                     log.exception(
                         "the search for nodes similar to %s failed: it is compared with none", node_id
@@ -137,16 +162,12 @@ class NodeComparisons:
 
     def verify(self, pairs: Iterable[Pair]) -> None:
         """Compare pairs on which there is no verdict yet."""
+        wanted: dict[Pair, tuple[Node, Node]] = {}
         for pair in pairs:
             a, b = self._node_of(pair[0]), self._node_of(pair[1])
-            if pair in self or a is None or b is None:
-                continue
-            verdict: Verdict
-            try:
-                verdict = verify(bounded(a), bounded(b))
-            except Exception as error:  # a defect with two nodes must not hold up all others
-                log.exception("%s and %s cannot be compared", a.id, b.id)
-                verdict = RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})")
+            if pair not in self and a is not None and b is not None:
+                wanted[pair] = a, b
+        for pair, verdict in zip(wanted, self._compare([*wanted.values()]), strict=True):
             self.judge(pair, verdict)
             self._counters.verified += 1
             self._counters.recognised += isinstance(verdict, Link)

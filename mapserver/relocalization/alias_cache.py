@@ -19,6 +19,7 @@ from mapweave.mapserver.relocalization.aliased_landmarks import (
     unexplained,
 )
 from mapweave.mapserver.relocalization.candidates import Retrieval
+from mapweave.mapserver.retrieval.ranking import IncompleteSearch
 from mapweave.registration.matching import match
 from mapweave.registration.recognition import RecognitionSettings
 
@@ -109,6 +110,9 @@ class AliasCache:
             index: finds candidates.
             node_of: gives a node by its id; None if it is gone.
             between: relative pose of two nodes in the merged map.
+
+        Raises:
+            IncompleteSearch: a part of the map cannot be searched now.
         """
         entry = self._entries.get(node.id)
         # What is gone, or is of a map that people have retired, is parted from nothing.
@@ -133,11 +137,15 @@ class AliasCache:
         node_of: Callable[[NodeId], Node | None],
         between: Between,
     ) -> _Entry:
-        """Search the whole fleet."""
+        """Search the whole fleet; raises IncompleteSearch if a part of it is not to be had."""
         s, aliases, same = self._recognition, dict[NodeId, AliasedNode](), []
         marks = node.landmarks
         view = View(marks.pixels, marks.codes, node.camera)
-        for candidate_id, _ in index.query(view, self._candidates + 1):
+        ranked = index.query(view, self._candidates + 1)
+        if ranked.missing:
+            # What is kept of a part of the map would pass for the whole of it later.
+            raise IncompleteSearch(ranked.missing)
+        for candidate_id, _ in ranked:
             candidate = node_of(candidate_id)
             if candidate_id == node.id or candidate is None:
                 continue

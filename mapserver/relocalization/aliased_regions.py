@@ -22,6 +22,7 @@ from mapweave.mapserver.relocalization.alias_cache import AliasCache, AliasedNod
 from mapweave.mapserver.relocalization.aliased_landmarks import between, same_place
 from mapweave.mapserver.relocalization.candidates import Retrieval
 from mapweave.mapserver.relocalization.place_hypotheses import THING_SIGMA, NodeMatch, extent
+from mapweave.mapserver.retrieval.ranking import IncompleteSearch
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 WELL_INSIDE = 0.85
@@ -133,7 +134,10 @@ class AliasedRegions:
         while self._left and most > 0:
             node = self._node_of(self._left.pop())
             if node is not None and not self._alike.knows(node):
-                self._aliases(node)
+                try:
+                    self._aliases(node)
+                except IncompleteSearch:  # once a question needs it, or after the next merge
+                    return 0
                 most -= 1
         return len(self._left)
 
@@ -152,6 +156,9 @@ class AliasedRegions:
 
         Returns:
             The counterpart that shows most of what the view shows; None if there is none.
+
+        Raises:
+            IncompleteSearch: a part of the map cannot be searched now.
         """
         s, node = self._settings, self._node_of(recognised.node)
         if node is None or not s.least_nodes:

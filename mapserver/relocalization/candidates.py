@@ -8,6 +8,7 @@ from typing import Protocol
 
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import View
+from mapweave.mapserver.retrieval.ranking import Ranked
 
 MOST_COMPARED = 16
 """Nodes that are compared with the view."""
@@ -18,7 +19,7 @@ ALIKE_FLOORS = 16
 class Retrieval(Protocol):
     """Finds candidate nodes for a view, for example mapweave.mapserver.retrieval.place_index.PlaceIndex."""
 
-    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+    def query(self, view: View, k: int = 5) -> Ranked:
         """At most k nodes with their similarity to it, best first."""
         ...
 
@@ -31,11 +32,13 @@ class Candidates:
         view: the image's features.
         ranked: nodes with their similarity to it, best first.
         elsewhere: maps on which the robot knows that it is not.
+        missing: in words, what of the map could not be searched; empty if all of it was.
     """
 
     view: View
     ranked: Sequence[tuple[NodeId, float]] = ()
     elsewhere: Collection[MapId] = ()
+    missing: str = ""
 
 
 def retrieve(
@@ -46,4 +49,4 @@ def retrieve(
         return Candidates(view)
     ranked = index.query(view, MOST_COMPARED * (ALIKE_FLOORS if elsewhere else 1))
     left = [(node, score) for node, score in ranked if node.map not in elsewhere]
-    return Candidates(view, left[:MOST_COMPARED], elsewhere)
+    return Candidates(view, left[:MOST_COMPARED], elsewhere, ranked.missing)

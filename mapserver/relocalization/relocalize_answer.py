@@ -23,6 +23,8 @@ def answer_of(
 ) -> RelocalizeAnswer:
     """Put a verdict into an answer.
 
+    A place that seems certain while a part of the map is missing is ambiguous: its like may be in that part.
+
     Args:
         verdict: the places and the outcome.
         merged: where nodes are.
@@ -32,13 +34,17 @@ def answer_of(
     reason = _reason(verdict, merged, least_features)
     known = verdict.outcome in (Outcome.FOUND, Outcome.AMBIGUOUS)
     similar = () if known else similar_places(verdict, least_features)
+    if verdict.missing:
+        reason = f"{reason}; partial: {verdict.missing}"
     if not known and not verdict.confirmable:
-        return RelocalizeAnswer(Certainty.UNKNOWN, (), reason, similar)
+        return RelocalizeAnswer(Certainty.UNKNOWN, (), reason, similar, verdict.missing)
     chances = probabilities(supported(verdict.places))
     candidates = tuple(
         _whereabouts(place, chance, merged, node_of)
         for place, chance in zip(verdict.places, chances, strict=True)
     )
+    if verdict.missing:
+        return RelocalizeAnswer(Certainty.AMBIGUOUS, candidates, reason, similar, verdict.missing)
     certainty = Certainty.UNKNOWN if verdict.confirmable else Certainty.AMBIGUOUS
     if verdict.outcome is Outcome.FOUND:
         # The distance from a photograph is unknown.

@@ -20,6 +20,7 @@ from mapweave.mapserver.relocalization.place_hypotheses import (
     supported,
 )
 from mapweave.mapserver.relocalization.view_registration import Registration
+from mapweave.mapserver.retrieval.ranking import IncompleteSearch
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 GATE = 16.3
@@ -58,6 +59,7 @@ class Verdict:
         rivals: more than one if ambiguous: places that explain the view about as well as the first.
         confirmable: another view that gives the same place would make it certain: it lacks nothing but
             landmarks.
+        missing: in words, what of the map could not be searched; empty if all of it was.
     """
 
     outcome: Outcome
@@ -65,6 +67,7 @@ class Verdict:
     places: Sequence[PlaceHypothesis] = ()
     rivals: Sequence[PlaceHypothesis] = ()
     confirmable: bool = False
+    missing: str = ""
 
 
 class HypothesisSelector:
@@ -83,6 +86,12 @@ class HypothesisSelector:
 
     def decide(self, registration: Registration) -> Verdict:
         """The robot's pose if only one place is possible, or why not."""
+        try:
+            return replace(self._decided(registration), missing=registration.candidates.missing)
+        except IncompleteSearch as error:
+            return replace(self._decided(registration, aliases=False), missing=str(error))
+
+    def _decided(self, registration: Registration, aliases: bool = True) -> Verdict:
         places = self.places(registration)
         rivals = self._rivals(places)
         outcome = self._refusal(registration, places, rivals)
@@ -90,7 +99,8 @@ class HypothesisSelector:
         if outcome is not None and not weak:
             return Verdict(outcome, registration, places, rivals)
         ranked = [node for node, _ in registration.candidates.ranked]
-        counterpart = self._counterpart(places[0], ranked, registration.candidates.elsewhere)
+        elsewhere = registration.candidates.elsewhere
+        counterpart = self._counterpart(places[0], ranked, elsewhere) if aliases else None
         if counterpart is None:
             return Verdict(outcome or Outcome.FOUND, registration, places, rivals, weak)
         places, rivals = [*places, counterpart], [places[0], counterpart]

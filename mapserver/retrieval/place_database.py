@@ -11,6 +11,10 @@ import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import Node, NodeId
@@ -20,6 +24,7 @@ from mapweave.mapserver.retrieval import voting
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.retrieval.index_file import load, save
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.retrieval.ranking import Ranked
 from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
 
 log = logging.getLogger(__name__)
@@ -38,6 +43,38 @@ NodeOf = Callable[[NodeId], Node | None]
 """Gives a node by its id; None if it is gone."""
 
 
+class NodeIndex(Protocol):
+    """What nodes are searched in: a PlaceIndex, or several as one (mapweave.mapserver.cluster)."""
+
+    def __len__(self) -> int:
+        """How many nodes."""
+        ...
+
+    def __contains__(self, node_id: NodeId) -> bool:
+        """Whether a node is in the index."""
+        ...
+
+    def add(self, node: Node) -> None:
+        """Add a node, or replace it; any thread may do so."""
+        ...
+
+    def extend(self, nodes: Iterable[Node]) -> None:
+        """Add nodes, or replace them."""
+        ...
+
+    def remove(self, node_id: NodeId, codes: NDArray[np.uint8] | None = None) -> None:
+        """Forget a node; see `PlaceIndex.remove`."""
+        ...
+
+    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
+        """At most k nodes with their similarity to a view, best first."""
+        ...
+
+    def overlaps(self, node: Node, node_of: NodeOf) -> dict[NodeId, float]:
+        """Overlaps of a node with those that are here; see `PlaceIndex.overlaps`."""
+        ...
+
+
 class PlaceDatabase:
     """Nodes by their landmarks, in memory or with a store.
 
@@ -45,7 +82,11 @@ class PlaceDatabase:
     """
 
     def __init__(
-        self, store: Store | None = None, path: Path | None = None, others: Collection[NodeId] = ()
+        self,
+        store: Store | None = None,
+        path: Path | None = None,
+        others: Collection[NodeId] = (),
+        index: NodeIndex | None = None,
     ) -> None:
         """Begin with the saved index, as far as it agrees with the store.
 
@@ -53,12 +94,15 @@ class PlaceDatabase:
             store: has the nodes; None: start empty, and never save.
             path: of the store's file; the index is next to it.
             others: nodes that come at the start from elsewhere; the saved index may have them, too.
+            index: empty, to be filled and asked instead of one of its own; it is never saved.
         """
         self._store = store
         self._others = frozenset(others)
         self._path = None if path is None else path.with_name(path.name + SUFFIX)
-        self._index = self._restored()
-        self._saved = self._index.version
+        own = self._restored() if index is None else PlaceIndex()
+        self._index: NodeIndex = own if index is None else index
+        self._own = own if index is None else None
+        self._saved = own.version
         self._left_out: set[NodeId] = set()
         self._newest: dict[str, tuple[int, int]] = {}
 
@@ -72,7 +116,7 @@ class PlaceDatabase:
         """Whether a node can be found."""
         return node_id in self._index
 
-    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
+    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
         """At most k nodes with their similarity to a view, best first; see `PlaceIndex.query`."""
         return self._index.query(view, k, exclude)
 
@@ -156,7 +200,9 @@ class PlaceDatabase:
 
     def save_if_worthwhile(self) -> None:
         """Save the index if enough is new; called every so many seconds."""
-        (before, _), (now, nodes) = self._saved, self._index.version
+        if self._own is None:
+            return
+        (before, _), (now, nodes) = self._saved, self._own.version
         # A large index is not written for a few nodes: they are soon put in again.
         if now - before >= WORTHWHILE * nodes:
             self._save()
@@ -183,12 +229,13 @@ class PlaceDatabase:
         return index
 
     def _save(self) -> None:
-        state = self._index.version
-        if self._store is None or self._path is None or state == self._saved:
+        if self._own is None or self._store is None or self._path is None:
+            return
+        if (state := self._own.version) == self._saved:
             return
         try:
             # The logs first: later changes may be in the index, but are not claimed.
-            save(self._path, self._index, self._store.positions())
+            save(self._path, self._own, self._store.positions())
         except InvalidFile as error:
             log.warning("%s; the next start takes longer", error)
             return

@@ -15,6 +15,7 @@ from mapweave.mapserver.retrieval import voting
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS, bounded
 from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
+from mapweave.mapserver.retrieval.ranking import NearestLandmarks, Ranked, rank
 from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
 
 SLOT_BITS = 16
@@ -38,10 +39,6 @@ class PlaceIndexSettings:
     landmarks: LandmarkIndexSettings = field(default_factory=LandmarkIndexSettings)
     votes: int = 16
     compared: int = 64
-
-
-REACH = 0.6
-"""Distance of two decoded descriptors at which a vote counts nothing."""
 
 
 class PlaceIndex:
@@ -146,7 +143,7 @@ class PlaceIndex:
         parts = np.split(np.concatenate(codes)[order], np.flatnonzero(np.diff(slot)) + 1)
         return dict(zip(np.unique(slot).tolist(), parts, strict=False))
 
-    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
+    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
         """Rank nodes by their similarity to a view, see mapweave.mapserver.retrieval.voting.votes.
 
         Args:
@@ -157,7 +154,23 @@ class PlaceIndex:
         Returns:
             Nodes with a positive score, best first.
         """
-        return self._ranked(view.codes, k, exclude)
+        return Ranked(self._ranked(view.codes, k, exclude))
+
+    def nearest(self, codes: NDArray[np.uint8]) -> NearestLandmarks:
+        """The landmarks that features vote for, for an index that is one of several.
+
+        Args:
+            codes: (N, 32) of the features.
+        """
+        with self._lock:
+            if len(codes) == 0 or len(self._landmarks) == 0:
+                empty = np.zeros((len(codes), 0))
+                return NearestLandmarks(empty.astype(np.float32), empty.astype(np.int64), ())
+            squared, ids = self._landmarks.nearest(codes, self._settings.votes)
+            slots, owners = np.unique(ids >> SLOT_BITS, return_inverse=True)
+            owners, first = owners.reshape(ids.shape), int(slots[0] < 0)
+            nodes = tuple(self._nodes[slot] for slot in slots[first:].tolist())
+        return NearestLandmarks(squared, owners - first, nodes)
 
     def _ranked(
         self, codes: NDArray[np.uint8], k: int, exclude: Collection[NodeId]
@@ -166,16 +179,9 @@ class PlaceIndex:
             if len(codes) == 0 or len(self._landmarks) == 0:
                 return []
             squared, ids = self._landmarks.nearest(codes, self._settings.votes)
+            hidden = [self._slots[node_id] for node_id in exclude if node_id in self._slots]
             # -1 belongs to no node, shifted too.
-            slots, scores = voting.votes(squared, ids >> SLOT_BITS, REACH)
-            if len(exclude):
-                unwanted = [self._slots[node_id] for node_id in exclude if node_id in self._slots]
-                slots, scores = slots[wanted := ~np.isin(slots, unwanted)], scores[wanted]
-            if not len(scores):
-                return []
-            best = np.flatnonzero(scores >= np.sort(scores)[-min(k, len(scores))])
-            ranked = [(self._nodes[int(slots[i])], float(scores[i])) for i in best]
-        return sorted(ranked, key=lambda item: (-item[1], item[0]))[:k]
+            return rank(squared, ids >> SLOT_BITS, self._nodes, k, hidden)
 
     def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
         """Overlaps of a node: shared similar descriptors, see mapweave.merge.pose_graph.candidates.

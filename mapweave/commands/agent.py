@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import (
+    add_log_format,
     add_network,
     connect,
     network_of,
@@ -69,6 +70,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
     )
+    add_log_format(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -107,8 +109,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.terminal import log_with_time
     from mapweave.wire.keys import check_epoch
 
-    log_with_time()
     name = check_name(arguments.name)
+    log_with_time(arguments.log_format, robot=name)
     if arguments.epoch is not None:
         check_epoch(arguments.epoch)
     resume = None if arguments.resume is None else map_of(arguments.resume)

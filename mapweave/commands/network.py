@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +36,8 @@ def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
         )  # fmt: skip
         group.add_argument(
             "--connect", nargs="+", metavar="ROUTER", dest="routers",
-            help="other routers to join; the robots of each reach the servers of all (default: none)",
+            help="another router to join, so that the robots of each reach the servers of both; a map server "
+            "without --listen is a client of the first of these routers that is in reach (default: none)",
         )  # fmt: skip
     else:
         group.add_argument(
@@ -47,6 +49,14 @@ def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
     group.add_argument("--keys", metavar="FOLDER" if listens else "FILE", help=what)
     parser.set_defaults(listens=listens)
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML; the command line overrides it")
+
+
+def add_log_format(parser: argparse.ArgumentParser) -> None:
+    """How a process that runs on writes its log."""
+    parser.add_argument(
+        "--log-format", choices=["text", "json"], default="text",
+        help="lines of the log: words, or one JSON object each (default: text)",
+    )  # fmt: skip
 
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
@@ -134,6 +144,23 @@ def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings,
         raise SettingsError(f"{network.keys} has the keys of fleet {fleet}, not of {network.fleet}")
     listen = () if network.endpoints == default.endpoints else network.endpoints
     return folder.router(server, listen, network.routers), folder
+
+
+def server_settings(network: NetworkSettings, server: str) -> tuple[BusSettings, KeyFolder | None]:
+    """How a map server takes part: as a router, or, given routers but not where to listen, as their client.
+
+    Raises:
+        SettingsError: see `router_settings`.
+    """
+    from mapweave.identities.key_file import read_key_file
+    from mapweave.settings import NetworkSettings
+    from mapweave.wire.bus_settings import BusSettings
+
+    if not network.routers or network.endpoints != NetworkSettings().endpoints:
+        return router_settings(network, server)
+    settings, folder = router_settings(replace(network, routers=()), server)
+    own = None if folder is None else read_key_file(folder.key_file(server)).credentials
+    return BusSettings(endpoints=network.routers, credentials=own, fleet=settings.fleet), folder
 
 
 def key_renewal(

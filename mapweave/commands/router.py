@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from mapweave.commands.network import (
+    add_log_format,
     add_network,
     key_renewal,
     network_of,
@@ -29,6 +30,7 @@ def add_to(commands: Any) -> None:
         help="print the configuration as JSON5 for a zenohd, which takes the same, and end; with --keys it "
         "contains the private key",
     )  # fmt: skip
+    add_log_format(parser)
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -39,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.wire.zenoh_bus import ZenohBus
     from mapweave.wire.zenoh_config import router_file
 
-    log_with_time()
+    log_with_time(arguments.log_format)
     network = network_of(arguments, settings_of(arguments))
     settings, keys = router_settings(network, network.server)
     if arguments.print_config:

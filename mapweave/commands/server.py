@@ -5,19 +5,23 @@ from __future__ import annotations
 import argparse
 import logging
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from mapweave.commands.map_input import SOURCES, map_source, opened
 from mapweave.commands.network import (
+    add_log_format,
     add_network,
     key_renewal,
     network_of,
-    router_settings,
+    server_settings,
     settings_of,
     stop_on_signals,
+    warn_without_router,
 )
+from mapweave.extras import need
 
 DATA = Path("out/server")
 DEMO_HTTP = "8080"
@@ -59,6 +63,13 @@ def add_to(commands: Any) -> None:
         help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
         "0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip
+    parser.add_argument(
+        "--ray", metavar="auto|ADDRESS",
+        help="split the place index among the processes of a Ray cluster, which also compare nodes: its "
+        "address, or auto for the one that runs on this machine, which is started if there is none (default: "
+        "off)",
+    )  # fmt: skip
+    add_log_format(parser)
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -77,14 +88,19 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Lines have dates, so that a log shows when two maps came apart.
-    log_with_time()
+    log_with_time(arguments.log_format)
     for part in ("mapweave.mapserver", "mapweave.wire"):
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     name = check_name(arguments.name or network.server)
-    router, folder = router_settings(network, name)
+    router, folder = server_settings(network, name)
     keys = Keys(router.fleet)
+    cluster = replace(settings.cluster, ray=arguments.ray or settings.cluster.ray)
+    if cluster.ray:
+        need("cluster")
+        if arguments.lockstep:
+            raise SettingsError("--lockstep is repeatable, and a cluster is not: leave out one of them")
     if arguments.demo and (arguments.data is not None or arguments.store is not None):
         raise SettingsError("--demo keeps nothing: leave out --data and --store")
     if arguments.store is not None and not is_postgres(arguments.store):
@@ -97,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(router)
     try:
-        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas)
+        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas, cluster)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
             data = arguments.data or DATA
@@ -117,8 +133,11 @@ def run(arguments: argparse.Namespace) -> int:
             if base is not None:
                 print(stamped(f"with {base}"), flush=True)
             stack.enter_context(server)
-            where = ", ".join(router.listen)
-            print(stamped(f"map server {name} of fleet {keys.fleet} listens at {where}"), flush=True)
+            where = "listens at " + ", ".join(router.listen)
+            if router.mode == "client":
+                where = "is at the routers " + ", ".join(router.endpoints)
+                warn_without_router(bus, name)
+            print(stamped(f"map server {name} of fleet {keys.fleet} {where}"), flush=True)
             if people is not None:
                 stack.enter_context(people.serve(server))
                 print(stamped(f"for people: {people.url}"), flush=True)

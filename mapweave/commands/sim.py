@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands.network import (
+    add_log_format,
     add_network,
     client_settings,
     network_of,
@@ -113,6 +114,7 @@ def _add_serve(kinds: Any) -> None:
     parser.add_argument(
         "--held", action="store_true", help="let no time pass before a scenario's runner asks for it"
     )
+    add_log_format(parser)
     add_network(parser)
     parser.set_defaults(run=run_serve)
 
@@ -208,7 +210,7 @@ def run_serve(arguments: argparse.Namespace) -> int:
     from mapweave.wire.zenoh_bus import ZenohBus
 
     # Which robots time waits for, and which agents have gone.
-    log_with_time()
+    log_with_time(arguments.log_format)
     logging.getLogger("mapweave.sim").setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)

@@ -101,3 +101,14 @@ def write_private(path: Path, text: str) -> None:
     finally:
         os.umask(before)
     path.chmod(PRIVATE)
+    give_to_folders_owner(path)
+
+
+def give_to_folders_owner(path: Path) -> None:
+    """A file that root writes belongs to the owner of its folder.
+
+    A server that systemd runs owns the folder of its keys; it reads what `sudo mapweave keys add` writes.
+    """
+    if os.geteuid() == 0:
+        folder = path.parent.stat()
+        os.chown(path, folder.st_uid, folder.st_gid)

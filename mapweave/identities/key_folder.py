@@ -22,7 +22,14 @@ import msgspec
 
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.node import check_name
-from mapweave.identities.key_file import SUFFIX, KeyFile, read_key_file, write_key_file, write_private
+from mapweave.identities.key_file import (
+    SUFFIX,
+    KeyFile,
+    give_to_folders_owner,
+    read_key_file,
+    write_key_file,
+    write_private,
+)
 from mapweave.identities.tokens import add_token, end_tokens
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.wire.bus_settings import BusSettings
@@ -272,6 +279,7 @@ class KeyFolder:
         # Last: the server reads all of it again when this has changed.
         text = msgspec.json.format(msgspec.json.encode(self.catalogue), indent=1)
         write_whole(self.path / CATALOGUE, text)
+        give_to_folders_owner(self.path / CATALOGUE)
 
     def _read(self, name: str) -> str:
         try:

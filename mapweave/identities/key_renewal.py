@@ -30,15 +30,16 @@ class KeyRenewal:
         """Begin with the keys that the router has.
 
         Args:
-            bus: the router.
+            bus: the router, or a server that is a client of one: its own key it reads at its start.
             folder: of the keys, as they were when the router was opened.
             server: name of the map server whose key the router has.
-            settings: of the router.
+            settings: of the bus.
             say: takes a line for people.
             renewed: takes the server's own key, which may be another one now.
         """
         self._bus, self._folder, self._server, self._say = bus, folder, server, say
-        self._listen, self._routers, self._renewed = settings.listen, settings.routers, renewed
+        self._routes, self._renewed = settings.mode == "router", renewed
+        self._listen, self._routers = settings.listen if self._routes else (), settings.routers
         self._behind = False
         self._complaint = ""
 
@@ -50,7 +51,8 @@ class KeyRenewal:
                 return
             self._behind = True
             settings = self._folder.router(self._server, self._listen, self._routers)
-            self._bus.reopen(settings)
+            if self._routes:
+                self._bus.reopen(settings)
             if settings.credentials is not None:
                 self._renewed(settings.credentials)
         except MapweaveError as error:
@@ -59,4 +61,4 @@ class KeyRenewal:
             self._complaint = str(error)
             return
         self._behind, self._complaint = False, ""
-        self._say("the keys have changed: all connect again")
+        self._say("the keys have changed" + (": all connect again" if self._routes else ""))

@@ -10,6 +10,7 @@ from mapweave.sim.bridge import SimBridge
 from mapweave.sim.robots import RobotSetup
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
+from mapweave.terminal import stamped
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 
@@ -50,7 +51,7 @@ def run_sim(
         bridge = SimBridge(simulation, bus, fleet, PATIENCE, held=held)
         try:
             names = ", ".join(simulation.robots)
-            print(f"simulating {names} in {world.name}, seed {seed}", flush=True)
+            print(stamped(f"simulating {names} in {world.name}, seed {seed}"), flush=True)
             bridge.run(stop)
         finally:
             bridge.close()

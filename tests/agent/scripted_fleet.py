@@ -49,7 +49,7 @@ class Eyes:
         self.world, self.pose = world, pose
         self.rng = np.random.default_rng(3)
 
-    def extract(self, image: np.ndarray) -> Features:
+    def extract(self, image: np.ndarray, left_out: object = None) -> Features:
         view, _ = take_view(self.world, self.pose, self.rng)
         pixels = view.pixels.astype(np.float64)
         return Features(pixels, pixels, view.codes, np.ones(len(view)))

@@ -13,13 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.agent.fleet_client import NO_ANSWER, FleetClient
-from mapweave.agent.mission import Answer, MayIDrive, Question, WhatIsKnown, WhereAmI, WhichWay
+from mapweave.agent.mission import Answer, MayIDrive, Question, WhatIsKnown, WhereAmI, WhichWay, WhoIsNear
 from mapweave.agent.mission_control import MissionControl
 from mapweave.hybridmap.agent_status import MAX_STATUS_WORDS, AgentStatus, Status
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
@@ -289,6 +290,29 @@ def test_the_servers_answers_come_with_their_numbers(link: FleetClient, other: M
     assert np.array_equal(view.codes, VIEW.codes)
     assert (request.start, request.goal, request.blocked) == (HERE, THERE, ((HERE, THERE),))
     assert request.start_from_robot == Pose2(0.25, -0.5, 1.0)
+
+
+def test_who_is_near_is_asked_only_of_a_server_that_is_there(link: FleetClient, other: MemoryBus) -> None:
+    """A robot that maps alone asks for ever: that is no trouble to report."""
+    who = WhoIsNear(-2, ((HERE, Pose2(0.5, 0.0, 0.1)),), 0.01, 0.02, 0.16, 0.3, 0.25)
+    asked: list[NearbyRequest] = []
+
+    def nearby(request) -> None:
+        asked.append(decode(request.payload, NearbyRequest))
+        request.reply(encode(NearbyAnswer((), "alone")))
+
+    other.serve(sent_by_any(KEYS.nearby("s0")), nearby)
+    link.ask(who)
+    (answer,) = link.answers(wait=True)
+    assert (answer.content, asked) == (None, [])
+    (reply,) = other.ask(KEYS.agent_status("r0"), b"", 2.0)
+    assert decode(reply.payload, AgentStatus).last_error == ""
+    other.announce(KEYS.server_alive("s0"))
+    eventually(link.server_in_reach)
+    link.ask(who)
+    (answer,) = link.answers(wait=True)
+    assert answer.content == NearbyAnswer((), "alone")
+    assert asked == [NearbyRequest("r0", who.starts, 0.01, 0.02, 0.16, 0.3, 0.25)]
 
 
 def test_it_gets_what_others_have_mapped(link: FleetClient, other: MemoryBus) -> None:

@@ -1,11 +1,11 @@
-"""docs/figures.md: it is what its generator makes of the stored results."""
+"""docs/figures.md and docs/scale.md: they are what their generator makes of the stored results."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from benchmarks.figures.benchmark import PAGE, written_page
+from benchmarks.figures.benchmark import written_pages
 from benchmarks.figures.measurements import MEASUREMENTS
 from benchmarks.figures.page import filled
 from benchmarks.figures.results import FOLDER, load, run, store
@@ -13,8 +13,9 @@ from benchmarks.rules.switches import MERGE_RULES, PLACE_RULES, TRIAL_RULES
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 
 
-def test_the_page_is_made_of_the_stored_results() -> None:
-    assert PAGE.read_text(encoding="utf-8") == written_page(), "python -m benchmarks.figures"
+def test_the_pages_are_made_of_the_stored_results() -> None:
+    for path, text in written_pages().items():
+        assert path.read_text(encoding="utf-8") == text, "python -m benchmarks.figures"
 
 
 def test_each_stored_result_is_of_the_command_that_is_named() -> None:

@@ -10,6 +10,7 @@ import pytest
 from mapweave.commands.status import cells
 from mapweave.hybridmap.change import Change, NodeRetired
 from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import KnownRequest, ReserveRequest
@@ -62,13 +63,17 @@ def test_a_robot_that_asks_too_much_is_refused_and_shown_and_others_are_answered
     assert lines[0] == "r7 is over its quota: 1 questions held back so far" and len(lines) < 12
 
 
-def test_a_robot_reserves_for_itself_alone(house: House) -> None:
+def test_a_robot_reserves_and_says_where_it_is_for_itself_alone(house: House) -> None:
     asker = house.bus()
     start = NodeId(*ROBOT, 1)
     for_r8 = encode(ReserveRequest("r8", start, Pose2(), ()))
     (reply,) = asker.ask(sent_by(KEYS.any_reserve(), "r9"), for_r8, 20.0)
     assert reply.error == "r9 reserves nothing for r8"
     assert not asker.ask(sent_by(KEYS.any_reserve(), "r8"), for_r8, 20.0)[0].error
+    about_r8 = encode(NearbyRequest("r8", ((start, Pose2()),), 0.1, 0.1, 0.2, 0.3, 0.3))
+    (reply,) = asker.ask(sent_by(KEYS.any_nearby(), "r9"), about_r8, 20.0)
+    assert reply.error == "r9 does not say where r8 is"
+    assert not asker.ask(sent_by(KEYS.any_nearby(), "r8"), about_r8, 20.0)[0].error
 
 
 def test_a_robot_is_localized_in_its_own_name(house: House) -> None:

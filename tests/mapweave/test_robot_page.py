@@ -26,6 +26,20 @@ def test_its_settings_can_be_read() -> None:
     assert robot.camera is not None and robot.describe(ArduinoBase.geometry).axle == 0.15
 
 
+def test_the_unit_finds_what_the_page_hands_over() -> None:
+    """Settings, key and calibration lie where the unit of the robot that is enabled looks for them."""
+    unit = (PAGE.parents[1] / "examples/systemd/mapweave-agent@.service").read_text(encoding="utf-8")
+    (name,) = set(re.findall(r"mapweave-agent@(\w+)", TEXT))
+    wanted = re.findall(
+        r"/etc/mapweave/%i\S*\.toml|(?<=--calibration )\S+", unit.replace("%i.toml", "%i.toml ")
+    )
+    paths = {path.replace("%i", name) for path in wanted}
+    calibration = f"{next(path for path in paths if not path.endswith('.toml'))}/{name}.toml"
+    handed = set(re.findall(r"install -D -m \d+ \S+ (\S+)", TEXT))
+    assert handed == {path for path in paths if path.endswith(".toml")} | {calibration}
+    assert f"mapweave keys add {name}" in TEXT and f"agent {name} --settings" in TEXT
+
+
 def test_its_links_lead_somewhere() -> None:
     links = re.findall(r"\]\(([^)#]+)\)", TEXT)
     assert links and all((PAGE.parent / link).exists() for link in links)

@@ -100,3 +100,19 @@ def test_held_tracks_match_in_both_directions(pictures, name):
     # Sobel's derivative smooths a little more than NumPy's differences.
     assert (weak > 0.8 * sift.LEAST_TEXTURE).all()
     assert (weak > 0.5 * sift.LEAST_ROUNDNESS * strong).all()
+
+
+def test_a_region_that_is_left_out_has_no_features_and_others_take_their_place(pictures):
+    image, settings = pictures.photograph("brick"), SiftSettings(most=60)
+    lens = Lens(CAMERA, (-0.2, 0.05, 0.001, 0.0, 0.0))
+    region = np.array([[100.0, 60.0, 220.0, 180.0], [-50.0, -50.0, 20.0, 300.0]])
+
+    def inside(pixels):
+        return (
+            ((pixels[:, None] >= region[:, :2]) & (pixels[:, None] <= region[:, 2:])).all(axis=2).any(axis=1)
+        )
+
+    whole, rest = Sift(lens, settings).extract(image), Sift(lens, settings).extract(image, region)
+    assert inside(whole.pixels).sum() >= 5 and not inside(rest.pixels).any()
+    outside = {tuple(pixel) for pixel in whole.raw[~inside(whole.pixels)]}
+    assert outside <= {tuple(pixel) for pixel in rest.raw} and len(rest) > len(outside)

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from mapweave.hybridmap.errors import SettingsError
 from mapweave.wire.bus_settings import NEXT_ENDPOINT, BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
 from mapweave.wire.zenoh_config import LARGEST, LARGEST_MESSAGE, router_file
@@ -126,6 +127,11 @@ def test_routers_that_join_each_other_carry_everything(routers: Routers) -> None
     assert set(got) == {bytes(10_000)}
     server.close()
     eventually(lambda: alive[-1] == ("mapweave/alive/s0", False))
+
+
+def test_a_router_joins_one_other() -> None:
+    with pytest.raises(SettingsError, match="a router joins one other, not 2"):
+        BusSettings(mode="router", listen=(endpoint(1),), routers=(endpoint(2), endpoint(3)))
 
 
 def test_what_is_too_large_between_routers_is_dropped_and_the_link_stays(routers: Routers) -> None:

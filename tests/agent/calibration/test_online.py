@@ -25,11 +25,16 @@ def watched(
     seed: int,
     sigma: float = 0.3,
     online: OnlineCalibration | None = None,
+    ranged: float = 0.0,
 ) -> OnlineCalibration:
-    """What the agent has found out at the end of a drive past points in the room and on its floor."""
+    """What the agent has found out at the end of a drive past points in the room and on its floor.
+
+    With `ranged`, a sensor ahead reads so many times the distance to the wall.
+    """
     rng = np.random.default_rng(seed)
     camera = replace(CAMERA, mount_forward=declared.forward, mount_height=declared.height)
-    online = online or OnlineCalibration(RobotDescription(camera, geometry=declared))
+    reach = {"ranger_bearings": (0.0,), "ranger_reach": 20.0} if ranged else {}
+    online = online or OnlineCalibration(RobotDescription(camera, geometry=declared, **reach))  # type: ignore[arg-type]
     half = 0.5 * np.array(SIDE)
     points = np.column_stack([rng.uniform(-half, half, (8000, 2)), rng.uniform(0.0, 1.5, 8000)])
     points[::2, 2] = 0.0
@@ -37,7 +42,13 @@ def watched(
     way, turn = (np.interp(run.stamps, run.wheels.stamps, c) for c in (run.wheels.way, run.wheels.turn))
     for k, stamp in enumerate(run.stamps):
         wheels = Odometry(float(way[k] - way[max(k - 1, 0)]), float(turn[k] - turn[max(k - 1, 0)]))
-        online.correct(Observation(round(stamp * 1e9) + 1, wheels))
+        proximity = np.zeros(0)
+        if ranged:
+            x, y, heading = run.poses[k]
+            ahead = np.array([math.cos(heading), math.sin(heading)])
+            walls = (half - np.sign(ahead) * [x, y]) / np.maximum(np.abs(ahead), 1e-9)
+            proximity = ranged * walls.min(keepdims=True) * (1.0 + 0.005 * rng.normal())
+        online.correct(Observation(round(stamp * 1e9) + 1, wheels, proximity=proximity))
         local = (points - centre[k]) @ rotation[k]
         ahead = local[:, 2] > 0.3
         pixels = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None] * CAMERA.fx + [
@@ -90,6 +101,29 @@ def test_a_wrong_geometry_is_named_and_mended(parameter: Parameter, amount: floa
     assert left < 0.3 * abs(amount) or not used
     kept = [p for p in NAMED_ONLY if p is not parameter]
     assert np.allclose(online.geometry.vector[kept], TRUE.vector[kept])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("amount", [math.log(1.05), -math.log(1.06)])
+def test_wheels_that_floor_and_rangers_contradict_are_corrected(amount: float) -> None:
+    """Two lengths against one. By the floor alone it might as well be the camera's height."""
+    vector = TRUE.vector
+    vector[Parameter.WHEEL_SCALE] += amount
+    run = drive(np.random.default_rng(4), TRUE, 90.0, "turning")
+    online = watched(run, DriveGeometry.of(vector), 4, ranged=1.0)
+    (cause,) = online.causes
+    assert cause.parameter is Parameter.WHEEL_SCALE and "lower" not in str(cause)
+    assert abs(math.log(online.geometry.wheel_scale)) < 0.3 * abs(amount)
+    assert np.array_equal(online.geometry.vector[1:], TRUE.vector[1:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranged", [1.0, 1.08])
+def test_right_wheels_are_left_alone_whatever_the_rangers_read(ranged: float) -> None:
+    """Sensors that read 8 % too much are contradicted by wheels and floor."""
+    online = watched(drive(np.random.default_rng(5), TRUE, 60.0, "turning"), TRUE, 5, ranged=ranged)
+    assert not online.causes
+    assert online.geometry == TRUE
 
 
 def test_a_robot_that_stands_learns_nothing():

@@ -167,7 +167,7 @@ def test_headway_counts_since_the_robot_came_nearer(distances):
 
 def test_a_route_with_a_thousand_nodes_in_one_place_needs_few_detections(node, monkeypatch):
     tried = []
-    monkeypatch.setattr(NodeDetector, "find", lambda self, image, wanted: tried.append(len(wanted)))
+    monkeypatch.setattr(NodeDetector, "find", lambda self, image, wanted, left_out: tried.append(len(wanted)))
     lens = Lens(ROBOT.camera, ROBOT.distortion)
     ahead = PoseGaussian(Pose2(0.5), np.zeros((3, 3)))
     route = (RouteLeg(node, HERE, None), *[RouteLeg(node, ahead, None)], *[RouteLeg(node, HERE, None)] * 1000)

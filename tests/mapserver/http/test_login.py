@@ -11,10 +11,12 @@ import socket
 import ssl
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from email.message import Message
 from pathlib import Path
 
 import pytest
+from starlette.exceptions import HTTPException
 from starlette.routing import Mount, Route, WebSocketRoute
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
@@ -25,12 +27,14 @@ from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
 from mapweave.identities.tokens import TOKENS, end_tokens
 from mapweave.mapserver.http import sessions
+from mapweave.mapserver.http.rates import MOST_PEOPLE, QUESTIONS, Rates
 from mapweave.mapserver.http.serving import Limits
 from mapweave.mapserver.http.tls import load, server_context
 from mapweave.mapserver.http.web import Questions, Web
+from mapweave.mapserver.quotas import BURST
 from mapweave.wire.credentials import Role
 from tests.mapserver.http.client import ask, raw
-from tests.mapserver.stub_services import StubServices
+from tests.mapserver.stub_services import StubServices, picture
 from tests.waiting import eventually
 
 NAMES = {"vera": Role.VIEWER, "otto": Role.OPERATOR, "r0": Role.ROBOT, "s0": Role.SERVER}
@@ -328,3 +332,49 @@ def encrypted(web: Web, context: ssl.SSLContext, data: bytes) -> bytes:
         except (ssl.SSLError, ConnectionError):
             pass  # cut off
         return got
+
+
+def test_one_who_asks_without_end_is_told_when_and_nobody_else_waits(
+    tmp_path: Path, services: StubServices, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By name, whatever the way of logging in; what costs nothing is not counted."""
+    now = 0.0
+    monkeypatch.setattr("mapweave.mapserver.http.web.Rates", lambda: Rates(clock=lambda: now))
+    keyed = Keyed(tmp_path / "keys", services)
+    with keyed.web:
+        session = keyed.session("otto")
+        for _ in range(round(BURST * QUESTIONS)):
+            assert keyed.ask("GET", "/explain", "otto") == 200
+        given = {"Authorization": f"Bearer {keyed.tokens['otto']}"}
+        status, headers, content = ask(keyed.web, "POST", "/relocalize", picture(), given)
+        assert status == 429 and headers["Retry-After"] == "1"
+        assert json.loads(content)["error"] == "otto asks more than 2 questions a second: try again in 1 s"
+        assert keyed.ask("GET", "/explain", **session) == 429
+        assert keyed.ask("GET", "/robots", "otto") == keyed.ask("GET", "/explain", "vera") == 200
+        now = 0.6
+        assert keyed.ask("GET", "/explain", "otto") == 200
+        assert keyed.ask("GET", "/explain", "otto") == 429
+
+
+def test_without_keys_addresses_have_rates() -> None:
+    now = 0.0
+    rates = Rates(clock=lambda: now)
+
+    def admitted(who: str, times: int) -> int:
+        count = 0
+        for _ in range(times):
+            with suppress(HTTPException):
+                rates.ask(who)
+                count += 1
+        return count
+
+    assert admitted("10.0.0.1", 500) == BURST * QUESTIONS
+    assert admitted("10.0.0.2", 5) == 5
+    total = 0
+    for tick in range(100):
+        now = 0.1 * (tick + 1)
+        total += admitted("10.0.0.1", 3)
+    assert abs(total - 10.0 * QUESTIONS) <= 1, "its rate in the long run"
+    for k in range(MOST_PEOPLE):
+        rates.ask(f"host {k}")
+    assert len(rates._buckets) == MOST_PEOPLE

@@ -21,6 +21,7 @@ from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
 from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.retrieval.ranking import Ranked
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
@@ -74,9 +75,9 @@ class OnlyTheFirst:
         self.index, self.view, self.first, self.asked = PlaceIndex(), view, nodes[0].id, 0
         self.index.extend(nodes)
 
-    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+    def query(self, view: View, k: int = 5) -> Ranked:
         if view is self.view:
-            return [(self.first, 2.0)]
+            return Ranked([(self.first, 2.0)])
         self.asked += 1
         return self.index.query(view, k)
 

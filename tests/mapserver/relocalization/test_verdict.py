@@ -10,6 +10,7 @@ from mapweave.mapserver.relocalization import verdict
 from mapweave.mapserver.relocalization.candidates import retrieve
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
 from mapweave.mapserver.relocalization.verdict import Outcome
+from mapweave.mapserver.retrieval.ranking import Ranked
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.world import room, take_node, take_view
 
@@ -22,13 +23,13 @@ NODE = take_node(
 LEAST = RelocalizationSettings().recognition.least_inliers
 
 
-class Ranked:
+class Retrieved:
     """Retrieval that finds one node, and counts how often it is asked."""
 
     def __init__(self, *ranked: tuple[NodeId, float]) -> None:
-        self.ranked, self.asked = list(ranked), 0
+        self.ranked, self.asked = Ranked(ranked), 0
 
-    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+    def query(self, view: View, k: int = 5) -> Ranked:
         self.asked += 1
         return self.ranked
 
@@ -37,7 +38,7 @@ def few(count: int) -> View:
     return View(VIEW.pixels[:count], VIEW.codes[:count], VIEW.camera)
 
 
-FOUND = Ranked((NODE.id, 2.0))
+FOUND = Retrieved((NODE.id, 2.0))
 OTHER_WAY = take_view(WORLD, ASIDE, np.random.default_rng(5))[0]
 
 
@@ -52,7 +53,7 @@ OTHER_WAY = take_view(WORLD, ASIDE, np.random.default_rng(5))[0]
             Outcome.FEW_FEATURES,
             f"the view has {LEAST - 1} features",
         ),
-        (VIEW, Ranked(), {}, 18, Outcome.NO_CANDIDATE, "no node of any map"),
+        (VIEW, Retrieved(), {}, 18, Outcome.NO_CANDIDATE, "no node of any map"),
         (VIEW, FOUND, {}, 18, Outcome.NOT_RECOGNISED, "are gone"),
         (OTHER_WAY, FOUND, {NODE.id: NODE}, 18, Outcome.NOT_RECOGNISED, f"nearest is {NODE.id}"),
         (VIEW, FOUND, {NODE.id: NODE}, 1000, Outcome.ONE_WEAK_NODE, "no other node confirms it"),
@@ -62,7 +63,7 @@ OTHER_WAY = take_view(WORLD, ASIDE, np.random.default_rng(5))[0]
 )
 def test_each_outcome(
     view: View,
-    index: Ranked,
+    index: Retrieved,
     nodes: dict[NodeId, Node],
     alone: int,
     outcome: Outcome,
@@ -82,7 +83,7 @@ def test_each_outcome(
 
 
 def test_retrieval_is_not_asked_about_a_view_that_cannot_be_registered() -> None:
-    index = Ranked((NODE.id, 2.0))
+    index = Retrieved((NODE.id, 2.0))
     assert not retrieve(few(LEAST - 1), index, LEAST).ranked and not index.asked
     assert retrieve(VIEW, index, LEAST).ranked == [(NODE.id, 2.0)] and index.asked == 1
 

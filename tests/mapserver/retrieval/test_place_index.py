@@ -8,7 +8,7 @@ from mapweave.hybridmap.descriptor import decode, quantise
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.retrieval import place_index
+from mapweave.mapserver.retrieval import place_index, ranking
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.mapserver.retrieval.inverted_file import InvertedFile
 from mapweave.mapserver.retrieval.landmark_index import MOST_WITHIN, LandmarkIndexSettings
@@ -44,8 +44,8 @@ def brute_force(nodes: list[Node], view: View, s: PlaceIndexSettings) -> dict[No
         nearest = sorted((float(((feature - v) ** 2).sum()), node) for v, node in everything)[: s.votes]
         best: dict[NodeId, float] = {}
         for squared, node in nearest:
-            if squared < place_index.REACH**2:
-                best[node] = max(best.get(node, 0.0), 1 - squared / place_index.REACH**2)
+            if squared < ranking.REACH**2:
+                best[node] = max(best.get(node, 0.0), 1 - squared / ranking.REACH**2)
         for node, weight in best.items():
             scores[node] += weight / np.sqrt(len(best))
     return scores

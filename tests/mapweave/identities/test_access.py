@@ -14,11 +14,13 @@ from pathlib import Path
 
 import pytest
 
+from mapweave.commands.network import server_settings
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.hybridmap.node import MapId
 from mapweave.identities.authority import Authority
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
+from mapweave.settings import NetworkSettings
 from mapweave.wire.access_rules import ASKS, COMMANDS, OF_ROBOTS, SIGNED
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
@@ -354,8 +356,31 @@ def test_without_keys_a_router_listens_on_its_own_machine_alone(endpoint: str) -
     BusSettings(mode="router", listen=("tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"))
 
 
+def test_a_server_with_keys_is_a_client_of_routers(fleet: Fleet) -> None:
+    """Given routers and not where to listen; robots ask it through the router."""
+    fleet.folder.add("s1", Role.SERVER)
+    fleet.renew()
+    network = NetworkSettings(routers=(fleet.endpoint,), keys=str(fleet.folder.path))
+    settings, _ = server_settings(network, "s1")
+    assert (settings.mode, settings.endpoints, settings.fleet) == ("client", (fleet.endpoint,), "demo")
+    server = ZenohBus(settings)
+    fleet.open.append(server)
+    server.serve(sent_by_any(KEYS.relocalize("s1")), answer)
+    got: list[str] = []
+    server.subscribe(KEYS.agent_statuses(), lambda sample: got.append(sample.key))
+    r0 = fleet.join("r0")
+    eventually(lambda: asked(r0, sent_by(KEYS.relocalize("s1"), "r0")))
+    eventually(lambda: r0.publish(KEYS.agent_status("r0"), b"x") or got)
+
+
+def test_a_server_that_listens_is_a_router() -> None:
+    listens, joins = ("tcp/127.0.0.1:7448",), ("tcp/127.0.0.1:7447",)
+    settings, _ = server_settings(NetworkSettings(endpoints=listens, routers=joins), "s0")
+    assert (settings.mode, settings.listen, settings.routers) == ("router", listens, joins)
+
+
 def test_routers_with_passwords_do_not_join(tmp_path: Path) -> None:
-    """Who connects would not know whom to."""
+    """Who connects would not know to which router."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0", 7447)
     with pytest.raises(SettingsError, match="with certificates, not with the passwords"):
         folder.router("s0", (), ["tcp/127.0.0.1:7448"])

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from cryptography import x509
 
 from mapweave.cli import main
+from mapweave.connection import no_server
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder
 from mapweave.identities.logins import Logins
@@ -36,6 +39,20 @@ def test_secrets_are_their_owners_alone(keys: Path) -> None:
     text = (keys / "fleet.json").read_text()
     assert "PRIVATE" not in text
     assert (read_key_file(keys / "r0.key.toml").credentials.password or "PRIVATE") not in text
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
+def test_what_root_adds_to_a_servers_keys_the_server_can_read(keys: Path) -> None:
+    """Systemd runs the server as a user of its own, which owns the folder; people add keys with sudo."""
+    for path in (keys, *keys.iterdir()):
+        os.chown(path, 64_999, 64_998)
+    where = ["--keys", str(keys)]
+    assert main(["keys", "add", "anna", "--role", "operator", *where]) == 0
+    assert main(["keys", "token", "anna", *where]) == 0
+    assert main(["keys", "revoke", "r0", *where]) == 0
+    owners = {path.name: (path.stat().st_uid, path.stat().st_gid) for path in keys.iterdir()}
+    assert {"fleet.json", "tokens.json", "anna.key.toml"} <= owners.keys()
+    assert set(owners.values()) == {(64_999, 64_998)}, owners
 
 
 def test_a_key_file_is_refused_if_others_may_read_it(keys: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -84,6 +101,13 @@ def test_a_token_is_shown_once_and_its_hash_alone_is_kept(
     assert Logins(keys).login(token) is None and (keys / "r0.key.toml").exists()
     assert "r0 has no token" in complaint(capfd, "keys", "revoke", "r0", "--tokens", *where)
     assert "r9 has no good key" in complaint(capfd, "keys", "token", "r9", *where)
+
+
+def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> None:
+    """The router drops it without a word: it looks like a server that is not there."""
+    robot = read_key_file(keys / "r0.key.toml").credentials
+    assert "its key is a robot's, use a viewer's or an operator's" in str(no_server("f1", robot))
+    assert "a robot's" not in str(no_server("f1", replace(robot, role=Role.VIEWER)))
 
 
 def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,253 @@
+"""Whether anything is lost, whatever is killed, frozen, cut off or deleted.
+
+    python -m benchmarks.chaos [--agents N] [--seconds S] [--seed N] [--store sqlite|URL] [--json]
+
+Real processes over TCP on loopback: agents (journal, replicator, fleet client), two map servers, two routers,
+and a link between each of them and each router that can be cut, slowed, frozen and half closed. The schedule
+is drawn with the seed and printed: at least 20 kill -9, a third as many SIGSTOP, two thirds as many links.
+With SQLite a server is also killed and its store deleted; it gets everything from the agents again. With
+PostgreSQL both servers share a database, which is killed as well.
+
+Each agent writes its own log, flushed to the disk, of what it hands over and of what its journal has then
+committed: that is `sent`. When all is over the stores are read and compared with it. `undone` changes are
+those that a server with a deleted store did not get again, since a later change has undone them and the robot
+has dropped them. `recovery_s` is from the end of each disturbance (the process is started again, the link
+mended) until both servers have acknowledged all that had been committed by then, whatever happens meanwhile.
+`relocalize_gap_s` is measured afterwards: a robot asks all the time where it is, and one of the servers, or
+the robot's router, is killed, or a server stopped; it is the longest time without an answer that names the
+place. `frozen_router_gap_s` is the same with the robot's router stopped, which it has to give up first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from benchmarks.chaos.account import Account, account, sent_changes
+from benchmarks.chaos.fleet_processes import DATABASE, ROUTERS, SERVERS, SQLITE, FleetProcesses
+from benchmarks.chaos.questions import LostRobot
+from benchmarks.chaos.recovery import RobotTimes, recoveries
+from benchmarks.chaos.schedule import KILLS, LINKS, Disturbance, Kind, draw_schedule
+from benchmarks.chaos.scripted_robot import ScriptedRobot
+from mapweave.agent.replication.journal import Journal
+from mapweave.mapserver.log.opening import open_store
+from mapweave.scenarios.children import ChildFailed
+from synthetic.postgres_server import PostgresServer, binaries
+
+POSTGRESQL = "postgresql"
+START = 120.0
+"""Longest wait until both servers answer, s."""
+SETTLE = 120.0
+"""Longest wait until all is acknowledged when nothing is disturbed any more, s."""
+FLAP = 0.3
+"""Of a link that is cut again and again, s."""
+LEAST_SECONDS = 10.0
+ATTACKS = (
+    (Kind.KILL, SERVERS[0], 4.0), (Kind.KILL, SERVERS[1], 4.0), (Kind.KILL, ROUTERS[0], 4.0),
+    (Kind.STOP, SERVERS[0], 4.0), (Kind.STOP, ROUTERS[1], 7.0),
+)  # fmt: skip
+"""On a fleet in which a robot asks where it is. It is at the second router since the first one was killed.
+The last of each is how long it lasts, s: a connection has a lease of 2.5 s, and a frozen endpoint is tried
+for 2 s."""
+
+Done = list[tuple[float, Kind, str]]
+
+
+def wait_until(condition: Callable[[], bool], patience: float, what: str) -> None:
+    """Wait for a condition; raises ChildFailed with `what` when the time is over."""
+    end = time.monotonic() + patience
+    while not condition():
+        if time.monotonic() > end:
+            raise ChildFailed(what)
+        time.sleep(0.3)
+
+
+def disturb(
+    fleet: FleetProcesses, schedule: Sequence[Disturbance], seconds: float, progress: Progress
+) -> Done:
+    """Carry out a schedule; returns when each disturbance ended."""
+    bar = progress.add_task("mapping", total=seconds)
+    began = time.monotonic()
+    waiting, going = list(schedule), list[Disturbance]()
+    done: Done = []
+    while waiting or going or time.monotonic() < began + seconds:
+        now = time.monotonic() - began
+        for one in [one for one in going if one.at + one.lasts <= now]:
+            going.remove(one)
+            fleet.end_disturbance(one.kind, one.target)
+            done.append((time.monotonic(), one.kind, one.target))
+        while waiting and waiting[0].at <= now:
+            one = waiting.pop(0)
+            fleet.begin(one.kind, one.target)
+            going.append(one)
+            progress.update(bar, description=f"{len(done) + len(going)}: {one.target} {one.kind}")
+        for one in going:
+            if one.kind is Kind.FLAP:
+                fleet.toggle(one.target, int((now - one.at) / FLAP) % 2 == 0)
+        fleet.check()
+        progress.update(bar, completed=min(now, seconds))
+        time.sleep(0.02)
+    progress.update(bar, description="mapped", completed=seconds)
+    return done
+
+
+def relocalize_gaps(fleet: FleetProcesses, seed: int, progress: Progress) -> list[float]:
+    """The longest times without an answer while each of `ATTACKS` lasts, s."""
+    bar = progress.add_task("a lost robot asks", total=len(ATTACKS))
+    views = [ScriptedRobot(k, seed).view for k in range(len(fleet.agents))]
+    gaps: list[float] = []
+    with LostRobot(fleet.endpoints, views) as robot:
+        for kind, victim, lasts in ATTACKS:
+            wait_until(lambda: robot.recognised(SERVERS), START, "not both servers recognise a place")
+            if not gaps:
+                robot.start()
+            progress.update(bar, description=f"a lost robot asks: {victim} {kind}")
+            began = time.monotonic()
+            fleet.begin(kind, victim)
+            time.sleep(lasts)
+            gaps.append(robot.longest_gap(began, time.monotonic()))
+            fleet.end_disturbance(kind, victim)
+            progress.console.print(f"{victim} {kind}: {gaps[-1]:.2f} s without an answer", highlight=False)
+            progress.advance(bar)
+    progress.update(bar, description="a lost robot asked")
+    return gaps
+
+
+def run(
+    folder: Path, agents: int, seconds: float, seed: int, store: str, progress: Progress
+) -> dict[str, object]:
+    """Start a fleet, disturb it, let it come to rest and count."""
+    names = [f"r{k}" for k in range(agents)]
+    postgres = start_postgres(folder) if store == POSTGRESQL else None
+    address = store if postgres is None else postgres.database()
+    groups = (names, SERVERS, ROUTERS, *(() if postgres is None else [(DATABASE,)]))
+    schedule = draw_schedule(seconds, groups, seed, store == SQLITE)
+    for one in schedule:
+        progress.console.print(str(one), highlight=False)
+    with ExitStack() as stack:
+        if postgres is not None:
+            stack.callback(postgres.stop)
+        fleet = stack.enter_context(FleetProcesses(folder, agents, seed, address, postgres))
+        for name in (*ROUTERS, *SERVERS, *fleet.agents):
+            fleet.start(name)
+        step = progress.add_task("the fleet starts", total=None)
+        wait_until(lambda: acknowledged(folder, names), START, "not all robots are acknowledged at the start")
+        progress.update(step, description="the fleet runs", total=1, completed=1)
+        done = disturb(fleet, schedule, seconds, progress)
+        *gaps, frozen = relocalize_gaps(fleet, seed, progress)
+        fleet.stop_mapping()
+        (folder / "disturbances.json").write_text(json.dumps(done))
+        step = progress.add_task("all is acknowledged", total=None)
+        wait_until(fleet.done, SETTLE, f"not all is acknowledged {SETTLE:g} s after the last disturbance")
+        fleet.check()
+        progress.update(step, total=1, completed=1)
+        for name in SERVERS:
+            fleet.end(name)
+        total = Account()
+        places = list(dict.fromkeys(map(fleet.store_of, SERVERS)))
+        stores = [open_store(place) for place in places]
+        for k, name in enumerate(names):
+            journal = Journal(folder / f"{name}.sqlite")
+            total += account(sent_changes(folder, k, seed), journal, stores)
+            journal.close()
+        for one_store in stores:
+            one_store.close()
+    took = recoveries([RobotTimes(folder, name) for name in names], SERVERS, done)
+    kinds = [one.kind for one in schedule]
+    return {
+        "seed": seed, "agents": agents, "seconds": seconds, "store": store.partition(":")[0],
+        **asdict(total),
+        "recovery_s_p50": round(float(np.percentile(took, 50)), 2),
+        "recovery_s_p95": round(float(np.percentile(took, 95)), 2),
+        "relocalize_gap_s": round(max(gaps), 2), "frozen_router_gap_s": round(frozen, 2),
+        "kills": sum(kind in KILLS for kind in kinds), "lost_stores": kinds.count(Kind.LOSE_STORE),
+        "stops": kinds.count(Kind.STOP), "cuts": sum(kind in LINKS for kind in kinds),
+    }  # fmt: skip
+
+
+def start_postgres(folder: Path) -> PostgresServer:
+    """A cluster in a folder that its own user may read, and whose commits are on the disk when they return.
+
+    Raises:
+        ChildFailed: there is no PostgreSQL.
+    """
+    if binaries() is None:
+        raise ChildFailed("there is no PostgreSQL: neither Debian's package postgresql nor PyPI's pgserver")
+    place = folder / DATABASE
+    place.mkdir()
+    for part in (folder, place):
+        part.chmod(0o755)
+    return PostgresServer(place, "-c", "fsync=on")
+
+
+def acknowledged(folder: Path, names: Sequence[str]) -> bool:
+    """Whether both servers have acknowledged something of every robot."""
+    files = [folder / f"{name}.acks" for name in names]
+    return all(
+        file.exists() and all(f"{server} " in file.read_text() for server in SERVERS) for file in files
+    )
+
+
+def good(report: dict[str, object]) -> bool:
+    """Whether nothing is lost."""
+    return report["maps_equal"] is True and not any(
+        report[key] for key in ("lost", "duplicated", "out_of_order")
+    )
+
+
+def main() -> None:
+    """Run once, print, and exit with 1 if anything is lost."""
+    about = (__doc__ or "").splitlines()[0]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.chaos", description=about)
+    parser.add_argument("--agents", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of mapping and disturbances")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--store", default=SQLITE,
+        help="sqlite: a file a server; postgresql: one database for both, which is started here and killed; "
+        "or the URL of one",
+    )  # fmt: skip
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep journals, stores and logs here")
+    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
+    options = parser.parse_args()
+    if options.agents < 1 or options.seconds < LEAST_SECONDS or options.seed < 0:
+        parser.error(f"--agents must be positive, --seconds at least {LEAST_SECONDS:g}, --seed not negative")
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with (
+        tempfile.TemporaryDirectory() as place,
+        Progress(*columns, console=Console(stderr=True)) as progress,
+    ):
+        folder = Path(place)
+        try:
+            report = run(folder, options.agents, options.seconds, options.seed, options.store, progress)
+        except ChildFailed as failed:
+            progress.stop()
+            sys.exit(f"seed {options.seed}: {failed}")
+        finally:
+            if options.keep is not None:
+                without = shutil.ignore_patterns(DATABASE)
+                shutil.copytree(folder, options.keep, ignore=without, dirs_exist_ok=True)
+    table = Table("", "", title="chaos", show_header=False)
+    for key, value in report.items():
+        table.add_row(key, str(value))
+    Console(stderr=options.json).print(table)
+    if options.json:
+        print(json.dumps(report))
+    sys.exit(0 if good(report) else 1)
+
+
+if __name__ == "__main__":
+    main()

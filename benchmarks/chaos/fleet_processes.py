@@ -1,0 +1,212 @@
+"""The processes of a fleet: agents, two servers, two routers between them; killed, frozen, started again.
+
+Agents and servers are clients of two routers that are joined. Each has a link of its own to each of them
+(`benchmarks.chaos.lossy_link`), is at one of them, and goes to the other one when that is away.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+
+from benchmarks.chaos.agent_process import ENOUGH, FLEET, Orders
+from benchmarks.chaos.lossy_link import Link, Links
+from benchmarks.chaos.schedule import Kind
+from benchmarks.fleet.drives import name_of
+from mapweave.processes import parent_watchdog
+from mapweave.scenarios.children import ChildFailed, free_port
+from synthetic.postgres_server import PostgresServer
+
+SERVERS, ROUTERS, DATABASE = ("s0", "s1"), ("z0", "z1"), "pg"
+INTERVAL = 0.25
+"""Between two steps of a robot, s."""
+SQLITE = "sqlite"
+PATIENCE = 20.0
+"""s for a process to end in order."""
+
+
+class FleetProcesses:
+    """All processes of one run, and their links. A context manager."""
+
+    def __init__(
+        self, folder: Path, agents: int, seed: int, store: str, postgres: PostgresServer | None = None
+    ) -> None:
+        """Choose ports and open the links; nothing runs yet.
+
+        Args:
+            folder: for journals, stores and logs.
+            agents: how many.
+            seed: of what they map.
+            store: "sqlite" for a file for each server, else the URL of the one that both use.
+            postgres: runs it, and may be killed.
+        """
+        self._postgres = postgres
+        self.folder, self._store = folder, store
+        self.agents = tuple(name_of(k) for k in range(agents))
+        self._links_thread = Links().__enter__()
+        self._ports = {name: free_port() for name in ROUTERS}
+        self.links: dict[str, list[Link]] = {
+            name: [self._links_thread.open(self._ports[router]) for router in ROUTERS]
+            for name in (*self.agents, *SERVERS)
+        }
+        self._commands = {name: self._agent(k, seed) for k, name in enumerate(self.agents)}
+        self._commands |= {name: self._server(name) for name in SERVERS}
+        self._commands |= {name: self._router(name) for name in ROUTERS}
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> FleetProcesses:
+        """Nothing runs yet."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End all that runs."""
+        for name in list(self._running):
+            self.kill(name)
+        self._links_thread.__exit__()
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Of the routers themselves."""
+        return tuple(self._endpoint(name) for name in ROUTERS)
+
+    def store_of(self, server: str) -> str:
+        """Path or URL of a server's store."""
+        return str(self.folder / server / f"{server}.sqlite") if self._store == SQLITE else self._store
+
+    def start(self, name: str) -> None:
+        """Start a process, again or for the first time."""
+        if name == DATABASE and self._postgres is not None:
+            self._postgres.start()
+            return
+        with (self.folder / f"{name}.log").open("ab") as output:
+            self._running[name] = subprocess.Popen(
+                self._commands[name], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT,
+                env=parent_watchdog.environment(),
+            )  # fmt: skip
+
+    def kill(self, name: str) -> None:
+        """End a process at once, without a word."""
+        if name == DATABASE and self._postgres is not None:
+            self._postgres.kill()
+            return
+        process = self._running.pop(name)
+        process.kill()
+        process.communicate()
+
+    def end(self, name: str) -> None:
+        """Ask a process to end, and wait.
+
+        Raises:
+            ChildFailed: it does not, or not in order.
+        """
+        process = self._running.pop(name)
+        process.terminate()
+        try:
+            process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise ChildFailed(f"{name} does not end: {self._last_line(name)}") from None
+        if process.returncode:
+            raise ChildFailed(f"{name} ended with status {process.returncode}: {self._last_line(name)}")
+
+    def check(self) -> None:
+        """Raise ChildFailed if a process has ended by itself, other than a robot that is done."""
+        done = (self.folder / ENOUGH).exists()
+        for name, process in self._running.items():
+            status = process.poll()
+            if status is not None and not (done and status == 0 and name in self.agents):
+                raise ChildFailed(f"{name} ended with status {status}: {self._last_line(name)}")
+
+    def done(self) -> bool:
+        """Whether all agents have ended, since all that they have is acknowledged."""
+        return all(self._running[name].poll() == 0 for name in self.agents)
+
+    def stop_mapping(self) -> None:
+        """Tell the agents to end when all is acknowledged."""
+        (self.folder / ENOUGH).touch()
+
+    def begin(self, kind: Kind, target: str) -> None:
+        """Disturb; `end_disturbance` takes it back."""
+        match kind:
+            case Kind.KILL | Kind.LOSE_STORE:
+                self.kill(target)
+            case Kind.STOP:
+                self._signal(target, signal.SIGSTOP)
+            case Kind.HALF:
+                for link in self.links[target]:
+                    self._links_thread.half_close(link)
+        if kind is Kind.LOSE_STORE:
+            path = Path(self.store_of(target))
+            for part in path.parent.glob(f"{path.name}*"):
+                part.unlink()
+        self._shape(target, kind, True)
+
+    def toggle(self, target: str, cut: bool) -> None:
+        """Cut the links of a process, or mend them."""
+        self._shape(target, Kind.CUT, cut)
+
+    def end_disturbance(self, kind: Kind, target: str) -> None:
+        """As it was before."""
+        match kind:
+            case Kind.KILL | Kind.LOSE_STORE:
+                self.start(target)
+            case Kind.STOP:
+                self._signal(target, signal.SIGCONT)
+        self._shape(target, kind, False)
+
+    def _shape(self, target: str, kind: Kind, begins: bool) -> None:
+        def how(link: Link) -> None:
+            match kind:
+                case Kind.CUT | Kind.FLAP:
+                    link.cut = begins
+                case Kind.FROZEN:
+                    link.frozen = begins
+                case Kind.SLOW:
+                    link.delay, link.rate = (0.3, 60e3) if begins else (0.0, float("inf"))
+
+        for link in self.links.get(target, []):
+            self._links_thread.change(link, how)
+
+    def _signal(self, name: str, number: signal.Signals) -> None:
+        if name in self._running:
+            os.kill(self._running[name].pid, number)
+
+    def _last_line(self, name: str) -> str:
+        lines = (self.folder / f"{name}.log").read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it printed nothing"
+
+    def _endpoint(self, name: str) -> str:
+        return f"tcp/127.0.0.1:{self._ports[name]}"
+
+    def _routers_of(self, name: str) -> list[str]:
+        """Half of the fleet has the one router first, half the other."""
+        endpoints = [link.endpoint for link in self.links[name]]
+        return endpoints if name[-1] in "02468" else endpoints[::-1]
+
+    def _agent(self, robot: int, seed: int) -> Sequence[str]:
+        endpoints = tuple(self._routers_of(name_of(robot)))
+        orders = Orders(robot, endpoints, str(self.folder), SERVERS, INTERVAL, seed)
+        return [sys.executable, "-m", "benchmarks.chaos.agent_process", json.dumps(asdict(orders))]
+
+    def _server(self, name: str) -> Sequence[str]:
+        command = [
+            sys.executable, "-m", "mapweave", "server", "--name", name, "--fleet", FLEET,
+            "--data", str(self.folder / name), "--connect", *self._routers_of(name),
+        ]  # fmt: skip
+        return command if self._store == SQLITE else [*command, "--store", self._store]
+
+    def _router(self, name: str) -> Sequence[str]:
+        others = [self._endpoint(other) for other in ROUTERS if other != name]
+        return [
+            sys.executable, "-m", "mapweave", "router", "--fleet", FLEET, "--listen", self._endpoint(name),
+            "--connect", *others,
+        ]  # fmt: skip

@@ -1,0 +1,113 @@
+"""A fleet in one building, its store, the views that lost robots ask about, and a robot that maps on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.change import Change, ChangeBody, NodePut
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import RelocalizeAnswer
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.codec import encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.messages import encode_view
+from mapweave.wire.zenoh_bus import ZenohBus
+from synthetic.building import Building
+
+FLEET = "shards"
+WRONG_M = 0.5
+"""A place that is found this far from where the view was taken is wrong."""
+
+
+class BuildingFleet:
+    """Robots that have mapped a building.
+
+    Attributes:
+        building: with the truth.
+        logs: of each robot.
+        nodes: of all robots.
+    """
+
+    def __init__(self, robots: int, nodes: int, seed: int) -> None:
+        """Draw it.
+
+        Args:
+            robots: how many.
+            nodes: of each.
+            seed: of all.
+        """
+        self.building = Building.draw(robots, nodes, seed)
+        self.logs: list[list[tuple[MapId, ChangeBody]]] = [
+            list(self.building.log(robot)) for robot in range(robots)
+        ]
+        self.nodes = [body.node for log in self.logs for _, body in log if isinstance(body, NodePut)]
+        self._seed = seed
+
+    def write(self, store: Path, robots: Sequence[int]) -> None:
+        """Write the logs of some robots to a store."""
+        store.parent.mkdir(parents=True, exist_ok=True)
+        database = SqliteStore(store)
+        for robot in robots:
+            log = self.logs[robot]
+            map_id = log[0][0]
+            entries = [
+                Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
+                for k, (_, body) in enumerate(log)
+            ]
+            database.apply(map_id, robot + 1, entries, len(entries))
+        database.close()
+
+    def questions(self, count: int) -> list[tuple[bytes, Pose2]]:
+        """Views a little beside nodes, as messages, and where each was taken."""
+        rng = np.random.default_rng([self._seed, 7])
+        made = []
+        for _ in range(count):
+            robot, number = (int(rng.integers(size)) for size in self.building.rooms.shape)
+            offset = Pose2.from_vector(rng.normal(0.0, [0.12, 0.12, 0.1]))
+            view, pose = self.building.view(robot, number, offset, rng)
+            made.append((encode_view(view), pose))
+        return made
+
+    def is_wrong(self, answer: RelocalizeAnswer, pose: Pose2) -> bool:
+        """Whether the best candidate is somewhere else."""
+        best = answer.candidates[0]
+        return (self.building.world_from(best.node) @ best.node_from_robot.mean).distance(pose) > WRONG_M
+
+
+class MappingRobot:
+    """Sends a log, a node at a time, as an agent does."""
+
+    def __init__(self, log: list[tuple[MapId, ChangeBody]], endpoint: str, folder: Path) -> None:
+        """Connect."""
+        self._bus = ZenohBus(BusSettings(endpoints=(endpoint,)))
+        self.agent = log[0][0].agent
+        self._journal = Journal(folder / f"{self.agent}.sqlite", self.agent)
+        self._map = self._journal.open_map(1)
+        assert self._map == log[0][0], self._map
+        self._replicator = Replicator(self._bus, Keys(FLEET), self._journal, self._map, ["s0"])
+        self._left = [body for _, body in log][::-1]
+
+    def map_on(self) -> bool:
+        """Send the next change, if there is one."""
+        if self._left:
+            self._replicator.submit([self._left.pop()], time.time_ns())
+        return bool(self._left)
+
+    def acknowledged(self, timeout: float) -> bool:
+        """Whether the server has all that was sent, within so many seconds."""
+        return self._replicator.wait_acknowledged(timeout)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._replicator.close()
+        self._bus.close()
+        self._journal.close()

@@ -1,0 +1,78 @@
+"""Where other robots are around a robot: a question and its answer, plain values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
+
+from mapweave.hybridmap.limits import Amount, Name, Words
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+
+MAX_STARTS = 8
+MAX_NEARBY = 16
+"""Robots in one answer, nearest first: more do not stand around one robot."""
+
+Size = Annotated[float, Meta(ge=0.0, le=100.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class NearbyRequest:
+    """Which robots are around this one? The server keeps what it says of itself, for the others' questions.
+
+    Attributes:
+        robot: its name.
+        starts: nodes around it, the best first, each with `node_from_robot`. The first that is in the merged
+            map counts: the newest are not merged yet.
+        sigma: standard deviation of its position from there, m.
+        heading_sigma: likewise of its heading, rad.
+        radius: of its footprint, m.
+        height: of its body, m.
+        speed: its limit, m/s.
+    """
+
+    robot: Name
+    starts: Annotated[tuple[tuple[NodeId, Pose2], ...], Meta(max_length=MAX_STARTS)]
+    sigma: Size
+    heading_sigma: Size
+    radius: Size
+    height: Size
+    speed: Annotated[float, Meta(ge=0.0, le=1000.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class NearbyRobot:
+    """Another robot, as it was `age` before the question.
+
+    Attributes:
+        robot: its name.
+        robot_from_other: its pose, seen from the asking robot at the time of the question.
+        sigma: standard deviation of that position, without what it has driven since, m.
+        radius: of its footprint, m.
+        height: of its body, m.
+        speed: its limit, m/s.
+        age: how old this is, s.
+    """
+
+    robot: Name
+    robot_from_other: Pose2
+    sigma: Amount
+    radius: Size
+    height: Size
+    speed: Annotated[float, Meta(ge=0.0, le=1000.0)]
+    age: Amount
+
+
+@dataclass(frozen=True, slots=True)
+class NearbyAnswer:
+    """The other robots of the same component, nearest first.
+
+    Attributes:
+        robots: the others.
+        reason: why there are none, in words; may be empty.
+    """
+
+    robots: Annotated[tuple[NearbyRobot, ...], Meta(max_length=MAX_NEARBY)]
+    reason: Words = ""

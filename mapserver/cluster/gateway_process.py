@@ -1,0 +1,109 @@
+"""Process between a map server and Ray.
+
+    python -m mapweave.mapserver.cluster.gateway_process FD ADDRESS SHARDS
+
+Each shard is an actor that Ray starts again, as often as needed; all belong to this process and end with it.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import sys
+import threading
+from concurrent.futures import Future
+from contextlib import suppress
+from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from mapweave.mapserver.cluster.gateway import WORK
+from mapweave.mapserver.cluster.shard import ShardServer
+from mapweave.mapserver.cluster.work import answer_work
+
+LOOPBACK = "127.0.0.1"
+
+
+def main() -> int:
+    """Hand requests on until the other side closes."""
+    descriptor, address, shards = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+    # The server ends this; Ctrl+C in a terminal reaches both.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    connection = Connection(descriptor)
+    try:
+        ray = _joined(address)
+    except Exception as error:  # noqa: BLE001 - whatever it is, the server says it and tries again
+        connection.send_bytes(pickle.dumps((0, f"{type(error).__name__}: {_words(error)}")))
+        return 1
+    shard = ray.remote(ShardServer).options(max_restarts=-1, num_cpus=0, scheduling_strategy="SPREAD")
+    actors = [shard.remote() for _ in range(shards)]
+    work = ray.remote(answer_work).options(num_cpus=1, max_retries=3, scheduling_strategy="SPREAD")
+    connection.send_bytes(pickle.dumps((int(ray.cluster_resources().get("CPU", 0)), "")))
+    sending = threading.Lock()
+    try:
+        while True:
+            number, target, request = pickle.loads(connection.recv_bytes())
+            sent = work.remote(request) if target == WORK else actors[target].call.remote(request)
+            sent.future().add_done_callback(partial(_reply, connection, sending, number))
+    except (EOFError, OSError):
+        # Not sys.exit: with a head that is gone, Ray waits for it.
+        threading.Timer(5.0, partial(os._exit, 0)).start()
+        ray.shutdown()
+        os._exit(0)
+
+
+def _joined(address: str) -> Any:
+    """Ray, as a driver in the cluster.
+
+    Raises:
+        ConnectionError: there is no cluster.
+    """
+    import ray
+
+    how: dict[str, Any] = {"namespace": "mapweave", "log_to_driver": False, "logging_level": "error"}
+    if address != "auto":
+        if not _listens(address):
+            raise ConnectionError(f"nothing listens at {address}")
+        ray.init(address=address, **how)
+    elif running := _running():
+        ray.init(address=running, **how)
+    else:
+        ray.init(address="local", include_dashboard=False, _node_ip_address=LOOPBACK, **how)
+    return ray
+
+
+def _running() -> str:
+    """Address of the cluster that runs on this machine; empty if none does."""
+    # Ray leaves the address of its last cluster there, and waits two minutes for one that has ended.
+    last = Path(os.environ.get("RAY_TMPDIR", "/tmp"), "ray", "ray_current_cluster")
+    known = [os.environ.get("RAY_ADDRESS", ""), last.read_text().strip() if last.exists() else ""]
+    return next((address for address in known if _listens(address)), "")
+
+
+def _listens(address: str) -> bool:
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), 2.0).close()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _reply(connection: Connection, sending: threading.Lock, number: int, done: Future[bytes]) -> None:
+    """Send an answer, or why there is none."""
+    error = done.exception()
+    reply = (number, done.result(), "") if error is None else (number, b"", _words(error))
+    # The other side may have closed: then this ends, too.
+    with sending, suppress(OSError):
+        connection.send_bytes(pickle.dumps(reply))
+
+
+def _words(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1][:500]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

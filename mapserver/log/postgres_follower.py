@@ -1,0 +1,135 @@
+"""What other servers write to a shared store, and which of them leads."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+import psycopg
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.store import EVERYTHING, News
+from mapweave.storage.postgres_session import RETRY, PostgresAddress, PostgresSession
+
+log = logging.getLogger(__name__)
+
+CHANNEL = "mapweave"
+"""Of the notifications about what has changed."""
+MOST_NOTIFIED = 7000
+"""Bytes; PostgreSQL takes less than 8000 (https://www.postgresql.org/docs/15/sql-notify.html)."""
+LEADER_LOCK = 0x4D575355
+"""Advisory lock of the server that leads: 'MWSU'. Locks are of one database."""
+LOG, RECORD = "log", "record"
+"""With which the words of a notification begin: before the name of a map, and of a record."""
+BEAT = 0.5
+"""s between two signs of life; so often a server tries to lead."""
+FROZEN = "5s"
+"""After so long without a sign of life PostgreSQL ends the session of a leader, and another leads."""
+POLL = 5.0
+"""s between two looks at everything: a notification may be lost with its session."""
+
+
+class PostgresFollower:
+    """A thread with a session of its own, which listens, and holds the lock."""
+
+    def __init__(
+        self,
+        address: PostgresAddress,
+        name: str,
+        own_session: Callable[[], int],
+        changed: Callable[[News], None],
+    ) -> None:
+        """Begin to follow.
+
+        Args:
+            address: of the database.
+            name: of the server.
+            own_session: PostgreSQL's number of the session with which this server writes.
+            changed: called from the thread with what others have written; at the start, at least every few
+                seconds, and before this server leads, with everything.
+        """
+        self._own_session, self._changed = own_session, changed
+        self._session = PostgresSession(
+            address, f"mapweave {name} follows", {"idle_session_timeout": FROZEN}, prepare=self._listen
+        )
+        self._leads = False
+        self._failure = ""
+        self._polled_at = 0.0
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="follow", daemon=True)
+        self._thread.start()
+
+    @property
+    def leads(self) -> bool:
+        """Whether this server holds the lock, as far as it knows."""
+        return self._leads
+
+    def close(self) -> None:
+        """Stop; another server may lead at once. Idempotent."""
+        self._stopping.set()
+        self._thread.join()
+        self._session.close()
+
+    def _listen(self, connection: psycopg.Connection) -> None:
+        connection.execute(f"LISTEN {CHANNEL}")
+        # What was written before is not notified.
+        self._polled_at = 0.0
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                with self._session.guard():
+                    self._follow(self._session.connection)
+                self._failure = ""
+            except InvalidFile as error:
+                self._leads = False
+                if str(error) != self._failure:
+                    log.warning("%s", error)
+                self._failure = str(error)
+                self._stopping.wait(RETRY)
+            except Exception:  # a defect with one piece of news must not end all following
+                log.exception("what other servers have written could not be followed")
+                self._stopping.wait(RETRY)
+
+    def _follow(self, connection: psycopg.Connection) -> None:
+        """Once: try to lead, then wait for news."""
+        # Also while it is held, which changes nothing: it is the sign of life.
+        row = connection.execute("SELECT pg_try_advisory_lock(%s)", (LEADER_LOCK,)).fetchone()
+        holds = bool(row and row[0])
+        if holds and not self._leads:
+            self._look_at_everything()
+            log.info("%s: this server leads", self._session.address.words)
+        self._leads = holds
+        if time.monotonic() >= self._polled_at + POLL:
+            self._look_at_everything()
+        notified = [*connection.notifies(timeout=BEAT, stop_after=1)]
+        words = [one.payload for one in notified if one.pid != self._own_session()]
+        if words:
+            self._changed(_news(words))
+
+    def _look_at_everything(self) -> None:
+        self._changed(EVERYTHING)
+        self._polled_at = time.monotonic()
+
+
+def words_of(touched: list[str]) -> str:
+    """A notification's text; empty: everything may have changed."""
+    words = " ".join(touched)
+    return words if len(words.encode()) < MOST_NOTIFIED else ""
+
+
+def _news(payloads: list[str]) -> News:
+    if "" in payloads:
+        return EVERYTHING
+    maps, records = set[MapId](), set[str]()
+    for word in (word for payload in payloads for word in payload.split(" ")):
+        kind, _, value = word.partition(":")
+        if kind == LOG:
+            agent, _, epoch = value.rpartition(".")
+            maps.add(MapId(agent, int(epoch)))
+        else:
+            records.add(value)
+    return News(frozenset(maps), frozenset(records))

@@ -1,0 +1,120 @@
+"""A real PostgreSQL server: in a folder of its own, on a Unix socket, as a user that may."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import time
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+ROLE = "mapweave"
+NEEDED = ("initdb", "postgres")
+STARTS = 60.0
+"""s in which it takes connections."""
+
+
+@cache
+def binaries() -> Path | None:
+    """The folder of PostgreSQL's programs: of Debian's packages, or of the PyPI package pgserver."""
+    debian = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
+    found = shutil.which("postgres")
+    folders = [*reversed(debian), *([Path(found).resolve().parent] if found else [])]
+    spec = find_spec("pgserver")
+    folders += [Path(place) / "pginstall/bin" for place in (spec and spec.submodule_search_locations) or ()]
+    return next((one for one in folders if all((one / name).exists() for name in NEEDED)), None)
+
+
+class PostgresServer:
+    """One cluster with its own processes."""
+
+    def __init__(self, folder: Path, *options: str, make: bool = True) -> None:
+        """Make a cluster, unless one is in the folder, and start it.
+
+        Args:
+            folder: for all it has; short, since a socket's path is.
+            options: for `postgres`.
+            make: with `initdb`.
+        """
+        self.folder, self.data, self._options = folder, folder / "data", options
+        self._count = 0
+        # PostgreSQL refuses to run as root.
+        name = "postgres" if "postgres" in {user.pw_name for user in pwd.getpwall()} else "daemon"
+        self.user = name if os.geteuid() == 0 else None
+        if self.user:
+            os.chown(folder, pwd.getpwnam(name).pw_uid, pwd.getpwnam(name).pw_gid)
+        if make:
+            self.run(
+                "initdb", "-D", str(self.data), "-U", ROLE, "--auth=trust", "--no-sync", "--data-checksums",
+                "--encoding=UTF8", "--locale=C",
+            )  # fmt: skip
+        self.start()
+
+    def run(self, program: str, *arguments: str) -> str:
+        """One of PostgreSQL's programs, as the server's user; returns what it prints."""
+        found = binaries()
+        assert found is not None
+        done = subprocess.run(
+            [found / program, *arguments], user=self.user, cwd=self.folder, env=self._environment(),
+            capture_output=True, text=True, check=False, timeout=120,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{program}: {done.stderr}"
+        return done.stdout
+
+    def start(self) -> None:
+        """Start it, and wait until it takes connections."""
+        found = binaries()
+        assert found is not None
+        with (self.folder / "log").open("ab") as log:
+            self.process = subprocess.Popen(
+                [found / "postgres", "-D", self.data, "-k", self.folder, "-c", "listen_addresses=",
+                 "-c", "fsync=off", *self._options],
+                user=self.user, cwd=self.folder, env=self._environment(), stdout=log, stderr=log,
+                start_new_session=True,
+            )  # fmt: skip
+        end = time.monotonic() + STARTS
+        while not self._ready():
+            assert time.monotonic() < end, (self.folder / "log").read_text()
+            time.sleep(0.02)
+
+    def kill(self) -> None:
+        """As a loss of power ends it."""
+        os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+    def stop(self) -> None:
+        """End it, and all sessions."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            self.process.wait(60)
+
+    def address(self, database: str = "postgres") -> str:
+        """Of a database."""
+        return f"postgresql://{ROLE}@/{database}?host={self.folder}"
+
+    def database(self) -> str:
+        """The address of a new one."""
+        import psycopg
+
+        self._count += 1
+        name = f"store_{self._count}"
+        with psycopg.connect(self.address(), autocommit=True) as connection:
+            connection.execute(f"CREATE DATABASE {name}")
+        return self.address(name)
+
+    def _environment(self) -> dict[str, str]:
+        return {"PATH": os.environ["PATH"], "LC_ALL": "C", "PGHOST": str(self.folder), "PGUSER": ROLE}
+
+    def _ready(self) -> bool:
+        import psycopg
+
+        assert self.process.poll() is None, (self.folder / "log").read_text()
+        try:
+            psycopg.connect(self.address(), connect_timeout=10).close()
+        except psycopg.OperationalError:
+            return False
+        return True

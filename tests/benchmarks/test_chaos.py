@@ -1,0 +1,161 @@
+"""The benchmark that kills: whether its account finds what is lost, and a short run of the whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from benchmarks.chaos.account import Account, BrokenLog, account, sent_changes
+from benchmarks.chaos.agent_process import STAMP, digest
+from benchmarks.chaos.recovery import NEVER, RobotTimes, recoveries
+from benchmarks.chaos.schedule import KILLS, LEAST_KILLS, Kind, draw_schedule
+from benchmarks.chaos.scripted_robot import ScriptedRobot
+from mapweave.agent.replication.journal import Journal
+from mapweave.hybridmap.change import Change
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.wire.codec import element_of, encode_change
+
+STEPS = 40
+GROUPS = (("r0", "r1"), ("s0", "s1"), ("z0", "z1"))
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> tuple[list[Change], Journal, SqliteStore]:
+    """A robot's log, its journal, and a store that has it all."""
+    script = ScriptedRobot(0, 5)
+    journal, store = Journal(tmp_path / "r0.sqlite", "r0"), SqliteStore(tmp_path / "s0.sqlite")
+    journal.open_map(1)
+    lines, head = [], 0
+    for step in range(1, STEPS + 1):
+        bodies = script.step()
+        head += len(journal.append(script.map, bodies, step * STAMP))
+        lines += [f"T {step} {len(bodies)} {digest(bodies)}", f"C {step} {head} {step / 10}"]
+    (tmp_path / "r0.truth").write_text("\n".join(lines))
+    sent = sent_changes(tmp_path, 0, 5)
+    entries = [Entry.read(script.map, one.sequence, encode_change(one)) for one in sent]
+    store.apply(script.map, journal.log_id(script.map), entries)
+    return sent, journal, store
+
+
+def changed(store: SqliteStore, path: Path, sql: str) -> SqliteStore:
+    """The store after something was done to it behind its back."""
+    store.close()
+    disk = sqlite3.connect(path)
+    disk.execute(sql)
+    disk.commit()
+    disk.close()
+    return SqliteStore(path)
+
+
+def test_all_that_was_sent_is_stored(fleet: tuple[list[Change], Journal, SqliteStore]) -> None:
+    sent, journal, store = fleet
+    assert len(sent) > STEPS
+    assert account(sent, journal, [store]) == Account(sent=len(sent), stored=len(sent))
+
+
+def test_what_a_store_lacks_is_lost(fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path) -> None:
+    sent, journal, store = fleet
+    newest = {element_of(one.body): one.sequence for one in sent}
+    final = max(newest.values())
+    lacking = changed(store, tmp_path / "s0.sqlite", f"DELETE FROM change WHERE sequence = {final}")
+    found = account(sent, journal, [lacking])
+    assert (found.lost, found.stored, found.maps_equal) == (1, len(sent) - 1, False)
+
+
+def test_what_a_robot_has_dropped_since_it_was_undone_is_not_lost(
+    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
+) -> None:
+    sent, journal, store = fleet
+    journal.acknowledge("s0", sent[0].map, len(sent))
+    dropped = journal.prune(sent[0].map, ["s0"])
+    assert dropped > 0
+    kept = {one.sequence for one in journal.changes(sent[0].map, 1, len(sent))}
+    gone = ", ".join(str(one.sequence) for one in sent if one.sequence not in kept)
+    lacking = changed(store, tmp_path / "s0.sqlite", f"DELETE FROM change WHERE sequence IN ({gone})")
+    found = account(sent, journal, [lacking])
+    assert (found.lost, found.undone, found.maps_equal) == (0, dropped, True)
+
+
+def test_what_is_twice_or_elsewhere_is_counted(
+    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
+) -> None:
+    sent, journal, store = fleet
+    # As if the last change had been taken twice, the second time under the next number.
+    twice = Entry.read(sent[0].map, len(sent) + 1, encode_change(replace(sent[-1], sequence=len(sent) + 1)))
+    store.apply(sent[0].map, journal.log_id(sent[0].map), [twice])
+    found = account(sent, journal, [store])
+    assert (found.duplicated, found.out_of_order, found.lost) == (1, 1, 0)
+
+
+def test_a_journal_that_forgot_a_committed_change_has_lost_it(
+    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
+) -> None:
+    sent, journal, store = fleet
+    journal.close()
+    disk = sqlite3.connect(tmp_path / "r0.sqlite")
+    disk.execute(f"DELETE FROM change WHERE sequence = {len(sent)}")
+    disk.commit()
+    disk.close()
+    assert account(sent, Journal(tmp_path / "r0.sqlite"), [store]).lost == 1
+
+
+def test_a_log_that_contradicts_itself_is_no_measure(
+    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
+) -> None:
+    del fleet
+    path = tmp_path / "r0.truth"
+    path.write_text(path.read_text().replace(" 2 ", " 1 ", 1))
+    with pytest.raises(BrokenLog):
+        sent_changes(tmp_path, 0, 5)
+
+
+def test_recovery_ends_with_the_last_acknowledgement(tmp_path: Path) -> None:
+    (tmp_path / "r0.truth").write_text("C 1 1 10.0\nC 2 3 11.0\nC 3 4 20.0\n")
+    (tmp_path / "r0.acks").write_text("s0 1 10.1\ns0 3 14.5\ns1 3 11.5\ns0 4 20.1\ns1 4 20.2\n")
+    robots = [RobotTimes(tmp_path, "r0")]
+
+    def took(end: float, kind: Kind = Kind.KILL, target: str = "s0") -> float:
+        return recoveries(robots, ("s0", "s1"), [(end, kind, target)])[0]
+
+    assert took(12.0) == pytest.approx(2.5), "s0 has the third change at 14.5"
+    assert took(15.0) == 0.0
+    # What a server had before its store was deleted does not count.
+    assert took(15.0, Kind.LOSE_STORE, "s1") == pytest.approx(5.2)
+    assert took(21.0, Kind.LOSE_STORE, "s1") == NEVER
+
+
+def test_a_schedule_is_that_of_its_seed_and_kills_often_enough() -> None:
+    def draw(seed: int) -> list[object]:
+        return list(draw_schedule(10.0, GROUPS, seed, True))
+
+    assert draw(1) == draw(1) != draw(2)
+    for seed in range(20):
+        schedule = draw_schedule(60.0, GROUPS, seed, True)
+        assert sum(one.kind in KILLS for one in schedule) >= LEAST_KILLS
+        for name in ("r0", "s1", "z0"):
+            mine = [one for one in schedule if one.target == name]
+            assert mine and all(a.at + a.lasts <= b.at for a, b in pairwise(mine))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_nothing_is_lost_in_a_short_chaos() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "benchmarks.chaos", "--agents", "2", "--seconds", "10", "--json"],
+        capture_output=True, text=True, env=dict(os.environ),
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    report = json.loads(ran.stdout.splitlines()[-1])
+    assert report["kills"] >= LEAST_KILLS and report["lost_stores"] > 0
+    assert report["sent"] == report["stored"] + report["undone"] > 100
+    assert (report["lost"], report["duplicated"], report["out_of_order"]) == (0, 0, 0)
+    assert report["maps_equal"] is True

@@ -1,0 +1,91 @@
+"""The plan for many robots: its constants measured again, and its sums by another way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks.figures import scale
+from benchmarks.figures.measurements import MEASUREMENTS
+from benchmarks.figures.results import Result, load
+from benchmarks.figures.scale import Costs, Plan, scale_page
+from benchmarks.fleet.drives import drive
+from mapweave.hybridmap.agent_status import AgentStatus, Status
+from mapweave.hybridmap.change import Change, EdgePut
+from mapweave.hybridmap.drive_statistics import DriveStatistics
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.wire.codec import encode_change
+from mapweave.wire.messages import encode, encode_view
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[str, Result]:
+    return {name: load(name) for name in MEASUREMENTS if name != "fleet"}
+
+
+def test_bytes_are_those_of_today(tmp_path: Path) -> None:
+    node = NodeId("r0", 3, 17)
+    doing = Status(
+        "driving to the goal", "3 nodes to go", 17, 40, Pose2(1.25, -2.0, 0.5), False, "goto", node,
+        Pose2(0.1, 0.0, 0.25), 5, progress=0.25, tally=DriveStatistics(4, 1, 1, 0),
+        covariance=(0.25, 0.0, 0.25, 0.0625),
+    )  # fmt: skip
+    order = MissionOrder("7f3a9c", "r0", MissionKind.GO, 1_700_000_000_123_456_789, "anna", node, "kitchen")
+    status = AgentStatus(doing, 1_700_000_000_123_456_789, "r0", 3, 2, 123_456, True, 15, battery=0.75)
+    size = len(encode(status))
+    assert (
+        size
+        <= scale.STATUS_BYTES
+        <= len(encode(replace(status, mission=MissionReport(order, MissionState.RUNNING, 0.25))))
+    )
+    store, nodes, edges = SqliteStore(tmp_path / "s.sqlite"), 0, []
+    for robot in range(4):
+        tour, map_id, entries = drive(robot, 20, 731), MapId(f"r{robot}", 1), []
+        for body in (body for stop in tour.changes for body in stop):
+            message = encode_change(Change(map_id, len(entries) + 1, 10**18, body))
+            entries.append(Entry.read(map_id, len(entries) + 1, message))
+            edges += [len(message)] * isinstance(body, EdgePut)
+        nodes += len(tour.changes)
+        store.apply(map_id, 7, entries)
+    store.close()
+    assert (tmp_path / "s.sqlite").stat().st_size / nodes == pytest.approx(scale.DISK_BYTES, rel=0.2)
+    assert sum(edges) / len(edges) == pytest.approx(scale.EDGE_BYTES, rel=0.1)
+    assert len(encode_view(tour.view)) == pytest.approx(scale.QUESTION_BYTES, rel=0.1)
+
+
+def test_the_sums_are_those_of_simulated_minutes(results: dict[str, Result]) -> None:
+    """One robot after the other, minute by minute, instead of by rates."""
+    costs = Costs.of(results)
+    plan = Plan.of(costs)
+    robots, minutes = scale.ROBOTS // scale.SITES, 60 * 24
+    sent, nodes, answers = 0.0, 0, 0
+    for robot in range(robots):
+        maps = robot < robots * scale.MAPPING
+        per_minute = 60 / scale.NODE_EVERY if maps else 0
+        sent += per_minute * (costs.node_bytes + scale.EDGE_BYTES + 2 * scale.FRAME_BYTES)
+        sent += 120 * (scale.STATUS_BYTES + scale.FRAME_BYTES) + scale.QUESTION_BYTES + scale.FRAME_BYTES
+        nodes += int(per_minute) * minutes
+        answers += minutes
+    assert plan.robot_bps == pytest.approx(sent / robots / 60)
+    assert plan.disk_day == pytest.approx(nodes * scale.DISK_BYTES)
+    assert plan.answer_cores == pytest.approx(answers * costs.answer_s / 86_400)
+    assert plan.compare_cores == pytest.approx(nodes * costs.compare_s / 86_400)
+    assert plan.memory > plan.nodes * costs.kept_bytes > 0
+
+
+def test_a_stored_result_of_fleets_takes_the_place_of_the_small_one(results: dict[str, Result]) -> None:
+    row = {"server_cpu": 0.5, "router_cpu": 0.1, "ack_p99_ms": 90.0}
+    figures = {
+        "agents": {"50": row, "1000": {**row, "ack_p99_ms": 400.0}, "2000": {**row, "ack_p99_ms": 9e3}}
+    }
+    costs = Costs.of({**results, "fleet": replace(results["life"], figures=figures)})
+    assert (costs.agents, costs.carried) == (2000, 1000)
+    assert costs.link_s == pytest.approx(0.6 / 2000)
+    page = scale_page({**results, "fleet": replace(results["life"], figures=figures)})
+    assert "| front servers | robots over that | 10 |" in page

@@ -1,0 +1,66 @@
+"""The way to the cluster: answers, failures, and a process that dies, with a process that is not Ray's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.mapserver.cluster import gateway as gateway_module
+from mapweave.mapserver.cluster.gateway import WORK, ClusterGone, Gateway
+from tests.waiting import eventually
+
+
+@contextmanager
+def gateway(monkeypatch: pytest.MonkeyPatch, address: str = "here") -> Iterator[Gateway]:
+    monkeypatch.setattr(gateway_module, "PROCESS", "tests.mapserver.cluster.echo_process")
+    monkeypatch.setattr(gateway_module, "FIRST_PAUSE", 0.05)
+    opened = Gateway(address, 3)
+    opened.start()
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def test_requests_are_answered_and_failures_have_their_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    with gateway(monkeypatch) as opened:
+        eventually(lambda: opened.workers == 3)
+        answers = [opened.ask(k, b"%d" % k) for k in range(3)]
+        assert [answer.result(10.0) for answer in answers] == [b"0 0", b"1 1", b"2 2"]
+        assert opened.ask(WORK, b"work").result(10.0) == b"-1 work"
+        with pytest.raises(MapweaveError, match="it failed"):
+            opened.ask(0, b"fail").result(10.0)
+
+
+def test_what_a_dead_process_was_asked_fails_at_once_and_another_is_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with gateway(monkeypatch) as opened:
+        eventually(lambda: opened.workers)
+        waiting = [opened.ask(0, b"silence"), opened.ask(0, b"die")]
+        for answer in waiting:
+            with pytest.raises(ClusterGone):
+                answer.result(10.0)
+        eventually(lambda: opened.workers)
+        assert opened.ask(1, b"again").result(10.0) == b"1 again"
+
+
+def test_a_cluster_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway_module, "SILENCE", 0.5)
+    with gateway(monkeypatch) as opened:
+        eventually(lambda: opened.workers)
+        with pytest.raises(ClusterGone):
+            opened.ask(0, b"silence").result(10.0)
+
+
+def test_without_a_cluster_every_request_fails_at_once_and_the_log_says_why(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with gateway(monkeypatch, "nowhere") as opened:
+        eventually(lambda: "nothing listens at nowhere" in caplog.text)
+        assert opened.workers == 0
+        with pytest.raises(ClusterGone):
+            opened.ask(0, b"hello").result(0.0)

@@ -1,0 +1,216 @@
+"""Several servers on one store: all have everything, exactly once and in order; one leads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import psycopg
+import pytest
+
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.content_hash import content_hash
+from mapweave.mapserver.explainer import ConstraintRecord
+from mapweave.mapserver.log import postgres_follower
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.postgres_store import PostgresStore
+from mapweave.mapserver.server import MapServer
+from mapweave.opened_map import open_map
+from mapweave.wire.codec import encode_change
+from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
+from tests.mapserver.log.acknowledged_fleet import AGENT, KEYS, ROBOTS, SERVER, life
+from tests.postgres import PostgresServer, started
+from tests.waiting import eventually
+
+Log = list[tuple[int, bytes]]
+
+
+class FrontServer:
+    """An ingest on the shared store."""
+
+    def __init__(self, hub: MemoryHub, address: str, name: str) -> None:
+        self.seen: list[Change] = []
+        self.bus = MemoryBus(hub)
+        self.store = PostgresStore(address, name)
+        self.ingest = Ingest(self.bus, KEYS, self.store, name, self.seen.append, SERVER)
+        self.store.follow(self.ingest.follow)
+
+    def close(self) -> None:
+        self.ingest.close()
+        self.bus.close()
+        self.store.close()
+
+    def logs(self) -> dict[MapId, Log]:
+        """What was passed on, in this order."""
+        logs: dict[MapId, Log] = {}
+        for change in self.seen:
+            logs.setdefault(change.map, []).append((change.sequence, encode_change(change)))
+        return logs
+
+
+@pytest.fixture
+def address(postgres: PostgresServer) -> str:
+    return postgres.database()
+
+
+@pytest.fixture
+def journals(tmp_path: Path) -> Iterator[list[Journal]]:
+    journals = [Journal(tmp_path / name, name) for name in ROBOTS]
+    yield journals
+    for journal in journals:
+        journal.close()
+
+
+def logs_of(journals: list[Journal]) -> dict[MapId, Log]:
+    """All that the robots have."""
+    return {
+        m: [(change.sequence, encode_change(change)) for change in journal.changes(m, 1, journal.head(m))]
+        for journal in journals
+        for m in journal.maps()
+    }
+
+
+@pytest.mark.parametrize("poll", [1000.0, 0.1], ids=["notified", "polled"])
+def test_all_servers_pass_on_everything_once_and_in_order(
+    address: str, journals: list[Journal], monkeypatch: pytest.MonkeyPatch, poll: float
+) -> None:
+    """Two hear the robots over bad links; a third hears nothing, and a fourth begins late."""
+    monkeypatch.setattr(postgres_follower, "POLL", poll)
+    if poll < 1.0:
+        monkeypatch.setattr(PostgresStore, "_notify", lambda store, connection: None)
+    rng = np.random.default_rng(3)
+    hub = MemoryHub()
+    servers = [FrontServer(hub, address, "s0"), FrontServer(hub, address, "s1")]
+    servers.append(FrontServer(MemoryHub(), address, "s2"))
+    robots = []
+    for journal in journals:
+        map_id = journal.open_map(1)
+        bus = MemoryBus(hub)
+        hub.disturb(Faults(drop=0.2, double=0.2, delay=0.2), rng, bus)
+        robot = Replicator(bus, KEYS, journal, map_id, ("s0", "s1"), AGENT)
+        robots.append(robot)
+        for stamp, body in enumerate(life(map_id, rng, 16)):
+            robot.submit([body], stamp)
+    late = FrontServer(MemoryHub(), address, "s3")
+    servers.append(late)
+    for robot in robots:
+        assert robot.wait_acknowledged(30)
+    expected = logs_of(journals)
+    for server in servers:
+        eventually(lambda server=server: len(server.seen) >= sum(map(len, expected.values())))
+        assert server.logs() == expected
+    for robot in robots:
+        robot.close()
+    for server in servers:
+        server.close()
+
+
+def test_what_one_server_acknowledges_counts_for_all_with_its_store(
+    address: str, journals: list[Journal]
+) -> None:
+    hub = MemoryHub()
+    servers = [FrontServer(hub, address, name) for name in ("s0", "s1")]
+    journal = journals[0]
+    map_id = journal.open_map(1)
+    robot = Replicator(MemoryBus(hub), KEYS, journal, map_id, ("s0",), AGENT)
+    bodies = life(map_id, np.random.default_rng(3), 20)
+    robot.submit(bodies[:9], 1)
+    assert robot.wait_acknowledged(30)
+    servers[0].close()
+    robot.submit(bodies[9:], 2)
+    assert robot.wait_acknowledged(30), "s1 has the same store"
+    assert journal.acknowledged(map_id)["s0"] == len(bodies)
+    robot.close()
+    servers[1].close()
+
+
+def test_one_server_leads_and_another_when_it_is_gone(address: str, postgres: PostgresServer) -> None:
+    stores = [PostgresStore(address, name) for name in ("s0", "s1")]
+    assert not any(store.leads for store in stores)
+    for store in stores:
+        store.follow(lambda news: None)
+    eventually(lambda: sum(store.leads for store in stores) == 1)
+    (leader,) = (store for store in stores if store.leads)
+    (other,) = (store for store in stores if not store.leads)
+    # As where its machine loses its power: PostgreSQL ends its session.
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name = %s",
+            (f"mapweave {'s0' if leader is stores[0] else 's1'} follows",),
+        )
+    eventually(lambda: sum(store.leads for store in stores) == 1 and (leader.leads or other.leads))
+    (leader,) = (store for store in stores if store.leads)
+    (other,) = (store for store in stores if store is not leader)
+    leader.close()
+    eventually(lambda: other.leads)
+    other.close()
+
+
+@pytest.mark.slow
+def test_decisions_on_one_server_reach_the_other(
+    address: str, journals: list[Journal], tmp_path: Path
+) -> None:
+    hub = MemoryHub()
+    servers = [
+        MapServer(MemoryBus(hub), KEYS, address, name, cache=tmp_path / name).__enter__()
+        for name in ("s0", "s1")
+    ]
+    rng = np.random.default_rng(3)
+    for journal in journals:
+        map_id = journal.open_map(1)
+        robot = Replicator(MemoryBus(hub), KEYS, journal, map_id, ("s0", "s1"), AGENT)
+        robot.submit(life(map_id, rng, 20), 1)
+        assert robot.wait_acknowledged(30)
+        robot.close()
+    apart = ManualConstraint(Apart((MapId("r0", 1), MapId("r1", 1))), True, "anna", 1, "two kitchens")
+    with closing(PostgresStore(address)) as store:
+        ConstraintRecord(store).add(apart)
+    for server in servers:
+        eventually(lambda server=server: len(server.constraints().made) == 1)
+        assert server.settle(60)
+    nodes = [sorted(server.merged().poses) for server in servers]
+    assert nodes[0] == nodes[1] and nodes[0]
+    eventually(lambda: sum(bool(server.status()["leads"]) for server in servers) == 1)
+    before = content_hash(open_map(address).content)
+    for server in servers:
+        server.__exit__(None, None, None)
+    assert content_hash(open_map(address).content) == before
+
+
+def test_robots_keep_what_they_have_while_postgresql_is_away(journals: list[Journal]) -> None:
+    """Also a robot that the server has not known before."""
+    servers = started()
+    postgres = next(servers)
+    hub = MemoryHub()
+    server = FrontServer(hub, postgres.database(), "s0")
+    rng = np.random.default_rng(3)
+    maps = [journal.open_map(1) for journal in journals]
+    robots = [
+        Replicator(MemoryBus(hub), KEYS, journal, map_id, ("s0",), AGENT)
+        for journal, map_id in zip(journals, maps, strict=True)
+    ]
+    robots[0].submit(life(maps[0], rng, 10), 1)
+    assert robots[0].wait_acknowledged(30)
+    postgres.kill()
+    for robot, map_id in zip(robots, maps, strict=True):
+        robot.submit(life(map_id, rng, 10), 2)
+    eventually(lambda: "the map store cannot be used" in server.ingest.failure)
+    asked = MemoryBus(hub)
+    (answer,) = asked.ask(KEYS.ack("s0", "r1"), b"", 10.0)
+    assert "the map store cannot be used" in answer.error, "it cannot know which maps there are"
+    assert not any(robot.wait_acknowledged(0.0) for robot in robots)
+    postgres.start()
+    for robot in robots:
+        assert robot.wait_acknowledged(60)
+    assert server.logs() == logs_of(journals)
+    for robot in robots:
+        robot.close()
+    server.close()
+    servers.close()

@@ -1,0 +1,88 @@
+"""The log as JSON: each line of real processes is an object, with what a message names as fields."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.json_log import JsonFormatter
+from mapweave.wire.log_messages import Mark
+from mapweave.wire.memory import MemoryHub
+from tests.mapserver.played import KEYS, MAP, HandAgent, Server
+from tests.waiting import eventually, free_port
+
+
+@pytest.fixture
+def lines() -> Iterator[io.StringIO]:
+    """Of a logger tree with this format."""
+    handler = logging.StreamHandler(stream := io.StringIO())
+    handler.setFormatter(JsonFormatter(robot="r9"))
+    logger = logging.getLogger("mapweave.mapserver")
+    logger.addHandler(handler)
+    yield stream
+    logger.removeHandler(handler)
+
+
+def objects(text: str) -> list[dict[str, str]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_a_refused_change_names_its_map_and_robot(lines: io.StringIO, tmp_path: Path) -> None:
+    hub = MemoryHub()
+    server, agent = Server(hub, tmp_path / "s0.sqlite"), HandAgent(hub)
+    agent.serve(1, lambda asked: agent.answer(asked))
+    agent.log[1] = b"\xc1"
+    agent.bus.publish(KEYS.change(MAP), b"\xc1", Mark(1, agent.log_id).encode())
+    eventually(lambda: "refused" in lines.getvalue())
+    server.end()
+    (line,) = [line for line in objects(lines.getvalue()) if "refused" in line["message"]]
+    assert (line["level"], line["logger"]) == ("warning", "mapweave.mapserver.log.ingest")
+    assert (line["map"], line["robot"]) == ("r0.3", "r0")
+    assert abs(datetime.fromisoformat(line["time"]) - datetime.now(UTC)) < timedelta(minutes=10)
+
+
+def test_fields_are_those_of_the_message_and_those_that_are_given(lines: io.StringIO) -> None:
+    log = logging.getLogger("mapweave.mapserver.test")
+    log.warning("two\nlines of %s and %s", NodeId("r0", 1, 7), MapId("r1", 2), extra={"reason": "ünknown"})
+    log.warning("100 % of nothing")
+    try:
+        raise ValueError("cause")
+    except ValueError:
+        log.exception("failed")
+    first, second, third = objects(lines.getvalue())
+    assert first["message"] == "two lines of r0.1.7 and r1.2"
+    assert (first["node"], first["map"], first["robot"], first["reason"]) == (
+        "r0.1.7",
+        "r0.1",
+        "r0",
+        "ünknown",
+    )
+    assert second["robot"] == "r9" and "map" not in second
+    assert "ValueError: cause" in third["exception"] and third["level"] == "error"
+
+
+def test_every_line_of_a_process_is_an_object_also_its_last(tmp_path: Path) -> None:
+    port = free_port()
+    words = [sys.executable, "-m", "mapweave", "router", "--listen", f"tcp/127.0.0.1:{port}"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "cwd": tmp_path}
+    with subprocess.Popen([*words, "--log-format", "json"], **pipes) as router:
+        assert router.stdout is not None
+        try:
+            first = router.stdout.readline()
+            again = subprocess.run([*words, "--log-format", "json"], **pipes, check=False)
+        finally:
+            router.send_signal(signal.SIGTERM)
+            rest = router.communicate(timeout=30)[0]
+    (listens, *_), (fails,) = objects(first + rest), objects(again.stdout)
+    assert (listens["level"], listens["message"]) == ("info", f"router listens at tcp/127.0.0.1:{port}")
+    assert again.returncode == 1 and fails["level"] == "error" and str(port) in fails["message"]

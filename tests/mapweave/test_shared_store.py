@@ -1,0 +1,153 @@
+"""Servers on one PostgreSQL as people run them: killed, and restored from a backup."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import psycopg
+import pytest
+
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.cli import main
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.mapserver.content_hash import content_hash
+from mapweave.mapserver.log.postgres_store import PostgresStore
+from mapweave.opened_map import open_map
+from mapweave.scenarios.children import Children, free_port
+from mapweave.wire.bus import Bus
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.codec import encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import Scalar, decode_record
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.zenoh_bus import ZenohBus
+from tests.mapserver.log.acknowledged_fleet import AGENT, life
+from tests.mapserver.log.test_front_servers import FrontServer, logs_of
+from tests.mapweave.test_map_commands import logs
+from tests.postgres import PostgresServer, binaries
+from tests.waiting import eventually
+
+KEYS = Keys("fleet")
+PATIENCE = 120.0
+
+
+def robot_of(folder: Path, bus: Bus, bodies: list[ChangeBody], name: str) -> tuple[Journal, Replicator]:
+    """A robot that sends a map."""
+    journal = Journal(folder / name, name)
+    replicator = Replicator(bus, KEYS, journal, journal.open_map(1), ("s0",), AGENT)
+    replicator.submit(bodies, 1)
+    return journal, replicator
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_either_of_two_servers_may_be_killed(
+    postgres: PostgresServer, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    address = postgres.database()
+    ports = {"s0": free_port(), "s1": free_port()}
+    endpoints = {name: f"tcp/127.0.0.1:{port}" for name, port in ports.items()}
+    maps = list(logs().values())
+    with Children(tmp_path / "logs") as children:
+
+        def start(name: str) -> None:
+            other = endpoints["s1" if name == "s0" else "s0"]
+            children.start(
+                name,
+                ["server", "--fleet", "fleet", "--name", name, "--store", address,
+                 "--data", str(tmp_path / name), "--listen", endpoints[name], "--connect", other],
+            )  # fmt: skip
+
+        for name in ports:
+            start(name)
+        bus = ZenohBus(BusSettings(mode="client", endpoints=tuple(endpoints.values())))
+
+        def status(name: str) -> Mapping[str, Scalar]:
+            replies = bus.ask(KEYS.server_status(name), b"", 5.0)
+            return next((decode_record(reply.payload) for reply in replies if not reply.error), {})
+
+        eventually(lambda: sum(bool(status(name).get("leads")) for name in ports) == 1, PATIENCE)
+        robots = [robot_of(tmp_path, bus, maps[0], "r0")]
+        assert robots[0][1].wait_acknowledged(PATIENCE)
+        (leader,) = (name for name in ports if status(name)["leads"])
+        (other,) = ports.keys() - {leader}
+        # In the middle of another robot's map.
+        robots.append(robot_of(tmp_path, bus, maps[1][:3], "r1"))
+        os.kill(children.pid(leader), signal.SIGKILL)
+        robots[1][1].submit(maps[1][3:], 1)
+        robots.append(robot_of(tmp_path, bus, maps[2], "r2"))
+        eventually(lambda: status(other).get("leads"), PATIENCE)
+        eventually(lambda: status(other).get("nodes") == 12 and status(other)["components"] == 2, PATIENCE)
+        children.end(leader)
+        start(leader)
+        for _, replicator in robots:
+            assert replicator.wait_acknowledged(PATIENCE)
+        eventually(lambda: status(leader).get("components") == 2 and status(leader)["settled"], PATIENCE)
+        assert (status(leader)["leads"], status(other)["leads"]) == (False, True)
+        for _, replicator in robots:
+            replicator.close()
+        bus.close()
+    journals = [journal for journal, _ in robots]
+    with closing(PostgresStore(address, read_only=True)) as store:
+        stored = {m: [(c.sequence, encode_change(c)) for c in store.replay(m)] for m in store.maps()}
+    assert stored == logs_of(journals)
+    for journal in journals:
+        journal.close()
+    capfd.readouterr()
+    assert main(["map", "show", address, "--json", "--no-picture"]) == 0
+    shown = json.loads(capfd.readouterr().out)
+    assert (shown["nodes"], shown["maps"], shown["source"]) == (
+        12,
+        ["r0.1", "r1.1", "r2.1"],
+        "server's store",
+    )
+    assert main(["map", "extract", address, "-o", str(tmp_path / "maps")]) == 0
+    assert sorted(path.name for path in (tmp_path / "maps").iterdir()) == [
+        "r0.1.mapweave", "r1.1.mapweave", "r2.1.mapweave",
+    ]  # fmt: skip
+
+
+def test_a_restored_backup_has_the_map_and_robots_add_what_is_newer(
+    postgres: PostgresServer, tmp_path: Path
+) -> None:
+    """The drill of docs/operations.md, by its own commands."""
+    folder = binaries()
+    if folder is None or not all((folder / name).exists() for name in ("pg_dump", "pg_restore")):
+        pytest.skip("this PostgreSQL comes without pg_dump and pg_restore")
+    address, hub = postgres.database(), MemoryHub()
+    database = str(psycopg.conninfo.conninfo_to_dict(address)["dbname"])
+    server = FrontServer(hub, address, "s0")
+    journal = Journal(tmp_path / "r0", "r0")
+    map_id = journal.open_map(1)
+    bodies = life(map_id, np.random.default_rng(3), 30)
+    robot = Replicator(MemoryBus(hub), KEYS, journal, map_id, ("s0",), AGENT)
+    robot.submit(bodies[:20], 1)
+    assert robot.wait_acknowledged(60)
+    then = content_hash(open_map(address).content)
+    dump = str(postgres.folder / f"{database}.dump")
+    postgres.run("pg_dump", "--format=custom", "--file", dump, database)
+    robot.submit(bodies[20:], 2)
+    assert robot.wait_acknowledged(60)
+    now, store_id = content_hash(open_map(address).content), server.store.id
+    server.close()
+
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute(f"DROP DATABASE {database}")
+        people.execute(f"CREATE DATABASE {database}")
+    postgres.run("pg_restore", "--exit-on-error", "--dbname", database, dump)
+
+    assert content_hash(open_map(address).content) == then != now
+    server = FrontServer(hub, address, "s0")
+    assert server.store.id == store_id
+    eventually(lambda: server.logs() == logs_of([journal]))
+    assert content_hash(open_map(address).content) == now
+    robot.close()
+    server.close()
+    journal.close()
