@@ -51,7 +51,7 @@ from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.merging.pruning import DAY_NS
+from mapweave.mapserver.merging.pruning import DAY_NS, plan_of
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.routes import Router
@@ -158,7 +158,7 @@ def run(
         merged = merger.merged()
         spent, old = time.process_time() - taken, len(merged.superseded)
         node_ms = 1e3 * (taken - began) / len(nodes)
-        plan = merger.plan_pruning(now_ns, keep_days)
+        plan = plan_of(merged, merger.maps.values(), merger.pruning, now_ns, keep_days)
         # A store that is closed is one file.
         with closing(SqliteStore(path)) as store:
             store.apply(map_id, 1, entries)

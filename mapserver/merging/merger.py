@@ -18,7 +18,7 @@ from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, NodeComparisons, compare
-from mapweave.mapserver.merging.pruning import PrunePlan, Pruning, plan_of
+from mapweave.mapserver.merging.pruning import PrunePlan, Pruning
 from mapweave.mapserver.merging.verification_cache import VerificationCache
 from mapweave.mapserver.plausibility import implausible, scattered
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
@@ -342,14 +342,6 @@ class Merger:
             return Islands(self.settings).merge(inside, Verdicts(), set(inside), self._constraints)
 
         return PinnedFrames().moved(leave_out(sorted(kept), attempt)[0], self._pins)
-
-    def plan_pruning(
-        self, now_ns: int, keep_days: float, stays: Callable[[NodeId], bool] = lambda node: False
-    ) -> PrunePlan | None:
-        """What is to be pruned after the merge that was made last; see `plan_of`."""
-        if self._dirty:
-            return None
-        return plan_of(self._merged, self.maps.values(), self.pruning, now_ns, keep_days, stays)
 
     def prune(self, plan: PrunePlan) -> None:
         """Let the nodes of a plan go, as if their robots had retired them, and keep what is left of them."""

@@ -156,7 +156,7 @@ def plan_of(
     pruning: Pruning,
     now_ns: int,
     keep_days: float,
-    stays: Callable[[NodeId], bool],
+    stays: Callable[[NodeId], bool] = lambda node: False,
 ) -> PrunePlan | None:
     """What is to be pruned after a merge; None: it is not asked more often than once a day.
 

@@ -9,7 +9,7 @@ from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.merging.pruning import Pruning, named_nodes
+from mapweave.mapserver.merging.pruning import Pruning, named_nodes, plan_of
 
 log = logging.getLogger(__name__)
 
@@ -47,9 +47,10 @@ class PruningRecord:
             InvalidFile: the disk does not take it; nothing is pruned.
         """
         named = {*named_nodes(tuple(self._named()))}
-        plan = merger.plan_pruning(
-            now_ns, self._keep_days, lambda node: node in named or node.map in self._base
-        )
+        plan = plan_of(
+            merger.merged(), merger.maps.values(), merger.pruning, now_ns, self._keep_days,
+            lambda node: node in named or node.map in self._base,
+        )  # fmt: skip
         if plan is None:
             return False
         self._store.prune(plan.nodes, plan.edges, merger.pruning.records(plan))

@@ -9,6 +9,9 @@ The active nodes dominate all nodes (each is covered directly by an active one) 
 removed. To find the fewest is NP-hard; here nodes are tried one by one, first those that cover few nodes and
 of which newer views exist.
 
+Views from next to a wall show what no other view does, and every drive adds some. So a node that many later
+views surround is superseded whatever they show.
+
 Superseded nodes keep their poses and edges, and become active again if their successor is removed.
 """
 
