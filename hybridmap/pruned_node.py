@@ -51,7 +51,7 @@ class PrunedNodes:
         return len(self.nodes)
 
     def successor(self, node: NodeId, present: Container[NodeId]) -> tuple[NodeId, Pose2] | None:
-        """The node of the map that stands in for a pruned one, and the pruned node's pose there.
+        """The node of the map that replaces a pruned one, and the pruned node's pose there.
 
         Args:
             node: any.
@@ -63,7 +63,7 @@ class PrunedNodes:
         successor_from_node, passed = Pose2(), set[NodeId]()
         while node not in present:
             left = self.nodes.get(node)
-            # A node that was sent again, and pruned again, may have come to stand in for its successor.
+            # A node that was sent again, and pruned again, may have replaced its own successor.
             if left is None or node in passed:
                 return None
             passed.add(node)
@@ -71,7 +71,7 @@ class PrunedNodes:
         return node, successor_from_node
 
     def words(self, node: NodeId, present: Container[NodeId]) -> str:
-        """For example `r0.1.5 left the map on 2026-03-01 14:00 UTC: r0.9.3 stands for its place`."""
+        """For example `r0.1.5 left the map on 2026-03-01 14:00 UTC: r0.9.3 replaces it`."""
         stands = self.successor(node, present)
-        now = "nothing is left of its place" if stands is None else f"{stands[0]} stands for its place"
+        now = "nothing is left of its place" if stands is None else f"{stands[0]} replaces it"
         return f"{node} left the map on {utc_words(self.nodes[node].stamp_ns)}: {now}"

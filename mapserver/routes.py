@@ -176,7 +176,7 @@ class Router:
         wary: Collection[tuple[NodeId, NodeId]],
         start_from_robot: Pose2 | None,
     ) -> RouteAnswer:
-        """The way from a node that may have left the map, by another one that stands for it."""
+        """The way from a node that may have left the map, by another one that replaces it."""
         if near == start:
             return self.route(near, goal, blocked, wary, start_from_robot)
         answer = self.route(near, goal, blocked, wary, near_from_start @ (start_from_robot or Pose2()))

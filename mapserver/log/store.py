@@ -140,7 +140,7 @@ class Store(Protocol):
         """
 
     def prune(self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]) -> None:
-        """Delete what logs say of some nodes and edges, for good, and store results that stand for them.
+        """Delete what logs say of some nodes and edges, for good, and store results in their place.
 
         All in one transaction. The logs' watermarks stay, so robots do not send them again.
 

@@ -2,7 +2,7 @@
 
 A node that has been superseded without a break for `keep_superseded_days` is marginalised
 (mapweave.merge.pose_graph.marginalization). What is left of it: marginal links between the nodes that remain,
-and a line that says which node stands for its place. The server alone decides this, and records it with its
+and a line that says which node replaces it. The server alone decides this, and records it with its
 store (mapweave.mapserver.log.store.Store.prune), so that everyone who reads the store gets the same map.
 
 Some superseded nodes stay: the first of each component, which gives the component its frame; those that a

@@ -137,7 +137,7 @@ def _among(graph: Component, part: Factors, links: Iterable[Link]) -> list[Link]
 
 
 def _approximation(graph: Component, left: Rows, taken: Set[Pair]) -> list[Link]:
-    """Links that stand for the marginal distribution of some nodes of a graph."""
+    """Links that approximate the marginal distribution of some nodes of a graph."""
     nodes = [graph.nodes[row] for row in left.tolist()]
     seat = {node: k for k, node in enumerate(nodes)}
     barred = [(seat[a], seat[b]) for a, b in taken if a in seat and b in seat]
@@ -146,7 +146,9 @@ def _approximation(graph: Component, left: Rows, taken: Set[Pair]) -> list[Link]
     poses = graph.relative(starts, ends)
     chosen = _chosen(pairs, np.linalg.slogdet(poses.covariances)[1])
     means, covariances = poses.means[chosen], poses.covariances[chosen]
-    weights = _weights(graph.means[left], pairs[chosen], means, np.linalg.inv(covariances))
+    weights = _weights(
+        graph.means[left], pairs[chosen], means, np.asarray(np.linalg.inv(covariances), np.float64)
+    )
     out = []
     for k, row in enumerate(chosen.tolist()):
         pose = PoseGaussian(Pose2.from_vector(means[k]), nearest_covariance(covariances[k] / weights[k]))

@@ -239,7 +239,13 @@ def test_what_is_pruned_is_gone_and_is_not_taken_again(
         raise InvalidFile("the disk is full")
 
     store = open_store(place)
-    bodies = [node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2), node_put(3, 2), edge_put(12, 2, 3)]
+    bodies: list[ChangeBody] = [
+        node_put(1, 3),
+        node_put(2, 5),
+        edge_put(11, 1, 2),
+        node_put(3, 2),
+        edge_put(12, 2, 3),
+    ]
     log = [entry(k + 1, body) for k, body in enumerate(bodies)]
     store.apply(MAP, 5, log)
     store.apply(OTHER, 6, [Entry.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))])

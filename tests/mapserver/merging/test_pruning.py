@@ -129,7 +129,7 @@ def test_what_is_superseded_for_long_leaves_and_the_rest_stays(logs: Logs, tmp_p
         again = server.merged()
         assert set(again.poses) == set(merged.poses) and again.pruned == merged.pruned
         assert poses_apart(merged, again) < 1e-3
-    # Whoever opens the store, or a file of the map, has the same map.
+    # Who opens the store, or a file of the map, has the same map.
     for other in (open_map(path).merged(), merged_of(unpack_map_file(pack_map_file(map_file_of(again))))):
         assert set(other.poses) == set(again.poses) and poses_apart(again, other) < 2e-3
 
@@ -148,11 +148,11 @@ def pruned(
         yield before, server.merged(), server
 
 
-def test_words_name_who_stands_for_it(pruned: tuple[MergedMap, MergedMap, Server]) -> None:
+def test_words_name_what_replaces_it(pruned: tuple[MergedMap, MergedMap, Server]) -> None:
     before, after, _ = pruned
     node = min(after.pruned.nodes)
     by = before.superseded[node].by
-    with pytest.raises(InvalidValue, match=f"{node} left the map on 2023-11-29 .* UTC: {by} stands for"):
+    with pytest.raises(InvalidValue, match=f"{node} left the map on 2023-11-29 .* UTC: {by} replaces it"):
         after.check(node)
     found = Places(Router(after), Annotations()).resolve(str(node))
     assert found.node == by and str(node) in found.note

@@ -49,11 +49,10 @@ def information_of(graph: Component, removed: set[NodeId]) -> Array:
     keep = [k for k, one in enumerate(graph.nodes) if one not in removed]
     drop = [k for k, one in enumerate(graph.nodes) if one in removed]
     i, j = ([3 * k + c for k in some for c in range(3)] for some in (keep, drop))
-    if not j:
-        return whole
-    return whole[np.ix_(i, i)] - whole[np.ix_(i, j)] @ np.linalg.solve(
-        whole[np.ix_(j, j)], whole[np.ix_(j, i)]
-    )
+    left: Array = whole[np.ix_(i, i)]
+    if j:
+        left -= whole[np.ix_(i, j)] @ np.linalg.solve(whole[np.ix_(j, j)], whole[np.ix_(j, i)])
+    return left
 
 
 def divergence(exact: Array, approximate: Array) -> float:
