@@ -11,7 +11,7 @@ import numpy as np
 from mapweave.hybridmap.constraint_subject import RetiredWindow
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.plausibility import fragments
+from mapweave.mapserver.plausibility import fragments, unreliable_robots
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.retrieval.ranking import Ranked
 from mapweave.mapserver.wire_limits import FARTHEST
@@ -59,7 +59,9 @@ class ActiveNodes:
         )
         windows = (constraint.about for constraint in merged.constraints.in_force)
         self._windows = tuple(about for about in windows if isinstance(about, RetiredWindow))
-        self._hidden = self._inactive.union(merged.superseded)
+        # What an inactive node has replaced is still needed.
+        replaced = (node for node, one in merged.superseded.items() if one.by not in self._inactive)
+        self._hidden = self._inactive.union(replaced)
 
     def query(self, view: View, k: int = 5) -> Ranked:
         """At most k active nodes with their similarity to a view, best first."""
@@ -80,15 +82,20 @@ class ActiveNodes:
 
 
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
-    """Nodes of maps with wrong geometry and of implausible maps that show places of other maps.
+    """Nodes of maps with wrong geometry, of implausible maps and of fragments that show places of other maps.
 
     Each is at the same place as the node that it is linked to, seen by a robot whose map has it elsewhere: it
-    is no second place where a robot could be. Unlinked nodes of such a map are still used.
+    is no second place where a robot could be. Unlinked nodes of such a map are still used, unless its robot
+    has left very many: so many views of one place would be all that a question is compared with.
     """
-    wrong = {*merged.wrong, *merged.implausible}
-    for refusal in merged.refused if wrong else ():
+    maps = {map_id: one for map_id, one in merged.maps.items() if map_id not in merged.constraints.retired}
+    wrong = {*merged.wrong, *merged.implausible, *fragments(maps, merged.pruned.maps)}
+    unreliable = unreliable_robots(maps, merged.wrong, merged.pruned.maps)
+    for some in unreliable.values():
+        yield from (node for map_id in some for node in merged.maps[map_id].nodes)
+    for refusal in merged.refused if wrong or unreliable else ():
         if refusal.link is not None and not refusal.link.within:
-            ends = [node for node in refusal.pair if node.map in wrong]
+            ends = [node for node in refusal.pair if node.map in wrong or node.agent in unreliable]
             if len(ends) == 1:
                 yield ends[0]
 

@@ -208,5 +208,5 @@ def _check_floor(
         if which in (portal.a.map, portal.b.map) and (differ if portal.means is PortalMeans.DOOR else same):
             raise InvalidValue(
                 f"map {which} cannot be on floor {label}: {entry.words}, so that its sides would be on "
-                f"{'one floor' if same else 'two floors'}; first: mapweave map portal remove {entry.name!r}"
+                f"{'one floor' if same else 'two floors'}; first remove that portal"
             )

@@ -18,8 +18,8 @@ MAP_SIGMA = 0.05
 half are off by less than 0.015 m, and a tenth by more than 0.05 m. Of each pair the pose graph knows it, but
 that costs more than all the rest of the answer."""
 CELL = 16.0
-"""Side of the cells by which robots are found, m: what is not in a cell beside a robot's needs more than the 5
-s between two questions to come near, at 1 m/s each."""
+"""Side of the cells by which robots are found, m. What is not in a cell beside a robot's needs more than the
+5 s between two questions to come near, at 1 m/s each."""
 MOST_ROBOTS = 4096
 """Robots that are remembered: without keys, names cost nothing."""
 

@@ -6,7 +6,8 @@ show, and is not joined with them, it makes no answer ambiguous (mapweave.mapser
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections import Counter
+from collections.abc import Collection, Container, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
@@ -29,10 +30,10 @@ def implausible(hybrid_map: HybridMap) -> str:
 LEAST_NODES = 4
 """Of a map whose geometry can be tested."""
 MOST_FRAGMENTS = 8
-"""Of a robot. One that loses its way leaves one or two a day."""
+"""Of a robot, and maps with wrong geometry. One that loses its way leaves one or two a day."""
 
 
-def fragments(maps: Mapping[MapId, HybridMap], pruned: Container[MapId]) -> list[MapId]:
+def fragments(maps: Mapping[MapId, HybridMap], pruned: Container[MapId] = ()) -> list[MapId]:
     """Maps with fewer nodes that their robots have left for others: nothing tells whether they are right.
 
     Of a robot that leaves very many, the newest as well.
@@ -55,7 +56,25 @@ def fragments(maps: Mapping[MapId, HybridMap], pruned: Container[MapId]) -> list
     ]
 
 
-def scattered(maps: Mapping[MapId, HybridMap], pruned: Container[MapId]) -> dict[MapId, str]:
+def unreliable_robots(
+    maps: Mapping[MapId, HybridMap], wrong: Collection[MapId], pruned: Container[MapId] = ()
+) -> dict[str, set[MapId]]:
+    """Robots with very many maps, and most of their nodes in them, that are wrong or too small: these maps.
+
+    No test finds every wrong map, and each is one more place where a robot seems to be.
+    """
+    bad: dict[str, set[MapId]] = {}
+    balance = Counter[str]()
+    for map_id, hybrid_map in maps.items():
+        if map_id in wrong or (len(hybrid_map.nodes) < LEAST_NODES and map_id not in pruned):
+            bad.setdefault(map_id.agent, set()).add(map_id)
+            balance[map_id.agent] += len(hybrid_map.nodes)
+        else:
+            balance[map_id.agent] -= len(hybrid_map.nodes)
+    return {robot: some for robot, some in bad.items() if len(some) > MOST_FRAGMENTS and balance[robot] > 0}
+
+
+def scattered(maps: Mapping[MapId, HybridMap], pruned: Container[MapId] = ()) -> dict[MapId, str]:
     """The first fragment of each robot that leaves very many; see `fragments`."""
     by_robot: dict[str, list[MapId]] = {}
     for map_id in fragments(maps, pruned):

@@ -62,7 +62,7 @@ class Portals:
         if first and second and first != second:
             return (
                 f"{start} is on floor {first} and {goal} on floor {second}, and no portal leads there: "
-                "mapweave map portal add NAME A B --kind lift"
+                "add the lift, ramp or door between them"
             )
         return f"{start} and {goal} are in parts of the map that nothing joins yet"
 
@@ -115,7 +115,7 @@ def check_portal(merged: MergedMap, annotations: Annotations, name: str, portal:
         if not label:
             raise InvalidValue(
                 f"the floor of {node} has no label, and a {portal.means} leads to another floor: "
-                f"mapweave floor NAME {node}"
+                "first say on which floor it is"
             )
     if first == second:
         raise InvalidValue(

@@ -51,7 +51,7 @@ def within_range(answer: RelocalizeAnswer) -> RelocalizeAnswer:
     sure = answer.certainty in (Certainty.FOUND, Certainty.PLACE)
     if answer.candidates and (not candidates or (sure and not fine[0])):
         reason = f"the place is out of the range of messages: {answer.reason}"
-        return RelocalizeAnswer(Certainty.UNKNOWN, (), reason)
+        return RelocalizeAnswer(Certainty.UNKNOWN, (), reason, partial=answer.partial)
     return replace(answer, candidates=candidates)
 
 

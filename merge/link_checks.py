@@ -48,6 +48,12 @@ def checked_link(
     """
     asked = constraint.about
     assert isinstance(asked, Linked), "a link"
+    # A map that was set apart as a copy is taken in by the link.
+    merged = replace(
+        merged,
+        maps={**merged.copies, **merged.maps},
+        set_apart={m: reason for m, reason in merged.set_apart.items() if m not in merged.copies},
+    )
     for end in (asked.a, asked.b):
         merged.check(end)
     against = constraints.against(asked.a, asked.b)
@@ -75,7 +81,7 @@ def _by_images(merged: MergedMap, asked: Linked, because: str, s: ConsistencySet
         if asked.pose is not None and distance2_of(_by_person(asked.pose), pose, s) >= s.gate:
             raise InvalidValue(
                 f"{asked} cannot be linked so: {inliers} landmarks of the images agree on another pose, "
-                f"{_words(pose.mean)}, {_off(pose.mean, asked.pose)} from yours; leave --pose out"
+                f"{_words(pose.mean)}, {_off(pose.mean, asked.pose)} from yours; leave your pose out"
             )
         words = f"{_landmarks(verdict)} of the images agree on one pose"
         return Linked.of(asked.a, asked.b, pose, verdict.shared, verdict.evidence), words
@@ -85,11 +91,11 @@ def _by_images(merged: MergedMap, asked: Linked, because: str, s: ConsistencySet
         evidence = f"{found.matches} features match, {found.inliers} of them agree on a pose: {evidence}"
     if asked.pose is None:
         raise InvalidValue(
-            f"the images of {asked} do not show one place: {evidence}. If you know that they do, give the "
-            f"pose of {asked.b} seen from {asked.a}, --pose X,Y,DEGREES, and say why with --because"
+            f"the images of {asked} do not show one place: {evidence}. If you know that they do, give by "
+            f"hand the pose of {asked.b} seen from {asked.a}, and a reason"
         )
     if not because:
-        raise InvalidValue(f"a pose by hand, without the images ({evidence}), needs a reason: --because")
+        raise InvalidValue(f"a pose by hand, without the images ({evidence}), needs a reason")
     return Linked.of(asked.a, asked.b, _by_person(asked.pose)), f"by hand alone; {evidence}"
 
 
@@ -99,8 +105,7 @@ def _check_floors(merged: MergedMap, asked: Linked, floors: Mapping[MapId, str])
     if first and second and first != second:
         raise InvalidValue(
             f"{asked} cannot be linked: {asked.a} is on floor {first}, {asked.b} on floor {second}. If a "
-            "label is wrong, first take it back: mapweave floor --undo NODE; a lift or a ramp between them: "
-            "mapweave map portal add"
+            "label is wrong, first take it back; a lift or a ramp between them is a portal, and no link"
         )
 
 
@@ -141,17 +146,17 @@ def _undo_first(merged: MergedMap, linked: Linked) -> str:
         more = f" and {len(loops)} loop closures" if loops else ""
         return (
             f"Map {linked.a.map} says so by its robot's own way{more}: if that is wrong, first retire what "
-            f"is wrong of it (mapweave map retire), or undo a loop closure (mapweave map unmerge)"
+            "is wrong of it, or undo a loop closure"
         )
     by_hand = [pair for pair in counts[step] if pair in links_by_hand]
     if by_hand:
         a, b = by_hand[0]
-        return f"The link by hand of {a} and {b} joins them; first: mapweave map link {a} {b} --undo"
+        return f"The link by hand of {a} and {b} joins them: first take it back"
     count = len(counts[step])
     links = "1 link joins" if count == 1 else f"{count} links join"
     return (
-        f"On the way between the two {links} {step[0]} and {step[1]}, the weakest; if that is wrong, first: "
-        f"mapweave map unmerge {step[0]} {step[1]}"
+        f"On the way between the two {links} {step[0]} and {step[1]}, the weakest; if that is wrong, first "
+        f"undo {'it' if count == 1 else 'them'}"
     )
 
 

@@ -124,6 +124,11 @@ class PostgresSession:
         self._closed = False
 
     @property
+    def is_open(self) -> bool:
+        """Whether there is a connection that is not known to be broken."""
+        return self._connection is not None and not self._connection.closed
+
+    @property
     def connection(self) -> psycopg.Connection:
         """That of now, or a new one.
 
@@ -156,10 +161,6 @@ class PostgresSession:
                 self._drop()
             reason = " ".join(str(error).split())
             raise InvalidFile(f"{self.address.words}: the map store cannot be used ({reason})") from None
-
-    def drop(self) -> None:
-        """End the connection; the next use makes a new one."""
-        self._drop()
 
     def close(self) -> None:
         """End the connection for good. Idempotent."""

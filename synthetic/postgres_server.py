@@ -32,13 +32,13 @@ def binaries() -> Path | None:
 class PostgresServer:
     """One cluster with its own processes."""
 
-    def __init__(self, folder: Path, *options: str, make: bool = True) -> None:
-        """Make a cluster, unless one is in the folder, and start it.
+    def __init__(self, folder: Path, *options: str, primary: PostgresServer | None = None) -> None:
+        """Make a cluster and start it.
 
         Args:
             folder: for all it has; short, since a socket's path is.
             options: for `postgres`.
-            make: with `initdb`.
+            primary: of which it is a standby, named `standby`.
         """
         self.folder, self.data, self._options = folder, folder / "data", options
         self._count = 0
@@ -47,11 +47,14 @@ class PostgresServer:
         self.user = name if os.geteuid() == 0 else None
         if self.user:
             os.chown(folder, pwd.getpwnam(name).pw_uid, pwd.getpwnam(name).pw_gid)
-        if make:
+        if primary is None:
             self.run(
                 "initdb", "-D", str(self.data), "-U", ROLE, "--auth=trust", "--no-sync", "--data-checksums",
                 "--encoding=UTF8", "--locale=C",
             )  # fmt: skip
+        else:
+            origin = f"host={primary.folder} user={ROLE} application_name=standby"
+            self.run("pg_basebackup", "-D", str(self.data), "-d", origin, "-R", "-c", "fast", "--no-sync")
         self.start()
 
     def run(self, program: str, *arguments: str) -> str:

@@ -29,7 +29,7 @@ def there_is_none() -> bool:
 class Browser:
     """One page at a time. Use it as a context."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *flags: str) -> None:
         """Start it with a profile of its own in a folder."""
         self._port = free_port()
         self._driver = subprocess.Popen(
@@ -39,7 +39,10 @@ class Browser:
         )
         try:
             eventually(self._ready)
-            options = {"binary": shutil.which("chromium"), "args": [*FLAGS, f"--user-data-dir={folder}"]}
+            options = {
+                "binary": shutil.which("chromium"),
+                "args": [*FLAGS, *flags, f"--user-data-dir={folder}"],
+            }
             wanted = {
                 "alwaysMatch": {
                     "browserName": "chrome",

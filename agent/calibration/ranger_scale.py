@@ -76,11 +76,16 @@ class RangerScale:
     """Collects stretches while the robot drives."""
 
     def __init__(self, description: RobotDescription) -> None:
-        """Find the sensors that look ahead or back; without any nothing is ever shown."""
+        """Find the sensors that look ahead and back; without any nothing is ever shown.
+
+        One each: the beams of a scanner beside it would repeat the same slip.
+        """
         bearings = np.array(description.ranger_bearings)
-        ahead = np.abs(np.sin(bearings)) < math.sin(ALONG)
-        self._beams: NDArray[np.intp] = np.flatnonzero(ahead)
-        self._signs = np.sign(np.cos(bearings[ahead])).tolist()
+        aside = np.abs(np.sin(bearings))
+        ways = [np.flatnonzero((aside < math.sin(ALONG)) & (np.sign(np.cos(bearings)) == s)) for s in (1, -1)]
+        best = [int(way[aside[way].argmin()]) for way in ways if len(way)]
+        self._beams: NDArray[np.intp] = np.array(best, np.intp)
+        self._signs = np.sign(np.cos(bearings[self._beams])).tolist()
         self._count, self._reach = len(bearings), description.ranger_reach
         self._stretches = [_Stretch() for _ in self._beams]
         self._way = self._turn = 0.0

@@ -170,7 +170,7 @@ Row = tuple[str, str, str, str]
 
 INTRODUCTION = """\
 `python -m benchmarks.figures` writes this page from the results behind [figures](figures.md), which name
-commands and dates. Nobody has run 10 000 robots: *measured* is a figure of one robot, node or answer,
+commands and dates. No one has run 10 000 robots: *measured* is a figure of one robot, node or answer,
 *extrapolated* a formula over these, *chosen* an assumption that you replace by your own. That memory and
 processor grow linearly beyond what was measured is itself an extrapolation."""
 ALONE = """\

@@ -212,13 +212,12 @@ def greatest_sequence(s: Setting) -> Lie:
 
 def many_epochs(s: Setting) -> Lie:
     """A new map for every few nodes, again and again, each with true views and wrong ways between them."""
-    logs = {}
-    for k in range(EPOCHS):
-        which = replace(s, map=MapId(s.map.agent, s.map.epoch + k))
-        some = [s.own[0][n] for n in sorted(s.rng.choice(len(s.own[0]), 3, replace=False))]
-        poses = [Pose2.from_vector(s.rng.uniform(-4.0, 4.0, 3)) for _ in some]
-        logs[which.map] = messages(which.map, bodies(chain(which, some, poses)))
-    return Lie(logs)
+    return _shuffled(s, EPOCHS, 3, 3)
+
+
+def shuffled_maps(s: Setting) -> Lie:
+    """The same with more nodes a map, so that its geometry can be tested."""
+    return _shuffled(s, EPOCHS // 2, 4, 9)
 
 
 def copied_to_tear(s: Setting) -> Lie:
@@ -286,6 +285,18 @@ def _filled(node: Node, rng: np.random.Generator) -> Landmarks:
     return joined([more, node.landmarks])
 
 
+def _shuffled(s: Setting, maps: int, least: int, most: int) -> Lie:
+    """Maps of so many true views each, with wrong ways between them."""
+    logs = {}
+    for k in range(maps):
+        which = replace(s, map=MapId(s.map.agent, s.map.epoch + k))
+        size = least + k % (most - least + 1)
+        some = [s.own[0][n] for n in sorted(s.rng.choice(len(s.own[0]), size, replace=False))]
+        poses = [Pose2.from_vector(s.rng.uniform(-4.0, 4.0, 3)) for _ in some]
+        logs[which.map] = messages(which.map, bodies(chain(which, some, poses)))
+    return Lie(logs)
+
+
 def _torn(s: Setting, nodes: Sequence[Node]) -> Map:
     """Copies of two maps' nodes in turns, each of the second's shifted against where it is."""
     poses = [
@@ -315,6 +326,7 @@ WAYS: dict[str, Callable[[Setting], Lie]] = {
     "edges to nowhere": edges_to_nowhere,
     "sequence 2^53": greatest_sequence,
     "many epochs": many_epochs,
+    "shuffled maps": shuffled_maps,
     "copies that tear": copied_to_tear,
     "altered copies that tear": altered_to_tear,
     "copied places": copied_places,

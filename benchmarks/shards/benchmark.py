@@ -4,9 +4,9 @@
 
 Real `mapweave server` processes over Zenoh on loopback, and a Ray cluster of several nodes, all on the
 cores of this machine. Each server reads the logs of a fleet that has mapped one building, merges them, and
-answers robots that ask without a pause. `same_links`: it has exactly the links of the server without Ray;
-`max_pose_difference_m`, of any node's merged pose; `merge_s`, from its start until all is merged and in its
-shards; `answers_per_s`.
+answers robots that ask without a pause. `start_s`, until all is merged and in its shards;
+`merged_nodes_per_s` of two more robots that send all at once; `answers_per_s`; `same_links`: it has exactly
+the links of the server without Ray; `max_pose_difference_m`, of any node's merged pose.
 
 With the most shards, processes are killed (`--kills`) while robots ask and two robots map on: a shard, a
 worker, the gateway, the server (started again), the head (another is started once answers are whole).
@@ -25,8 +25,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,110 +34,24 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.shards.askers import ASK_WITHIN, PATIENCE, Askers
 from benchmarks.shards.fleet import FLEET, BuildingFleet, MappingRobot
 from benchmarks.shards.ray_nodes import RayNodes, descendants
 from mapweave.hybridmap.change import EdgePut
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, unpack_map_file
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
-from mapweave.wire.messages import decode
 from mapweave.wire.zenoh_bus import ZenohBus
 
-KILLS = ("shard", "worker", "gateway", "server", "head")
+KILLS = ("worker", "shard", "gateway", "server", "head")
 LATE = 2
-"""Robots that map on while processes are killed."""
-PATIENCE = 120.0
-"""Longest wait for a server to read, merge, or be whole again, s."""
-ASK_WITHIN = 5.0
-"""Longest wait for one answer, s; then the question is asked again."""
-IN_A_ROW = 10
-"""Whole answers in a row after which a server counts as recovered."""
+"""Robots that join later."""
 AFTER = 4.0
 """s after a kill before the next one, at least."""
 PERIOD = 0.3
 """s between two changes of a robot that maps on."""
-
-
-@dataclass
-class Tally:
-    """What robots were answered: when, and whether the whole map was searched.
-
-    Attributes:
-        answers: time of each answer, s, and whether it was whole.
-        seconds: that each answer took.
-        asked_again: questions that were refused or lost, and asked again.
-        found: answers that were certain.
-        wrong: of these, those somewhere else.
-        unanswered: questions without an answer at the end.
-    """
-
-    answers: list[tuple[float, bool]] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    asked_again: int = 0
-    found: int = 0
-    wrong: int = 0
-    unanswered: int = 0
-
-    def whole(self, since: float) -> bool:
-        """Whether answers have come since then, and the last ones are whole."""
-        last = [(at, whole) for at, whole in self.answers[-IN_A_ROW:] if at > since]
-        return len(last) == IN_A_ROW and all(whole for _, whole in last)
-
-    def recovery(self, since: float) -> float:
-        """The longest time without a whole answer since then, s."""
-        whole = [since, *sorted(at for at, whole in list(self.answers) if whole and at > since)]
-        return float(np.diff(whole).max())
-
-
-class Askers:
-    """Lost robots that ask without a pause until they are stopped."""
-
-    def __init__(self, fleet: BuildingFleet, endpoint: str, count: int) -> None:
-        """Connect."""
-        self._fleet, self._questions = fleet, fleet.questions(200)
-        self._buses = [ZenohBus(BusSettings(endpoints=(endpoint,))) for _ in range(count)]
-        self._stop = threading.Event()
-        self.tally = Tally()
-        self._pool = ThreadPoolExecutor(count)
-        self._asking = [self._pool.submit(self._ask, bus, k) for k, bus in enumerate(self._buses)]
-
-    def close(self) -> Tally:
-        """Let each get its last answer, and disconnect."""
-        self._stop.set()
-        for asking in self._asking:
-            asking.result()
-        self._pool.shutdown()
-        for bus in self._buses:
-            bus.close()
-        return self.tally
-
-    def _ask(self, bus: ZenohBus, number: int) -> None:
-        key, tally = Keys(FLEET).any_relocalize(), self.tally
-        bus.wait_connected(PATIENCE)
-        while not self._stop.is_set():
-            message, pose = self._questions[number % len(self._questions)]
-            number += len(self._buses)
-            began, end = time.monotonic(), time.monotonic() + PATIENCE
-            while True:
-                asked = time.monotonic()
-                replies = bus.ask(key, message, ASK_WITHIN)
-                if replies and not replies[0].error:
-                    break
-                tally.asked_again += 1
-                if time.monotonic() > end:
-                    tally.unanswered += 1
-                    return
-                pause = replies[0].retry_after if replies else 0.0
-                time.sleep(max(pause or 0.0, asked + 0.1 - time.monotonic()))
-            answer = decode(replies[0].payload, RelocalizeAnswer)
-            tally.seconds.append(time.monotonic() - began)
-            tally.answers.append((time.monotonic(), not answer.partial))
-            if answer.certainty is Certainty.FOUND:
-                tally.found += 1
-                tally.wrong += self._fleet.is_wrong(answer, pose)
 
 
 class Server:
@@ -232,18 +144,29 @@ def measure(
     fleet: BuildingFleet, folder: Path, shards: int, cluster: RayNodes | None, o: argparse.Namespace
 ) -> tuple[dict[str, Any], MapFile]:
     """One server: its figures, and its map."""
-    fleet.write(folder / "s0.sqlite", range(o.robots))
+    early = o.robots - LATE
+    fleet.write(folder / "s0.sqlite", range(early))
     began = time.monotonic()
     with Server(folder, shards, cluster) as server:
+        server.wait(early * o.nodes)
+        start_s = time.monotonic() - began
+        began = time.monotonic()
+        robots = [MappingRobot(log, server.endpoint, folder) for log in fleet.logs[early:]]
+        for robot in robots:
+            while robot.map_on():
+                pass
         server.wait(len(fleet.nodes))
         merge_s = time.monotonic() - began
+        for robot in robots:
+            robot.close()
         content = server.map()
         askers = Askers(fleet, server.endpoint, o.askers)
         time.sleep(o.seconds)
         tally = askers.close()
     took = 1e3 * np.array(tally.seconds)
     return {
-        "merge_s": round(merge_s, 1),
+        "start_s": round(start_s, 1),
+        "merged_nodes_per_s": round(LATE * o.nodes / merge_s, 1),
         "answers_per_s": round(len(tally.answers) / o.seconds, 1),
         "p50_ms": round(float(np.percentile(took, 50)), 1),
         "p95_ms": round(float(np.percentile(took, 95)), 1),
@@ -267,7 +190,7 @@ def killed(
     fleet.write(folder / "s0.sqlite", range(early))
     recovery: dict[str, float] = {}
     with Server(folder, shards, cluster) as server:
-        server.wait(sum(node.id.map in {log[0][0] for log in fleet.logs[:early]} for node in fleet.nodes))
+        server.wait(early * o.nodes)
         robots = [MappingRobot(log, server.endpoint, folder) for log in fleet.logs[early:]]
         stop = threading.Event()
 
@@ -321,15 +244,21 @@ def kill(kind: str, server: Server, cluster: RayNodes) -> None:
         os.kill(server.gateway(), signal.SIGKILL)
     else:
         titles = {"shard": ("ray::ShardServer",), "worker": ("ray::answer_work", "ray::IDLE")}[kind]
-        os.kill(next(pid for title in titles for pid in cluster.processes(title)), signal.SIGKILL)
+
+        def found() -> list[int]:
+            return [pid for title in titles for pid in cluster.processes(title)]
+
+        # Ray starts a worker when there is work.
+        wait_until(found)
+        os.kill(found()[0], signal.SIGKILL)
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], object]) -> None:
     """Wait for a condition; end the benchmark if it does not come true."""
     end = time.monotonic() + PATIENCE
     while not condition():
         if time.monotonic() > end:
-            raise SystemExit(f"answers are not whole again after {PATIENCE:g} s")
+            raise SystemExit(f"no whole answers, or no process to kill, for {PATIENCE:g} s")
         time.sleep(0.05)
 
 

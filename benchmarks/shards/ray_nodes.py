@@ -15,7 +15,7 @@ from types import TracebackType
 
 from mapweave.scenarios.children import free_port
 
-START = 90.0
+START = 180.0
 """Longest wait for a node, s."""
 STORE_BYTES = 80_000_000
 """Of a node's object store: the least that Ray takes is 75 MB."""

@@ -26,8 +26,9 @@ WORK = -1
 """Instead of a shard's number: a request that any worker answers, see mapweave.mapserver.cluster.work."""
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 15.0
 """s between two attempts to reach a cluster; it doubles."""
-SILENCE = 60.0
-"""s without any answer to what was asked, after which the child is started again."""
+SILENCE = 30.0
+"""s without any answer to what was asked, after which the child is started again: Ray notices only after more
+than a minute that its head is gone."""
 PROCESS = "mapweave.mapserver.cluster.gateway_process"
 
 
@@ -121,7 +122,8 @@ class Gateway:
         with theirs:
             process = subprocess.Popen(
                 [sys.executable, "-m", PROCESS, str(theirs.fileno()), self._address, str(self._shards)],
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
             )  # fmt: skip
         child = _Child(process, Connection(ours.detach()), SimpleQueue())
         with self._lock:

@@ -21,8 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.mapserver.cluster.gateway import WORK
-from mapweave.mapserver.cluster.shard import ShardServer
-from mapweave.mapserver.cluster.work import answer_work
 
 LOOPBACK = "127.0.0.1"
 
@@ -38,6 +36,9 @@ def main() -> int:
     except Exception as error:  # noqa: BLE001 - whatever it is, the server says it and tries again
         connection.send_bytes(pickle.dumps((0, f"{type(error).__name__}: {_words(error)}")))
         return 1
+    from mapweave.mapserver.cluster.shard import ShardServer
+    from mapweave.mapserver.cluster.work import answer_work
+
     shard = ray.remote(ShardServer).options(max_restarts=-1, num_cpus=0, scheduling_strategy="SPREAD")
     actors = [shard.remote() for _ in range(shards)]
     work = ray.remote(answer_work).options(num_cpus=1, max_retries=3, scheduling_strategy="SPREAD")
@@ -61,12 +62,12 @@ def _joined(address: str) -> Any:
     Raises:
         ConnectionError: there is no cluster.
     """
+    if address != "auto" and not _listens(address):
+        raise ConnectionError(f"nothing listens at {address}")
     import ray
 
     how: dict[str, Any] = {"namespace": "mapweave", "log_to_driver": False, "logging_level": "error"}
     if address != "auto":
-        if not _listens(address):
-            raise ConnectionError(f"nothing listens at {address}")
         ray.init(address=address, **how)
     elif running := _running():
         ray.init(address=running, **how)

@@ -43,6 +43,8 @@ STAND_IN_AFTER = 2.0
 """s; Ray restarts a killed actor in 2 s, on a busy machine in 7. A stand-in of 1000 nodes takes 0.2 s."""
 PATIENCE = 30.0
 """s for a shard that is filled: it learns new cells meanwhile."""
+REACHED_WITHIN = 2.0
+"""s for a lost shard to say what it has; while Ray restarts it, it says nothing."""
 PAUSE = 0.2
 """s between two attempts to reach a lost shard."""
 
@@ -95,12 +97,12 @@ class ShardLink:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop; the shard itself is left as it is. Idempotent."""
+        """Stop; the shard itself is left as it is. A request to it ends with the gateway. Idempotent."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
         if self._thread.is_alive():
-            self._thread.join(PATIENCE)
+            self._thread.join(PAUSE)
 
     # Change it.
 
@@ -183,6 +185,8 @@ class ShardLink:
         with self._changed:
             if not self._current or self._state is None or state.incarnation != self._state.incarnation:
                 return
+            if self._closing:
+                return
             self._current, self._lost_at = False, time.monotonic()
             self._changed.notify_all()
         log.warning("shard %s is lost (%s): answers are partial until it is back", self.name, _words(error))
@@ -205,11 +209,11 @@ class ShardLink:
 
     def _restore(self) -> None:
         """Bring the shard up to date; raises if it cannot be reached."""
-        state = State(*pickle.loads(self._call(HELLO).result(max(self.timeout, 5.0))))
+        state = State(*pickle.loads(self._call(HELLO).result(max(self.timeout, REACHED_WITHIN))))
         with self._changed:
             same = state == self._state
         if not same:
-            state = State(*pickle.loads(self._call(RESET).result(max(self.timeout, 5.0))))
+            state = State(*pickle.loads(self._call(RESET).result(max(self.timeout, REACHED_WITHIN))))
             with self._changed:
                 self._state, self._behind = state, dict.fromkeys(self._nodes)
         began, count = time.monotonic(), len(self._behind)

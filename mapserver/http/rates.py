@@ -1,4 +1,4 @@
-"""How often one person may ask what takes long: one who asks without end harms nobody else."""
+"""How often one person may ask what takes long: one who asks without end harms no other."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ QUESTIONS = 2.0
 LIMITED = frozenset({"relocalize", "explain"})
 """Questions that a worker is busy with for long."""
 MOST_PEOPLE = 4096
-"""Of whom this is remembered; one more forgets the one that has asked first."""
+"""Buckets that are kept; one more replaces the oldest."""
 
 
 class Rates:
     """By person, and by address on a fleet without keys. Used by the server's thread alone."""
 
     def __init__(self, rate: float = QUESTIONS, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin with nobody.
+        """Begin without any.
 
         Args:
             rate: questions a second.

@@ -166,16 +166,31 @@ class Connection(H11Protocol):
 
 
 class _Loop(asyncio.SelectorEventLoop):
-    """A TLS handshake has the time limit of a head; by itself asyncio waits for 60 s."""
+    """A TLS handshake has the time limit of a head; by itself asyncio waits for 60 s.
+
+    So many of them wait at most, as of heads: a connection is no `Connection` before its handshake is done.
+    """
 
     def __init__(self, handshake: float) -> None:
         super().__init__()
         self._handshake = handshake
+        self._shaking: dict[asyncio.Future[None], asyncio.Transport] = {}
 
     async def create_server(self, *arguments: Any, **named: Any) -> asyncio.Server:
         if named.get("ssl") is not None:
             named.update(ssl_handshake_timeout=self._handshake, ssl_shutdown_timeout=LINGER)
         return await super().create_server(*arguments, **named)
+
+    def _make_ssl_transport(self, *arguments: Any, **named: Any) -> asyncio.Transport:
+        """Begin a handshake, in the place of the oldest if there are too many."""
+        transport: asyncio.Transport = super()._make_ssl_transport(*arguments, **named)  # type: ignore[misc]
+        waiter: asyncio.Future[None] = named["waiter"]
+        self._shaking[waiter] = transport
+        waiter.add_done_callback(lambda done: self._shaking.pop(done, None))
+        if len(self._shaking) > MAX_WAITING:
+            # Later: in a burst the oldest has no socket yet.
+            self.call_soon(self._shaking.pop(next(iter(self._shaking))).abort)
+        return transport
 
 
 class _Server(uvicorn.Server):

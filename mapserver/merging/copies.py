@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from mapweave.hybridmap.node import MapId, Node, NodeId
@@ -64,14 +66,18 @@ class Copies:
         """Two nodes are no longer compared, or show different things now."""
         self._pairs.pop(pair, None)
 
-    def maps(self, suspects: frozenset[MapId]) -> dict[MapId, str]:
+    def maps(self, suspects: frozenset[MapId], linked: Collection[frozenset[MapId]] = ()) -> dict[MapId, str]:
         """The maps with copies, and what they copy, in words.
 
         Args:
             suspects: maps that were set apart when this process began.
+            linked: pairs of maps that a person has linked: both are of one recording, say, and true.
         """
+        pairs = {
+            pair: copied for pair, copied in self._pairs.items() if {node.map for node in pair} not in linked
+        }
         shared: dict[str, set[str]] = {}
-        for a, b in self._pairs:
+        for a, b in pairs:
             shared.setdefault(a.agent, set()).add(b.agent)
             shared.setdefault(b.agent, set()).add(a.agent)
 
@@ -79,7 +85,7 @@ class Copies:
             return node.map in suspects, len(shared[node.agent]), self._came.get(node, 0)
 
         out: dict[MapId, str] = {}
-        for pair, copied in sorted(self._pairs.items()):
+        for pair, copied in sorted(pairs.items()):
             original, copy = sorted(pair, key=copier)
             out.setdefault(
                 copy.map, f"{copied} landmarks of its node {copy} are those of {original} bit by bit: copies"

@@ -221,7 +221,10 @@ class Merger:
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
                 self._implausible[map_id] = implausible(self._kept[map_id])
             self._isolation.changed(self._changed)
-            self._copied = self._copies.maps(self._suspects)
+            before = self._copied.keys()
+            linked = {frozenset((a.map, b.map)) for a, b in self._constraints.links}
+            self._copied = self._copies.maps(self._suspects, linked)
+            self._touched |= before - self._copied.keys()
             try:
                 self._find_wrong_geometry()
             except Exception:  # a defect with one map must not hold up the merge
@@ -256,6 +259,7 @@ class Merger:
         merged = replace(
             merged,
             set_apart=self._set_apart(),
+            copies={which: self._kept[which] for which in self._copied},
             implausible={which: odd[which] for which in sorted(odd.keys() & kept.keys())},
             wrong=self._wrong,
             pruned=self.pruning.pruned,

@@ -6,7 +6,11 @@ import argparse
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "demo": ("mapweave demo --seed 3",),
-    "server": ("mapweave server --http 8080", "mapweave server --keys keys --http 0.0.0.0:8080"),
+    "server": (
+        "mapweave server --http 8080",
+        "mapweave server --keys keys --http 0.0.0.0:8080",
+        "mapweave server --keys keys --store postgresql://mapweave@db1,db2/maps",
+    ),
     "router": (
         "mapweave router --keys keys",
         "mapweave router --keys keys --print-config",

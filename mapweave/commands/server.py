@@ -97,10 +97,10 @@ def run(arguments: argparse.Namespace) -> int:
     router, folder = server_settings(network, name)
     keys = Keys(router.fleet)
     cluster = replace(settings.cluster, ray=arguments.ray or settings.cluster.ray)
+    if cluster.ray and arguments.lockstep:
+        raise SettingsError("--lockstep is repeatable, and a cluster is not: leave out one of them")
     if cluster.ray:
         need("cluster")
-        if arguments.lockstep:
-            raise SettingsError("--lockstep is repeatable, and a cluster is not: leave out one of them")
     if arguments.demo and (arguments.data is not None or arguments.store is not None):
         raise SettingsError("--demo keeps nothing: leave out --data and --store")
     if arguments.store is not None and not is_postgres(arguments.store):

@@ -37,7 +37,7 @@ EVERY = 0.5
 TABLE_EVERY = 5.0
 """Between two tables where there is no terminal, s."""
 MOST_APART = 10
-"""Robots of which it is told below the table why their maps are not merged."""
+"""Robots that are listed below the table with the reason why their maps are not merged."""
 
 
 def add_to(commands: Any) -> None:

@@ -9,18 +9,21 @@ NAME.key.toml     key file of NAME: copy it there
 
 from __future__ import annotations
 
+import os
 import re
 import secrets
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import msgspec
 
-from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue, SettingsError
 from mapweave.hybridmap.node import check_name
 from mapweave.identities.key_file import (
     SUFFIX,
@@ -133,6 +136,7 @@ class KeyFolder:
 
         Raises:
             SettingsError: there are keys already, or a host is no name or address.
+            InvalidFile: the disk does not take them; nothing is left there.
         """
         if (path / CATALOGUE).exists():
             raise SettingsError(f"{path}: there are keys already; add to them with `mapweave keys add`")
@@ -149,18 +153,36 @@ class KeyFolder:
             tuple(f"{scheme}/{f'[{host}]' if ':' in host else host}:{port}" for host in reached),
             tuple(known),
         )  # fmt: skip
+        new = not path.exists()
         path.mkdir(parents=True, exist_ok=True)
         path.chmod(0o700)
-        if profile is Profile.PRODUCTION:
+        try:
+            # A full disk leaves nothing, and not an authority without a server: moving takes no room.
+            with TemporaryDirectory(dir=path, prefix=".") as beside:
+                try:
+                    cls._fill(Path(beside), catalogue, server)
+                except InvalidFile as error:
+                    raise InvalidFile(str(error).replace(str(Path(beside).resolve()), str(path))) from None
+                for file in sorted(Path(beside).iterdir(), key=lambda file: file.name == CATALOGUE):
+                    file.replace(path / file.name)
+        except BaseException:
+            if new:
+                with suppress(OSError):
+                    path.rmdir()
+            raise
+        return cls(path)
+
+    @classmethod
+    def _fill(cls, path: Path, catalogue: Catalogue, server: str) -> None:
+        """Write the authority, the catalogue and the server's key."""
+        if catalogue.profile is Profile.PRODUCTION:
             from mapweave.identities.authority import Authority
 
-            authority, private_key = Authority.create(fleet)
+            authority, private_key = Authority.create(catalogue.fleet)
             write_whole(path / AUTHORITY, authority.certificate.encode())
             write_private(path / AUTHORITY_KEY, private_key)
         write_whole(path / CATALOGUE, msgspec.json.format(msgspec.json.encode(catalogue), indent=1))
-        folder = cls(path)
-        folder.add(server, Role.SERVER, SERVER_DAYS)
-        return folder
+        cls(path).add(server, Role.SERVER, SERVER_DAYS)
 
     @property
     def profile(self) -> Profile:
@@ -198,8 +220,9 @@ class KeyFolder:
             credentials = Credentials(name, role, password=secrets.token_urlsafe(24))
             identity = Identity(name, role, subject, issued_at, void=void)
         path = self.path / f"{name}{SUFFIX}"
-        write_key_file(path, KeyFile(self.catalogue.fleet, self.catalogue.endpoints, credentials))
-        self._keep(identity)
+        with _kept_on_failure(path, self.path / PASSWORDS):
+            write_key_file(path, KeyFile(self.catalogue.fleet, self.catalogue.endpoints, credentials))
+            self._keep(identity)
         return path
 
     def revoke(self, name: str, because: str = "") -> None:
@@ -271,18 +294,42 @@ class KeyFolder:
 
     def _keep(self, identity: Identity) -> None:
         others = tuple(one for one in self.catalogue.identities if one.name != identity.name)
-        self.catalogue = replace(self.catalogue, identities=(*others, identity))
+        catalogue = replace(self.catalogue, identities=(*others, identity))
         if self.profile is Profile.LAB:
-            users = [one.name for one in self.catalogue.identities if not one.revoked]
+            users = [one.name for one in catalogue.identities if not one.revoked]
             lines = [f"{name}:{read_key_file(self.key_file(name)).credentials.password}" for name in users]
             write_private(self.path / PASSWORDS, "\n".join(lines) + "\n")
         # Last: the server reads all of it again when this has changed.
-        text = msgspec.json.format(msgspec.json.encode(self.catalogue), indent=1)
+        text = msgspec.json.format(msgspec.json.encode(catalogue), indent=1)
         write_whole(self.path / CATALOGUE, text)
         give_to_folders_owner(self.path / CATALOGUE)
+        self.catalogue = catalogue
 
     def _read(self, name: str) -> str:
         try:
             return read_whole(self.path / name).decode()
         except (OSError, UnicodeDecodeError) as error:
             raise SettingsError(f"{self.path / name}: {error}") from None
+
+
+@contextmanager
+def _kept_on_failure(*paths: Path) -> Iterator[None]:
+    """Put files back as they were if what is done fails; on a full disk a name is left, but no room."""
+    before = {path: path.with_name(f".{path.name}.before") for path in paths}
+    for path, kept in before.items():
+        kept.unlink(missing_ok=True)
+        if path.exists():
+            os.link(path, kept)
+    try:
+        yield
+    except BaseException:
+        for path, kept in before.items():
+            if kept.exists():
+                kept.replace(path)
+            else:
+                path.unlink(missing_ok=True)
+        raise
+    finally:
+        # Also behind a failure: two names of one file are left by a replacement.
+        for kept in before.values():
+            kept.unlink(missing_ok=True)

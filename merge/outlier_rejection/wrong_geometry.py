@@ -35,6 +35,7 @@ from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2
+from mapweave.merge.outlier_rejection.shuffled_maps import is_shuffled
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
@@ -256,7 +257,7 @@ def all_refuted(
     """
     if not _nodes_agree(links, fixed):
         return False
-    if is_bent(links, placed, fixed):
+    if is_bent(links, placed, fixed) or is_shuffled(links, placed, fixed):
         return True
     sets = link_sets(links, placed, fixed, s)
     sets = [some_links for some_links in sets if len(some_links) >= LEAST_SHARE * len(sets[0])]

@@ -130,6 +130,7 @@ class MergedMap:
             mapweave.merge.map_maintenance.landmark_removal. Nodes without faded landmarks are left out.
         set_apart: maps that are not among these, because the merge fails with them or they are copies, and
             why.
+        copies: those of them that are copies of other maps, which a person may link all the same.
         implausible: maps in which is what no robot can have measured, and what; see
             mapweave.mapserver.plausibility.
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
@@ -149,6 +150,7 @@ class MergedMap:
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     set_apart: Mapping[MapId, str] = field(default_factory=dict)
+    copies: Mapping[MapId, HybridMap] = field(default_factory=dict)
     implausible: Mapping[MapId, str] = field(default_factory=dict)
     wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
     contradicted: Mapping[tuple[NodeId, NodeId], str] = field(default_factory=dict)

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from benchmarks.shards.benchmark import IN_A_ROW, Tally
+from benchmarks.shards.askers import IN_A_ROW, Tally
 
 
 def test_recovery_by_hand() -> None:

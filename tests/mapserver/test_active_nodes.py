@@ -14,6 +14,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
+from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.active_nodes import ActiveNodes, without_faded
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
@@ -120,6 +121,15 @@ def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
     assert all(node.map == HERE for node, _ in places.query(two.view(THERE), 5))
     two.merger.constrain(ManualConstraints())
     assert any(node == late.id for node, _ in two.merger.places.query(two.view(THERE), 5))
+
+
+def test_what_an_inactive_node_has_replaced_is_active(two: Two) -> None:
+    two.merger.constrain(ManualConstraints())
+    old, new = NodeId("a", 1, 1), NodeId("b", 1, 1)
+    merged = replace(two.merger.merged(), superseded={old: Superseded(new, 30, 0.1, 0.1)})
+    for set_apart, active in ((), False), ((new,), True):
+        places = ActiveNodes(two.merger.places, two.merger.node, merged, set_apart)
+        assert (old in dict(places.query(two.view(HERE), 5))) is active
 
 
 def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,10 @@ import pytest
 
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import Linked
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.limits import MAX_NUMBER
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEventKind
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -19,7 +23,8 @@ from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.log.entry import unmeasurable
 from mapweave.mapserver.merging.copies import Copies, copied_landmarks
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.plausibility import MOST_FRAGMENTS
+from mapweave.mapserver.plausibility import MOST_FRAGMENTS, unreliable_robots
+from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.wire.codec import decode_change
 from mapweave.wire.log_messages import Head
@@ -58,12 +63,21 @@ def views(map_id: MapId, step: Pose2, covariance: np.ndarray) -> list[ChangeBody
 
 
 def chain(map_id: MapId, nodes: list[Node], step: Pose2, covariance: np.ndarray) -> list[ChangeBody]:
+    return driven(map_id, nodes, [step] * (len(nodes) - 1), covariance)
+
+
+def driven(
+    map_id: MapId, nodes: list[Node], steps: list[Pose2], covariance: np.ndarray = STEP
+) -> list[ChangeBody]:
+    """Nodes with these ways between them."""
     out: list[ChangeBody] = []
     for k, node in enumerate(nodes):
         out.append(NodePut(replace(node, id=NodeId(*map_id, 2 * k + 1), stamp_ns=k * 10**9)))
         if k:
             ends = NodeId(*map_id, 2 * k - 1), NodeId(*map_id, 2 * k + 1)
-            edge = Edge(NodeId(*map_id, 2 * k), *ends, PoseGaussian(step, covariance), EdgeKind.MAPPED)
+            edge = Edge(
+                NodeId(*map_id, 2 * k), *ends, PoseGaussian(steps[k - 1], covariance), EdgeKind.MAPPED
+            )
             out.append(EdgePut(edge))
     return out
 
@@ -148,6 +162,29 @@ def test_who_shares_landmarks_with_most_has_copied_them_if_nothing_else_tells() 
     assert all(copied_landmarks(a, b) == 0 for a in other for b in sound)
 
 
+def test_a_person_links_two_maps_of_one_recording() -> None:
+    """They are copies of each other until then, and again when the link is taken back."""
+    merger = Merger()
+    log = [decode_change(message) for message in next(iter(sound_logs().values()))]
+    again = [change.body.node for change in log if isinstance(change.body, NodePut)]
+    steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
+    for change in log:
+        merger.on_change(change)
+    for number, body in enumerate(driven(LAST, again, steps), start=1):
+        merger.on_change(Change(LAST, number, 0, body))
+    merged = merger.merged()
+    assert merged.set_apart.keys() == {LAST}
+    asked = ManualConstraint(Linked(again[0].id, NodeId(*LAST, 1)), True, "anna", 1, "one recording")
+    linked = check_manual_constraint(merged, ManualConstraints(), asked, merger.maps).constraint
+    merger.constrain(ManualConstraints([linked]))
+    merged = merger.merged()
+    assert not merged.set_apart
+    one, other = (merged.pose(node) for node in (again[0].id, NodeId(*LAST, 1)))
+    assert merged.joined(again[0].id.map, LAST) and one.distance(other) < 0.05
+    merger.constrain(ManualConstraints([linked, replace(linked, holds=False)]))
+    assert merger.merged().set_apart.keys() == {LAST}
+
+
 def test_edges_that_no_robot_measures() -> None:
     own, other = NodeId(*LAST, 1), NodeId(*FIRST, 3)
     for end, kind, x, variance, words in (
@@ -178,6 +215,51 @@ def test_fragments_make_no_answer_ambiguous() -> None:
     assert list(merged.implausible) == [LAST]
     relocalizer = Answers.of(merger, merged, merger.node).relocalizer
     assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+
+
+def test_many_bad_maps_speak_against_a_robot_unless_most_of_its_nodes_are_sound() -> None:
+    nodes = take_map(WORLD, LAST, [*TOUR] * 7, np.random.default_rng(8))[0]
+
+    def held(size: int) -> HybridMap:
+        out = HybridMap()
+        for node in nodes[:size]:
+            out.apply(NodePut(node))
+        return out
+
+    small = {MapId("z", epoch): held(3) for epoch in range(1, MOST_FRAGMENTS + 2)}
+    assert unreliable_robots(small, ()) == {"z": {*small}}
+    assert not unreliable_robots(dict(list(small.items())[:-1]), ())
+    large = {MapId("z", 50): held(3 * len(small))}
+    assert not unreliable_robots(small | large, ())
+    assert unreliable_robots(small | large, [*large]) == {"z": {*small, *large}}
+
+
+def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_rooms_does() -> None:
+    """The fragment has two views where they are, and a third one elsewhere."""
+    merger = Merger()
+    for log in sound_logs().values():
+        for message in log:
+            merger.on_change(decode_change(message))
+    beside = Pose2(0.1, 0.1, 0.2)
+    tour = [TOUR[3], TOUR[3] @ beside, TOUR[0]]
+    # The newest map of a robot is no fragment. Of the third view less is seen: else nothing would be joined.
+    for epoch, count in ((1, 3), (2, 1)):
+        map_id = MapId(LAST.agent, epoch)
+        nodes = take_map(WORLD, map_id, tour[:count], np.random.default_rng(8))[0]
+        nodes[2:] = [replace(one, landmarks=one.landmarks.take(np.arange(0, 90, 2))) for one in nodes[2:]]
+        for number, body in enumerate(driven(map_id, nodes, [beside, Pose2(1.0, 2.0, 0.5)]), start=1):
+            merger.on_change(Change(map_id, number, 0, body))
+    assert {MapId(LAST.agent, 1)} <= {node.map for node in merger.merged().components[0]}
+    relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
+    assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+    # Alone, and in one map: no other robot says that the second room is there.
+    steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
+    nodes = take_map(WORLD, FIRST, [*TOUR, *TOUR], np.random.default_rng(5))[0]
+    for number, body in enumerate(driven(FIRST, nodes, [*steps, Pose2(20.0), *steps]), start=1):
+        merger.on_change(Change(FIRST, number, 0, body))
+    assert not merger.merged().wrong
+    relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
+    assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.AMBIGUOUS] * 2
 
 
 def test_nothing_is_concluded_from_a_clock_that_runs_backwards() -> None:

@@ -28,10 +28,10 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.zenoh_bus import ZenohBus
+from synthetic.postgres_server import PostgresServer, binaries
 from tests.mapserver.log.acknowledged_fleet import AGENT, life
 from tests.mapserver.log.test_front_servers import FrontServer, logs_of
 from tests.mapweave.test_map_commands import logs
-from tests.postgres import PostgresServer, binaries
 from tests.waiting import eventually
 
 KEYS = Keys("fleet")

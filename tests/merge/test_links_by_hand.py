@@ -121,10 +121,10 @@ def test_images_that_do_not_agree_are_refused_unless_a_person_knows_better(seam:
     with pytest.raises(InvalidValue, match=r"do not show one place: \d+ features? match"):
         seam.ask(Linked(*pair))
     # Where they agree, they know better than a person.
-    with pytest.raises(InvalidValue, match=r"agree on another pose, .* from yours; leave --pose out"):
+    with pytest.raises(InvalidValue, match=r"agree on another pose, .* from yours; leave your pose out"):
         seam.ask(Linked(LAST, FIRST, seam.true(LAST, FIRST) @ Pose2(1.0, 0.0, 0.0)), because="sure")
     true = seam.true(*pair)
-    with pytest.raises(InvalidValue, match="needs a reason: --because"):
+    with pytest.raises(InvalidValue, match="needs a reason"):
         seam.ask(Linked(*pair, true))
     assert "by hand alone" in seam.ask(Linked(*pair, true), because="measured with a tape")
     merged = seam.merger.merged()

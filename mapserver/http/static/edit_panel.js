@@ -48,8 +48,8 @@ export class EditPanel {
   }
   // The name of the login, which the server records.
   sign(name) {
-    permission.name = byId("edit-name").value = name;
-    byId("edit-name").readOnly = true;
+    permission.name = name;
+    byId("edit-who").hidden = true;
   }
   fields({ id, fields, more }) {
     const set = add(byId("edit-kinds"), "div", "", "fields"), inputs = {};

@@ -34,7 +34,7 @@ export const EDITORS = [
   { id: "link", group: "What is merged", label: "Link two places",
     hint: "Two nodes that see one place. The server asks their images, and whether the map allows it.",
     // Shown when the server asks for it.
-    more: "By hand: where the second node is, seen from the first", moreWhen: /--pose/,
+    more: "By hand: where the second node is, seen from the first", moreWhen: /by hand/,
     fields: [
       { name: "x", label: "Ahead, m", type: "number", step: "any", more: true },
       { name: "y", label: "To the left, m", type: "number", step: "any", more: true },

@@ -82,6 +82,17 @@ def test_a_person_who_walks_about_does_not_change_it() -> None:
     assert found is None or abs(found.log) < 2.5 * found.sigma
 
 
+def test_a_scanner_counts_as_one_sensor_each_way() -> None:
+    """One drive toward a wall is one stretch, however many beams see it: its wheels slip once."""
+    bearings = tuple(math.radians(k) for k in range(-180, 180))
+    rangers = RangerScale(RobotDescription(BODY.camera, ranger_bearings=bearings, ranger_reach=8.0))
+    for _ in range(3):
+        for tick in range(40):
+            rangers.step(Odometry(0.025, 0.0), np.full(360, 2.0 - 0.025 * tick))
+        rangers.step(Odometry(0.0, 1.0), np.full(360, 8.0))
+    assert rangers.scale() is None
+
+
 def test_without_a_sensor_along_the_way_or_a_drive_nothing_is_said() -> None:
     blind = RangerScale(RobotDescription(BODY.camera, ranger_bearings=(0.5, -0.5), ranger_reach=3.0))
     none = RangerScale(RobotDescription(BODY.camera))

@@ -43,10 +43,24 @@ def test_verdicts_are_those_of_one_server(failing: int, monkeypatch: pytest.Monk
             assert one.a_from_b.mean == other.a_from_b.mean
 
 
-def test_without_a_cluster_all_is_done_here() -> None:
+def test_without_a_cluster_all_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "PAIRS", 2)
     nodes = [change.node for _, change in Building.draw(1, 4, 1).log(0) if isinstance(change, NodePut)]
 
     def call(request: bytes) -> Future[bytes]:
         raise AssertionError("there is no cluster")
 
     assert len(WorkPool(call, lambda: 0).compare(list(combinations(nodes, 2)))) == 6
+
+
+def test_workers_that_never_answer_are_not_waited_for_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "PATIENCE", 0.5)
+    nodes = [change.node for _, change in Building.draw(1, 5, 1).log(0) if isinstance(change, NodePut)]
+    pairs, asked = list(combinations(nodes, 2)), []
+
+    def call(request: bytes) -> Future[bytes]:
+        asked.append(request)
+        return Future()
+
+    pool = WorkPool(call, lambda: 1)
+    assert len(pool.compare(pairs)) == len(pool.compare(pairs)) == 10 and len(asked) == 3

@@ -173,6 +173,8 @@ def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, t
     # The images do not agree: that is refused with the figures, and a pose by hand offered.
     refusal = person.edit("link", "one door")
     assert "do not show one place" in refusal and "10 are needed" in refusal
+    assert "--" not in refusal and "mapweave" not in refusal, "words of the shell mean nothing on a page"
+    assert browser.run("return document.getElementById('edit-name').checkVisibility()")
     assert browser.run("return document.querySelector('#edit-kinds details').open")
     assert browser.run("return document.getElementById('edit-because').value") == "one door"
     assert browser.run("return document.getElementById('edit-apply').disabled")

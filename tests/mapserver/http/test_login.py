@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import json
 import logging
+import select
 import socket
 import ssl
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from email.message import Message
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from mapweave.identities.logins import Logins
 from mapweave.identities.tokens import TOKENS, end_tokens
 from mapweave.mapserver.http import sessions
 from mapweave.mapserver.http.rates import MOST_PEOPLE, QUESTIONS, Rates
-from mapweave.mapserver.http.serving import Limits
+from mapweave.mapserver.http.serving import MAX_WAITING, Limits
 from mapweave.mapserver.http.tls import load, server_context
 from mapweave.mapserver.http.web import Questions, Web
 from mapweave.mapserver.quotas import BURST
@@ -319,6 +320,35 @@ def test_who_logs_in_over_https_sees_the_certificate_of_the_authority(
         assert json.load(urllib.request.urlopen(asked, context=trusting, timeout=20))["nodes"] == 12
 
 
+def test_handshakes_that_are_never_begun_make_room(services: StubServices, tmp_path: Path) -> None:
+    """Hundreds were held until their time was over: with the limit of open files no one else got in."""
+    folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0")
+    tls = server_context(read_key_file(folder.key_file("s0")).credentials)
+    trusting = ssl.create_default_context(cafile=str(folder.path / "authority.pem"))
+    more = 60
+    with (
+        Web(
+            ("127.0.0.1", 0), services, limits=Limits(head=120.0), logins=Logins(folder.path), tls=tls
+        ) as web,
+        ExitStack() as opened,
+    ):
+        half = [
+            opened.enter_context(socket.create_connection(("127.0.0.1", web.port), timeout=20))
+            for _ in range(MAX_WAITING + more)
+        ]
+        eventually(lambda: sum(ended(one) for one in half[:more]) == more)
+        assert not any(ended(one) for one in half[more:])
+        answer = encrypted(web, trusting, b"GET /session HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert answer.startswith(b"HTTP/1.1 401 ")
+
+
+def ended(connection: socket.socket) -> bool:
+    """Whether the other side has closed it."""
+    poll = select.poll()
+    poll.register(connection, select.POLLIN | select.POLLHUP)
+    return bool(poll.poll(0))
+
+
 def encrypted(web: Web, context: ssl.SSLContext, data: bytes) -> bytes:
     with (
         socket.create_connection(("127.0.0.1", web.port), timeout=20) as plain,
@@ -334,7 +364,7 @@ def encrypted(web: Web, context: ssl.SSLContext, data: bytes) -> bytes:
         return got
 
 
-def test_one_who_asks_without_end_is_told_when_and_nobody_else_waits(
+def test_one_who_asks_without_end_gets_the_time_to_retry_and_no_other_waits(
     tmp_path: Path, services: StubServices, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By name, whatever the way of logging in; what costs nothing is not counted."""

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
+from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
+from mapweave.mapserver.http.tls import server_context
 from mapweave.mapserver.http.web import Web
 from mapweave.wire.credentials import Role
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.conftest import MappedRoom
 from tests.mapserver.house import House
+from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -25,6 +32,10 @@ WHO = "return document.getElementById('who').textContent"
 SELECTED = "return document.getElementById('selected').textContent"
 ROBOT = "const robot = document.querySelector('#robots button'); robot?.click(); return Boolean(robot)"
 SUMMARY = "return document.getElementById('summary').textContent"
+NAMED = """
+document.getElementById('tab-edit')?.click();
+return document.getElementById('edit-name').checkVisibility()
+"""
 EXPLORE = "[...document.querySelectorAll('#selected button')].find(b => b.textContent === 'Explore').click()"
 RETIRE = """
 const body = JSON.stringify({ retire: ["r0.1.5"], because: "a mirror", by: "mallory" });
@@ -80,6 +91,7 @@ def test_a_viewer_looks_and_an_operator_commands(
         )
         eventually(lambda: control.report is not None)
         assert control.report is not None and control.report.order.by == "otto"
+        assert not page.run(NAMED), "the record has the name of the login"
         look("operator")
         page.run(RETIRE)
         eventually(lambda: any("by otto on" in event.words for event in house.server.history()))
@@ -92,3 +104,33 @@ def test_a_viewer_looks_and_an_operator_commands(
         assert page.run(SUMMARY) == "", "nothing of the fleet is left on the page"
     link.close()
     house.close()
+
+
+@pytest.mark.slow
+def test_the_page_over_https(tmp_path: Path) -> None:
+    """Login, session and the live map, with the certificate of the fleet's authority."""
+    folder = KeyFolder.create(tmp_path / "keys", "fleet", Profile.PRODUCTION, [], "s0")
+    folder.add("vera", Role.VIEWER)
+    token, own = folder.token("vera", 1.0), read_key_file(folder.key_file("s0")).credentials
+    key = x509.load_pem_x509_certificate(own.certificate.encode()).public_key()
+    spki = hashlib.sha256(key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)).digest()
+    trusted = f"--ignore-certificate-errors-spki-list={base64.b64encode(spki).decode()}"
+    services = StubServices()
+    with (
+        Web(("127.0.0.1", 0), services, logins=Logins(folder.path), tls=server_context(own)) as web,
+        Browser(tmp_path / "profile", trusted) as page,
+    ):
+        page.open(f"https://127.0.0.1:{web.port}/")
+        eventually(lambda: page.run(FORM))
+        page.type("#token", token)
+        page.run("document.getElementById('login').requestSubmit()")
+        eventually(lambda: page.run(WHO) == "vera, viewer")
+        eventually(lambda: "12 nodes" in page.run(SUMMARY))
+        assert page.run("return location.protocol + document.cookie") == "https:", "scripts see no cookie"
+    with (
+        Web(("127.0.0.1", 0), services, logins=Logins(folder.path), tls=server_context(own)) as web,
+        Browser(tmp_path / "stranger") as page,
+    ):
+        page.open(f"https://127.0.0.1:{web.port}/")
+        assert page.run("return document.getElementById('login')") is None, "who does not trust it is warned"
+        assert "ERR_CERT_AUTHORITY_INVALID" in page.run("return document.documentElement.textContent")

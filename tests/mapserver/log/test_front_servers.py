@@ -214,3 +214,18 @@ def test_robots_keep_what_they_have_while_postgresql_is_away(journals: list[Jour
         robot.close()
     server.close()
     servers.close()
+
+
+def test_a_frozen_server_does_not_lead_for_ever(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(postgres_follower, "FROZEN", "1s")
+    monkeypatch.setattr(postgres_follower, "BEAT", 1000.0)
+    frozen = PostgresStore(address, "s0")
+    frozen.follow(lambda news: None)
+    eventually(lambda: frozen.leads)
+    monkeypatch.setattr(postgres_follower, "BEAT", 0.1)
+    other = PostgresStore(address, "s1")
+    other.follow(lambda news: None)
+    eventually(lambda: other.leads)
+    eventually(lambda: not frozen.leads)
+    other.close()
+    frozen.close()

@@ -16,22 +16,22 @@ STEPS = st.lists(
 
 
 @given(STEPS)
-def test_the_lag_is_never_told_too_small(steps: list[tuple[int, float, float]]) -> None:
+def test_the_lag_is_never_too_small(steps: list[tuple[int, float, float]]) -> None:
     log = AgentLog(MapId("r0", 1), 7, PullSettings())
-    told: list[tuple[int, float]] = []
+    announced: list[tuple[int, float]] = []
     now, newest, watermark, began = 0.0, 0, 0, 0.0
     for count, pause, share in steps:
         for _ in range(count):
             now, newest = now + pause, newest + 2
-            began = now if not told else began
+            began = now if not announced else began
             log.announce(newest, now)
             log.announce(newest - 1, now + 1.0)
-            told.append((newest, now))
+            announced.append((newest, now))
         watermark += int(share * (newest - watermark))
         log.settled(Applied((), (), watermark))
-        told = [(number, at) for number, at in told if number > watermark]
-        true = now - told[0][1] if told else 0.0
+        announced = [(number, at) for number, at in announced if number > watermark]
+        true = now - announced[0][1] if announced else 0.0
         assert true <= log.lag(now) <= now - began + 1e-9
-        if not told or watermark == 0:
+        if not announced or watermark == 0:
             assert log.lag(now) == true
         assert len(log._announced) <= MOST_ANNOUNCED

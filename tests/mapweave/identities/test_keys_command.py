@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import resource
 import stat
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,3 +158,71 @@ def test_certificates_are_what_they_say(tmp_path: Path) -> None:
         assert not certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         assert ("maps.local" in names.get_values_for_type(x509.DNSName)) == server
+
+
+class FullDisk:
+    """Takes so many files, and then none."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.left = 1000
+        sync = os.fsync
+
+        def fsync(handle: int) -> None:
+            if stat.S_ISREG(os.fstat(handle).st_mode):
+                self.left -= 1
+                if self.left < 0:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            sync(handle)
+
+        monkeypatch.setattr("mapweave.storage.atomic_file.os.fsync", fsync)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()} if folder.exists() else {}
+
+
+@pytest.mark.parametrize("profile", ["production", "lab"])
+def test_a_full_disk_leaves_no_half_authority(
+    profile: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With a catalogue and without a server's key `init` said that there are keys already."""
+    folder, disk, count = tmp_path / "keys", FullDisk(monkeypatch), 0
+    while True:
+        disk.left = count
+        words = ["keys", "init", "--keys", str(folder), "--at", "10.0.0.5", "--profile", profile]
+        if main(words) == 0:
+            break
+        (line,) = capfd.readouterr().err.splitlines()
+        assert "No space left" in line and str(folder) in line
+        assert not folder.exists()
+        count += 1
+    assert count >= 3
+    assert KeyFolder(folder).key_file("s0").exists()
+
+
+@pytest.mark.parametrize("name", ["r0", "r1"])
+def test_a_full_disk_leaves_keys_as_they_were(
+    name: str, keys: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Of a robot that has a key and of one that has none: half of a new one is a key that no server knows."""
+    disk, before, count = FullDisk(monkeypatch), contents(keys), 0
+    while True:
+        disk.left = count
+        if main(["keys", "add", name, "--keys", str(keys)]) == 0:
+            break
+        (line,) = capfd.readouterr().err.splitlines()
+        assert "No space left" in line
+        assert contents(keys) == before
+        count += 1
+    assert count >= 2
+    assert not [path for path in keys.iterdir() if path.name.startswith(".")]
+
+
+def test_a_disk_that_is_really_full_is_one_line(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "mapweave", "keys", "init", "--keys", "keys", "--profile", "lab"]
+    done = subprocess.run(
+        words, cwd=tmp_path, capture_output=True, text=True, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
+    )  # fmt: skip
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "cannot be written" in done.stderr
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,37 @@
+"""A server whose cluster is not there does all by itself, and says why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from mapweave.cli import main
+from mapweave.hybridmap.query import Certainty
+from mapweave.mapserver.cluster.settings import ClusterSettings
+from mapweave.mapserver.server import MapServer, ServerSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.mapserver.conftest import MappedRoom
+from tests.waiting import eventually, free_port
+
+
+def test_the_server_needs_no_cluster(
+    mapped_room: Callable[[], MappedRoom], caplog: pytest.LogCaptureFixture
+) -> None:
+    room, bus = mapped_room(), MemoryBus(MemoryHub())
+    nowhere = f"127.0.0.1:{free_port()}"
+    settings = replace(ServerSettings(), cluster=ClusterSettings(nowhere, shards=2))
+    with MapServer(bus, Keys("fleet"), room.path, "s0", settings) as server:
+        eventually(lambda: server.status()["nodes"] == 7)
+        eventually(lambda: f"nothing listens at {nowhere}" in caplog.text)
+        assert server.status()["cluster"] == "0 of 2 shards; 2 in this process"
+        answer = server.locate(lambda: room.view(next(iter(room.truth))), 1).result(30.0)
+        assert answer.certainty is Certainty.FOUND and not answer.partial
+    bus.close()
+
+
+def test_lock_step_and_a_cluster_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["server", "--lockstep", "--ray", "auto"]) == 1
+    assert "--lockstep is repeatable, and a cluster is not" in capsys.readouterr().err
