@@ -356,11 +356,10 @@ class Merger:
             for node in plan.nodes:
                 if node in hybrid_map.graph:
                     self._replay(map_id, NodeRetired(node))
-            if not hybrid_map.nodes:
+            if not (hybrid_map.nodes or hybrid_map.edges):
                 del self.maps[map_id]
                 self._changed.discard(map_id)
                 self._kept.pop(map_id, None)
-                self._implausible.pop(map_id, None)
         self.alike.remove(plan.nodes)
         self.reaches.remove(plan.nodes)
         self._pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
@@ -369,10 +368,6 @@ class Merger:
         """Go on with what another process has pruned, before anything is merged."""
         self.pruning = pruning
         self._pipeline.replace_marginals(pruning.marginals, pruning.standing)
-
-    def status(self) -> str:
-        """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
-        return self.merged().summary()
 
     def _replay(self, map_id: MapId, change: ChangeBody) -> None:
         """Take a change into its map, and forget what no longer holds."""
