@@ -44,6 +44,9 @@ class Standing(StrEnum):
 ALIASED = "aliased"
 """Name among a link's evidence: of its inliers, landmarks that are found at other places too; absent if none
 is known (see mapweave.merge.outlier_rejection.distinctness)."""
+MARGINAL = "marginal"
+"""Likewise, of a link that is left of nodes that have left the map (see
+mapweave.merge.pose_graph.marginalization)."""
 
 
 MAX_MAPS_LISTED = 256

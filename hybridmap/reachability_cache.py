@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import Edge, EdgeId, Node
+from mapweave.hybridmap.node import Edge, EdgeId, Node, NodeId
 from mapweave.hybridmap.reachability import Reachability, left, reachability_of
 
 
@@ -35,6 +35,14 @@ class ReachabilityCache:
             cached = behind, reachability_of(visible_edge, a, b)
             self._cache[edge.id] = cached
         return cached[1]
+
+    def remove(self, nodes: Container[NodeId]) -> None:
+        """Forget all edges at some nodes."""
+        self._cache = {
+            edge_id: (behind, reachability)
+            for edge_id, (behind, reachability) in self._cache.items()
+            if not any(isinstance(end, Node) and end.id in nodes for end in behind)
+        }
 
     def forget(self, but: Container[EdgeId]) -> None:
         """Forget all edges but some."""

@@ -89,8 +89,8 @@ def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
     has left very many: so many views of one place would be all that a question is compared with.
     """
     maps = {map_id: one for map_id, one in merged.maps.items() if map_id not in merged.constraints.retired}
-    wrong = {*merged.wrong, *merged.implausible, *fragments(maps)}
-    unreliable = unreliable_robots(maps, merged.wrong)
+    wrong = {*merged.wrong, *merged.implausible, *fragments(maps, merged.pruned.maps)}
+    unreliable = unreliable_robots(maps, merged.wrong, merged.pruned.maps)
     for some in unreliable.values():
         yield from (node for map_id in some for node in merged.maps[map_id].nodes)
     for refusal in merged.refused if wrong or unreliable else ():
@@ -102,7 +102,7 @@ def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
 
 def _adrift(merged: MergedMap) -> Iterator[NodeId]:
     """Nodes of fragments that nothing joins with a larger map: an answer from there would be of no use."""
-    small = set(fragments(merged.maps))
+    small = set(fragments(merged.maps, merged.pruned.maps))
     for graph in merged.graphs if small else ():
         if graph.maps <= small:
             yield from graph.nodes

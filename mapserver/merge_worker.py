@@ -19,6 +19,7 @@ from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, compare
+from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import Job, Schedule
@@ -51,6 +52,7 @@ class MergeWorker:
         history: MapHistory | None = None,
         compare: Compare = compare,
         observe: Callable[[float], None] = lambda seconds: None,
+        pruning: PruningRecord | None = None,
     ) -> None:
         """Start with no map.
 
@@ -63,9 +65,10 @@ class MergeWorker:
             history: records what joins and parts.
             compare: compares nodes.
             observe: called with the time that a merge has taken, s.
+            pruning: prunes what has been superseded for long; None: nothing is.
         """
         self._schedule = schedule
-        self._keeper = keeper
+        self._keeper, self._pruning = keeper, pruning
         self._history = history or MapHistory()
         self._observe = observe
         self._share = share
@@ -189,6 +192,8 @@ class MergeWorker:
         self._schedule.post(change)
 
     def _restore(self) -> None:
+        if self._pruning:
+            self._pruning.restore(self._merger)
         if self._keeper:
             try:
                 self._keeper.restore(self._merger)
@@ -317,3 +322,8 @@ class MergeWorker:
             self._history.follow(merged)
         except Exception:  # a defect here must not end all merging
             log.exception("the history of the maps could not be written")
+        try:
+            if self._pruning and self._pruning.prune(self._merger, self._schedule.time_ns()):
+                self._dirty = True
+        except Exception:  # it is tried again the next day
+            log.exception("what has been superseded for long could not be pruned")

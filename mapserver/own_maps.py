@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MERGE_AUTHOR, Edge, MapId
 from mapweave.storage.map_file import MapFile
@@ -21,6 +22,12 @@ def maps_of(content: MapFile) -> dict[MapId, HybridMap]:
         if not (isinstance(change, EdgePut) and is_link(change.edge)):
             maps.setdefault(element.map, HybridMap()).apply(change)
     return maps
+
+
+def marginal_links(content: MapFile) -> tuple[Edge, ...]:
+    """The links in a file that are left of nodes which a server has pruned."""
+    edges = (change.edge for change in content.changes if isinstance(change, EdgePut))
+    return tuple(edge for edge in edges if is_link(edge) and MARGINAL in edge.evidence)
 
 
 def is_link(edge: Edge) -> bool:

@@ -85,6 +85,10 @@ class Places:
             node = NodeId.parse(word)
         except InvalidValue:
             raise InvalidValue(f"{word!r} is no place of this map{self.alike(word)}: {FORMS}") from None
+        stands = self.merged.pruned.successor(node, self.merged.poses)
+        if stands is not None and stands[0] != node:
+            found = self.resolve(str(stands[0]))
+            return replace(found, note=self.merged.pruned.words(node, self.merged.poses))
         self.merged.check(node)
         number = self.merged.component_of(node)
         if number is None:

@@ -7,7 +7,7 @@ show, and is not joined with them, it makes no answer ambiguous (mapweave.mapser
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Container, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
@@ -33,16 +33,20 @@ MOST_FRAGMENTS = 8
 """Of a robot, and maps with wrong geometry. One that loses its way leaves one or two a day."""
 
 
-def fragments(maps: Mapping[MapId, HybridMap]) -> list[MapId]:
+def fragments(maps: Mapping[MapId, HybridMap], pruned: Container[MapId] = ()) -> list[MapId]:
     """Maps with fewer nodes that their robots have left for others: nothing tells whether they are right.
 
     Of a robot that leaves very many, the newest as well.
+
+    Args:
+        maps: by id.
+        pruned: maps that had more nodes, which newer ones have superseded.
     """
     small: dict[str, list[MapId]] = {}
     newest: dict[str, int] = {}
     for map_id, hybrid_map in sorted(maps.items()):
         newest[map_id.agent] = map_id.epoch
-        if len(hybrid_map.nodes) < LEAST_NODES:
+        if len(hybrid_map.nodes) < LEAST_NODES and map_id not in pruned:
             small.setdefault(map_id.agent, []).append(map_id)
     return [
         map_id
@@ -52,7 +56,9 @@ def fragments(maps: Mapping[MapId, HybridMap]) -> list[MapId]:
     ]
 
 
-def unreliable_robots(maps: Mapping[MapId, HybridMap], wrong: Collection[MapId]) -> dict[str, set[MapId]]:
+def unreliable_robots(
+    maps: Mapping[MapId, HybridMap], wrong: Collection[MapId], pruned: Container[MapId] = ()
+) -> dict[str, set[MapId]]:
     """Robots with very many maps, and most of their nodes in them, that are wrong or too small: these maps.
 
     No test finds every wrong map, and each is one more place where a robot seems to be.
@@ -60,7 +66,7 @@ def unreliable_robots(maps: Mapping[MapId, HybridMap], wrong: Collection[MapId])
     bad: dict[str, set[MapId]] = {}
     balance = Counter[str]()
     for map_id, hybrid_map in maps.items():
-        if map_id in wrong or len(hybrid_map.nodes) < LEAST_NODES:
+        if map_id in wrong or (len(hybrid_map.nodes) < LEAST_NODES and map_id not in pruned):
             bad.setdefault(map_id.agent, set()).add(map_id)
             balance[map_id.agent] += len(hybrid_map.nodes)
         else:
@@ -68,10 +74,10 @@ def unreliable_robots(maps: Mapping[MapId, HybridMap], wrong: Collection[MapId])
     return {robot: some for robot, some in bad.items() if len(some) > MOST_FRAGMENTS and balance[robot] > 0}
 
 
-def scattered(maps: Mapping[MapId, HybridMap]) -> dict[MapId, str]:
-    """The first fragment of each robot that leaves very many."""
+def scattered(maps: Mapping[MapId, HybridMap], pruned: Container[MapId] = ()) -> dict[MapId, str]:
+    """The first fragment of each robot that leaves very many; see `fragments`."""
     by_robot: dict[str, list[MapId]] = {}
-    for map_id in fragments(maps):
+    for map_id in fragments(maps, pruned):
         by_robot.setdefault(map_id.agent, []).append(map_id)
     words = f"its robot has left {MOST_FRAGMENTS} maps and more with fewer than {LEAST_NODES} nodes each"
     return {some[0]: words for some in by_robot.values() if len(some) >= MOST_FRAGMENTS}

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -144,6 +145,11 @@ class Router:
             from all edges together. That of the first is relative to `start`. A way through portals ends at
             the first of them.
         """
+        present, pruned = self.merged.poses, self.merged.pruned
+        if any(node in pruned and node not in present for node in (start, goal)):
+            first, last = pruned.successor(start, present), pruned.successor(goal, present)
+            if first is not None and last is not None:
+                return self._beside(start, *first, last[0], blocked, wary, start_from_robot)
         if missing := self.missing(start, goal):
             return RouteAnswer((), missing)
         within = self.rules.around(start, start_from_robot or Pose2())
@@ -159,6 +165,26 @@ class Router:
                     return RouteAnswer((), self._all_closed(best.nodes, goal, within))
                 reason = reason or why_not
         return RouteAnswer((), reason or f"every way into the map near {start} is blocked")
+
+    def _beside(
+        self,
+        start: NodeId,
+        near: NodeId,
+        near_from_start: Pose2,
+        goal: NodeId,
+        blocked: Collection[tuple[NodeId, NodeId]],
+        wary: Collection[tuple[NodeId, NodeId]],
+        start_from_robot: Pose2 | None,
+    ) -> RouteAnswer:
+        """The way from a node that may have left the map, by another one that replaces it."""
+        if near == start:
+            return self.route(near, goal, blocked, wary, start_from_robot)
+        answer = self.route(near, goal, blocked, wary, near_from_start @ (start_from_robot or Pose2()))
+        if not answer.legs:
+            return answer
+        known = PoseGaussian(near_from_start.inverse(), np.zeros((3, 3)))
+        entry = replace(answer.legs[0], previous_from_node=known @ answer.legs[0].previous_from_node)
+        return replace(answer, legs=(entry, *answer.legs[1:]))
 
     def missing(self, start: NodeId, goal: NodeId) -> str:
         """Why no route can exist, in words; empty if there may be one."""

@@ -7,7 +7,7 @@ Ingest -> Store -> MergeWorker -> Answers <- Services <- robots, over the bus
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -22,6 +22,7 @@ from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
+from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.annotator import AnnotationRecord, Annotator
@@ -36,6 +37,7 @@ from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, News
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
+from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.metrics import Metrics, Sources
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
@@ -131,9 +133,13 @@ class MapServer:
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._metrics = Metrics()
+        # The servers of a shared store merge each by itself: what one prunes the others would still have.
+        pruning = None if self._store.shared else PruningRecord(
+            self._store, s.merge.keep_superseded_days, self._said, base.maps if base else ()
+        )  # fmt: skip
         self._worker = MergeWorker(
             clock, MERGE_SHARE, self._places, s.merge, findings, self._history, self._cluster.compare,
-            self._metrics.merged,
+            self._metrics.merged, pruning,
         )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
@@ -157,7 +163,7 @@ class MapServer:
         self._ingest = Ingest(
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
-            self._quotas, lambda: self._constraints.constraints.retired, worker.unmerged, worker.note_refusal,
+            self._quotas, self._gone, worker.unmerged, worker.note_refusal,
             self._metrics.acknowledged,
         )  # fmt: skip
         clock.give_way(lambda: self._ingest.busy)
@@ -410,6 +416,16 @@ class MapServer:
     def _damaged(self) -> int:
         """Changes that are damaged on the disk."""
         return sum(gap.last - gap.first + 1 for gap in self._store.damaged())
+
+    def _said(self) -> Iterator[object]:
+        """All that people have said of nodes."""
+        yield from self._constraints.constraints.made
+        yield from self._annotations.annotations.made
+
+    def _gone(self) -> Collection[MapId]:
+        """Maps that people have retired, or of which nothing is left."""
+        merged = self._worker.answers.merged
+        return {*self._constraints.constraints.retired, *(merged.pruned.maps - merged.maps.keys())}
 
     def _constrain(self) -> None:
         """Merge by the constraints and the floors of the records."""

@@ -12,12 +12,15 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import Edge, MapId
 from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.pruning import Pruning
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
-from mapweave.mapserver.own_maps import maps_of
+from mapweave.mapserver.own_maps import maps_of, marginal_links
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.links import link_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, read_map_file
@@ -38,6 +41,7 @@ class Parts:
         history: history of the maps in any of the files, in order.
         annotations: what people say about them in any of the files.
         images: of floor plans, by their names, in any of the files.
+        marginals: links that are left of nodes which a server has pruned, in any of the files.
     """
 
     maps: dict[MapId, HybridMap]
@@ -46,6 +50,7 @@ class Parts:
     history: tuple[MapEvent, ...] = ()
     annotations: Annotations = field(default_factory=Annotations)
     images: Mapping[str, bytes] = field(default_factory=dict)
+    marginals: tuple[Edge, ...] = ()
 
 
 def parts_of(files: Mapping[Path, MapFile] | Mapping[Path | str, MapFile]) -> Parts:
@@ -79,7 +84,9 @@ def parts_of(files: Mapping[Path, MapFile] | Mapping[Path | str, MapFile]) -> Pa
     history = sorted(events, key=lambda hybrid_map: (hybrid_map.stamp_ns, hybrid_map.kind, hybrid_map.words))
     said: Annotations = sum((Annotations(content.annotations) for content in files.values()), Annotations())
     images = {name: png for content in files.values() for name, png in content.images.items()}
-    return Parts(maps, constraints.with_floors(said.floors), tuple(notes), tuple(history), said, images)
+    marginals = {edge.id: edge for content in files.values() for edge in marginal_links(content)}
+    constraints = constraints.with_floors(said.floors)
+    return Parts(maps, constraints, tuple(notes), tuple(history), said, images, tuple(marginals.values()))
 
 
 def _length(hybrid_map: HybridMap) -> int:
@@ -108,6 +115,8 @@ def merge_parts(
     settings: MergeSettings | None = None,
     store: Path | None = None,
     pins: Sequence[Pin] = (),
+    marginals: Iterable[Edge] = (),
+    standing: Iterable[Pair] = (),
 ) -> MergedMap:
     """Merge robots' maps as the map server does.
 
@@ -118,6 +127,8 @@ def merge_parts(
         settings: how they are merged.
         store: the server's store from which they come: what that server has compared is not compared again.
         pins: that hold frames, oldest first.
+        marginals: links that are left of nodes which a server has pruned.
+        standing: verified links that this server no longer decides again, by their nodes.
 
     Raises:
         InvalidValue: a map cannot be merged; writing the others would lose it.
@@ -125,6 +136,7 @@ def merge_parts(
     merger = Merger(settings=settings)
     merger.constrain(constraints)
     merger.pin(pins)
+    merger.restore_pruning(Pruning([link_of(edge) for edge in marginals], standing))
     changes = [
         (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()
     ]
@@ -153,5 +165,7 @@ def merge_map_files(paths: Iterable[str | PathLike[str]]) -> MapFile:
         InvalidValue: a map cannot be merged.
     """
     parts = parts_of({Path(path): read_map_file(Path(path)) for path in paths})
-    merged = merge_parts(parts.maps, parts.constraints, pins=parts.annotations.pins)
+    merged = merge_parts(
+        parts.maps, parts.constraints, pins=parts.annotations.pins, marginals=parts.marginals
+    )
     return map_file_of(merged, parts.history, parts.annotations, parts.images)

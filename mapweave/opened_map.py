@@ -18,19 +18,20 @@ from typing import TYPE_CHECKING, TypeVar
 from mapweave.agent.replication import journal
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log import sqlite_store
 from mapweave.mapserver.log.opening import is_postgres
 from mapweave.mapserver.log.salvage import Salvage, all_of, salvage
-from mapweave.mapserver.log.store import HISTORY
-from mapweave.mapserver.own_maps import maps_of
+from mapweave.mapserver.log.store import HISTORY, PRUNING
+from mapweave.mapserver.own_maps import maps_of, marginal_links
 from mapweave.mapserver.plan_images import kept_images, recorded_images
 from mapweave.storage.database_reader import MAGIC as SQLITE
 from mapweave.storage.database_reader import reading
 from mapweave.storage.map_file import MAGIC, MapFile, read_map_file
-from mapweave.wire.messages import KeptHistory, decode
+from mapweave.wire.messages import KeptHistory, KeptPruning, decode
 
 if TYPE_CHECKING:
     from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -59,6 +60,7 @@ class OpenedMap:
             merged yet.
         maps: the robots' maps in it, also those of a journal that are empty.
         complaints: what of each map could not be read, in one line each; key None: what belongs to no map.
+        standing: verified links that a store's server no longer decides again, by their nodes.
     """
 
     path: Path | str
@@ -66,6 +68,7 @@ class OpenedMap:
     content: MapFile
     maps: tuple[MapId, ...]
     complaints: Mapping[MapId | None, str]
+    standing: frozenset[tuple[NodeId, NodeId]] = frozenset()
 
     @property
     def name(self) -> str:
@@ -97,7 +100,8 @@ class OpenedMap:
             return merged_of(self.content, settings)
         of_store = self.path if self.source is MapSource.STORE and isinstance(self.path, Path) else None
         pins = Annotations(self.content.annotations).pins
-        return merge_parts(maps, constraints, progress, settings, of_store, pins)
+        marginals = marginal_links(self.content)
+        return merge_parts(maps, constraints, progress, settings, of_store, pins, marginals, self.standing)
 
     def file(self, merged: MergedMap) -> MapFile:
         """The content of a map file that holds the whole map.
@@ -198,18 +202,26 @@ def _of_salvaged(
     constraints, bad = _read(salvaged.constraints, ManualConstraint)
     history, worse = _read([salvaged.results[HISTORY]] if HISTORY in salvaged.results else [], KeptHistory)
     annotations, worst = _read(salvaged.annotations, Annotation)
+    pruning, wrong = _read([salvaged.results[PRUNING]] if PRUNING in salvaged.results else [], KeptPruning)
+    bodies = [body for _, hybrid in sorted(salvaged.maps.items()) for body in hybrid.contents()]
+    for kept in pruning:
+        # These load the libraries that solve pose graphs.
+        from mapweave.mapserver.merging.pruning import marginal_of
+
+        bodies += [EdgePut(marginal_of(link).edge()) for link in kept.links]
     content = MapFile(
         "agent",
         _title(salvaged.maps),
-        tuple(body for _, hybrid in sorted(salvaged.maps.items()) for body in hybrid.contents()),
+        tuple(bodies),
         constraints=tuple(constraints),
         history=tuple(event for record in history for event in record.events),
         annotations=tuple(annotations),
         images=images(Annotations(tuple(annotations))),
     )
-    complaint = _lost(path, salvaged, bad + worse + worst)
+    complaint = _lost(path, salvaged, bad + worse + worst + wrong)
     maps = tuple(sorted(salvaged.maps))
-    return OpenedMap(path, MapSource.STORE, content, maps, {None: complaint} if complaint else {})
+    standing = frozenset(pair for kept in pruning for pair in kept.standing)
+    return OpenedMap(path, MapSource.STORE, content, maps, {None: complaint} if complaint else {}, standing)
 
 
 def _title(maps: Collection[MapId]) -> str:

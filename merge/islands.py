@@ -9,7 +9,7 @@ the merge without retired areas, and whether a link by hand is contradicted the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 
 import networkx as nx
@@ -23,7 +23,8 @@ from mapweave.merge.manual_constraints import CutMaps, apply_constraints
 from mapweave.merge.merging import MergeCache, decide
 from mapweave.merge.outlier_rejection.loop_closures import distance2_of
 from mapweave.merge.pose_graph.candidates import Pair
-from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
+from mapweave.merge.pose_graph.marginalization import fused, is_marginal
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
 from mapweave.merge.retired_nodes import retired_nodes
@@ -35,6 +36,8 @@ EXACT = 600
 depends on what there is alone, not on the order in which it came."""
 CHANGED = 0.25
 """Larger ones when links have come or gone that are this share of those that were decided together."""
+CONTRADICTION = "contradicts what nodes measured that have left the map since"
+"""Reason of a refusal."""
 
 
 class Islands:
@@ -56,6 +59,26 @@ class Islands:
         self._cut_maps = CutMaps()
         self._without_areas: Islands | None = None
         self._without_hand: Islands | None = None
+        self._marginals: Sequence[Link] = ()
+        self._standing: Set[Pair] = frozenset()
+        self._fused: dict[Pair, tuple[Link, Link, Link | None]] = {}
+
+    def replace_marginals(self, marginals: Sequence[Link], standing: Set[Pair]) -> None:
+        """Nodes were removed: these links are left of them, and of those that were removed before.
+
+        They join what they are about before all other links, and never fall: nodes are removed long after
+        their links were decided. So it is with verified links that were decided by what is gone.
+
+        Args:
+            marginals: all that count from now on, see `mapweave.merge.pose_graph.marginalization`.
+            standing: verified links that are not decided again, by their nodes.
+        """
+        self._marginals, self._standing = marginals, standing
+        pairs = {link.pair for link in marginals}
+        self._fused = {pair: entry for pair, entry in self._fused.items() if pair in pairs}
+        # Much of what is remembered is about nodes that are gone.
+        self._cache, self._abroad, self._cut_maps = MergeCache(), {}, CutMaps()
+        self._without_areas = self._without_hand = None
 
     def merge(
         self,
@@ -104,15 +127,49 @@ class Islands:
         constraints: ManualConstraints,
         earlier: Sequence[StandingDecisions],
     ) -> tuple[MergedMap, StandingDecisions]:
-        links, refused = _sorted_out(verdicts)
+        links, refused = self._with_marginals(maps, *_sorted_out(verdicts))
         undone = apply_constraints(maps, links, constraints, self._cut_maps)
-        everything = undone.maps, undone.links, [*refused, *undone.refused], self._settings, self._cache
+        decided = {link.key for link in undone.links if is_marginal(link) or link.key in self._standing}
+        others = [link for link in undone.links if link.key not in decided]
+        certain = [*undone.certain, *(link for link in undone.links if link.key in decided)]
+        everything = undone.maps, others, [*refused, *undone.refused], self._settings, self._cache
         small = sum(len(hybrid_map.nodes) for hybrid_map in maps.values()) <= self._exact
         before = None if small or not earlier else StandingDecisions.union(earlier)
-        merged, stands = decide(*everything, before, undone.certain)
+        merged, stands = decide(*everything, before, certain)
         if stands.changed > CHANGED * stands.size:
-            merged, stands = decide(*everything, None, undone.certain)
-        return undone.completed(merged), stands
+            merged, stands = decide(*everything, None, certain)
+        by_hand = {link.pair for link in undone.certain}
+        contradicted = {pair: words for pair, words in merged.contradicted.items() if pair in by_hand}
+        return undone.completed(replace(merged, contradicted=contradicted)), stands
+
+    def _with_marginals(
+        self, maps: Mapping[MapId, HybridMap], links: list[Link], refused: list[RefusedLink]
+    ) -> tuple[list[Link], list[RefusedLink]]:
+        """Links and refusals with the marginal links of these maps: of two nodes there is one link."""
+        inside = {
+            link.pair: link
+            for link in self._marginals
+            if all(end.map in maps and end in maps[end.map].nodes for end in link.pair)
+        }
+        if not inside:
+            return links, refused
+        verified = {link.key: link for link in links}
+        out = [link for link in links if link.key not in inside]
+        against = [refusal for refusal in refused if refusal.pair not in inside]
+        for pair, marginal in inside.items():
+            link = verified.get(pair)
+            # What is not decided for good must not become certain by what is weakly known already.
+            if link is None or pair not in self._standing:
+                out.append(marginal)
+                continue
+            known = self._fused.get(pair)
+            # A link is known by its identity: what was decided of it holds as long as it is the same.
+            if known is None or known[0] is not marginal or known[1] is not link:
+                known = self._fused[pair] = marginal, link, fused(marginal, link)
+            if known[2] is None:
+                against.append(refuse(link, CONTRADICTION))
+            out.append(known[2] or marginal)
+        return out, against
 
     def _retired_nodes(
         self,
@@ -125,7 +182,7 @@ class Islands:
         if not any(isinstance(c.about, RetiredArea) for c in constraints.in_force):
             self._without_areas = None
             return retired_nodes(maps, constraints, ())
-        self._without_areas = self._without_areas or _Reference(self._settings, self._exact)
+        self._without_areas = self._without_areas or self._reference()
         others = constraints.without(RetiredArea)
         others = others.with_nodes(retired_nodes(maps, others, ()))
         inside = _around(maps, self._ties(maps, verdicts, others), constraints)
@@ -144,7 +201,7 @@ class Islands:
         if not links:
             self._without_hand = None
             return {}
-        self._without_hand = self._without_hand or _Reference(self._settings, self._exact)
+        self._without_hand = self._without_hand or self._reference()
         others = constraints.without(Linked).with_nodes(constraints.nodes)
         merged = self._without_hand.merge(maps, verdicts, touched, others)
         out, s = {}, self._settings.consistency
@@ -160,6 +217,11 @@ class Islands:
                 )
         return out
 
+    def _reference(self) -> Islands:
+        reference = _Reference(self._settings, self._exact)
+        reference.replace_marginals(self._marginals, self._standing)
+        return reference
+
     def _ties(
         self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, constraints: ManualConstraints
     ) -> list[frozenset[MapId]]:
@@ -167,7 +229,7 @@ class Islands:
         ties: nx.Graph = nx.Graph()
         ties.add_nodes_from(maps)
         ties.add_edges_from(verdicts.ties(constraints))
-        by_hand = ((a.map, b.map) for a, b in constraints.links)
+        by_hand = ((a.map, b.map) for a, b in (*constraints.links, *(m.pair for m in self._marginals)))
         ties.add_edges_from(pair for pair in by_hand if pair[0] in maps and pair[1] in maps)
         for map_id, hybrid_map in maps.items():
             entry = self._abroad.get(map_id)

@@ -55,7 +55,10 @@ class MergeSettings:
     Attributes:
         consistency: when links are accepted.
         exclusion: when two robots would have been in one place.
+        keep_superseded_days: a server deletes nodes that newer ones have superseded for so long, days. Until
+            then a wrong merge can be taken back whole. `inf`: never.
     """
 
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
     exclusion: ExclusionSettings = field(default_factory=ExclusionSettings)
+    keep_superseded_days: Positive = 14.0

@@ -13,16 +13,19 @@ import msgspec
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanPiece, PlanReceived
+from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalDone
+from mapweave.hybridmap.pruned_node import PrunedNode
 from mapweave.hybridmap.query import (
     MAX_CANDIDATES,
     MAX_KNOWN,
@@ -71,6 +74,38 @@ class KeptHistory:
     implausible: frozenset[MapId] = frozenset()
 
 
+@dataclass(frozen=True)
+class KeptPruning:
+    """What a server keeps on its disk of superseded nodes, see mapweave.mapserver.merging.pruning.
+
+    Attributes:
+        links: marginal links.
+        standing: verified links that are not decided again, by their nodes.
+        since: superseded nodes, and since when, ns since 1970.
+        linked_since: the nodes of verified links, and since when they hold.
+        looked_ns: when it was last looked whether any had to go.
+        parts: how many `KeptPruned` there are.
+    """
+
+    links: tuple[Linked, ...] = ()
+    standing: tuple[tuple[NodeId, NodeId], ...] = ()
+    since: tuple[tuple[NodeId, Stamp], ...] = ()
+    linked_since: tuple[tuple[NodeId, NodeId, Stamp], ...] = ()
+    looked_ns: Stamp = 0
+    parts: int = 0
+
+
+@dataclass(frozen=True)
+class KeptPruned:
+    """What is left of nodes that were pruned at one time.
+
+    Attributes:
+        nodes: each with what is left.
+    """
+
+    nodes: tuple[tuple[NodeId, PrunedNode], ...] = ()
+
+
 VIEW = Limit("view", MAX_LANDMARKS_BYTES + 256)
 LIMITS: dict[type, Limit] = {
     RelocalizeAnswer: Limit("relocalization", MAX_CANDIDATES * 512 + 2**13),
@@ -109,6 +144,8 @@ LIMITS: dict[type, Limit] = {
     PlanPiece: Limit("piece of a plan", PIECE + 1024),
     PlanReceived: Limit("plan image", 2048),
     KeptHistory: Limit("history", 2**26, 2_000_000),
+    KeptPruning: Limit("record of pruning", 2**28, 20_000_000),
+    KeptPruned: Limit("record of pruned nodes", 2**28, 20_000_000),
 }
 """Kinds of messages."""
 

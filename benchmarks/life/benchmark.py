@@ -1,26 +1,39 @@
 """The life of a map: a robot maps the same rooms again and again; how far does the fleet's map grow?
 
-    python -m benchmarks.life [--drives N] [--seed N] [--stops N] [--moved SHARE] [--queries N] [--json]
+    python -m benchmarks.life [--drives N] [--seed N] [--stops N] [--moved SHARE] [--queries N]
+                              [--keep-days DAYS] [--json]
 
 Two rooms of random landmarks on their walls (nothing is rendered). On every drive, a new epoch of the map, a
 robot goes through both: N stops at newly drawn places, with a full turn at each. Its changes go
 through the server's own merger one by one, with a merge after every drive. Printed are the active
 nodes after each drive; and how many of the views that are taken anywhere in the rooms, and of those that
 are taken again where a drive stopped, are answered rightly (within 0.25 m and 8 degrees of the truth) from
-the first drive's map, from the whole map without superseded nodes, and from all nodes. Between two drives
-furniture may be moved: a share of the landmarks then is elsewhere for good, and queries are taken of the
-rooms as they are at last. Times are of this process alone. Ten drives take about a minute and a half.
+the map after one drive and after ten, from the map in the end, and from that with its superseded nodes.
+Between two drives furniture may be moved: a share of the landmarks then is elsewhere for good, and queries
+are taken of the rooms as they are at last. Times are of this process alone. Ten drives take about a minute
+and a half.
+
+Drives are 3.65 days apart, so a hundred are a year. After each the server prunes what has been superseded
+for long, in memory and in a store. After 60 drives and more there are also what a drive adds in the long run:
+the means of memory, merge and store over the last five drives by those over the five about the fiftieth.
+Memory is that of the process, less what it was before the first drive.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
+import gc
 import json
 import math
+import resource
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from rich.console import Console
@@ -34,16 +47,27 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.active_nodes import ActiveNodes
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.pruning import DAY_NS, plan_of
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.codec import encode_change
 from synthetic.world import take_map, take_view
 
 CLOSE, CLOSE_TURN = 0.25, math.radians(8.0)
 ROUTES = 40
 """Pairs of active nodes between which a route is asked for."""
+APART = 3.65
+"""Days between two drives."""
+FIFTIETH, SOME = 50, 5
+"""The drives with which the last ones are compared are about this one; and how many they are."""
+EARLY = (1, 10)
+"""Drives after which the map is asked, too."""
 LEFT_OUT = Superseded(NodeId("none", 0, 0), 0, 0.0, 0.0)
 """Marks nodes that are left out of a comparison."""
 
@@ -56,15 +80,21 @@ class Drive:
         nodes: active ones.
         superseded: the others.
         components: of the merged map.
+        pruned: nodes that have left the map.
         node_ms: what it took to take in a node with its edges and to compare it, ms.
         merge_s: what the last merge took, s.
+        memory: of the process, bytes.
+        store: what the store takes, bytes.
     """
 
     nodes: int
     superseded: int
+    pruned: int
     components: int
     node_ms: float
     merge_s: float
+    memory: int
+    store: int
 
 
 def main() -> None:
@@ -75,17 +105,18 @@ def main() -> None:
     parser.add_argument("--stops", type=int, default=5, help="in a room on every drive (default 5)")
     parser.add_argument("--moved", type=float, default=0.0, help="share of landmarks moved after each drive")
     parser.add_argument("--queries", type=int, default=200, help="views that are asked about (default 200)")
+    parser.add_argument("--keep-days", type=float, default=14.0, help="superseded nodes are kept")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     a = parser.parse_args()
     if a.drives < 1 or a.stops < 1 or a.queries < 1 or a.seed < 0 or not 0.0 <= a.moved <= 1.0:
         print("life: at least one drive, stop and query; seed 0 or more; a share of 0 to 1", file=sys.stderr)
         raise SystemExit(2)
     console = Console(stderr=a.json)
-    figures, drives = run(a.drives, a.seed, a.stops, a.moved, a.queries, console)
-    columns = "drive", "nodes", "superseded", "components", "ms a new node", "last merge s"
+    figures, drives = run(a.drives, a.seed, a.stops, a.moved, a.queries, a.keep_days, console)
+    columns = "drive", "nodes", "superseded", "pruned", "components", "ms a new node", "last merge s"
     table = Table(*columns, title=f"seed {a.seed}")
     for number, one in enumerate(drives, start=1):
-        counts = map(str, (number, one.nodes, one.superseded, one.components))
+        counts = map(str, (number, one.nodes, one.superseded, one.pruned, one.components))
         table.add_row(*counts, f"{one.node_ms:.1f}", f"{one.merge_s:.2f}")
     console.print(table)
     totals = Table("figure", "value")
@@ -98,31 +129,52 @@ def main() -> None:
 
 
 def run(
-    drives: int, seed: int, stops: int, moved: float, queries: int, console: Console
+    drives: int, seed: int, stops: int, moved: float, queries: int, keep_days: float, console: Console
 ) -> tuple[dict[str, float | list[float]], list[Drive]]:
     """All drives, then the questions; see the module."""
     rng = np.random.default_rng([seed, 0x11FE])
     house = House.built(rng)
     merger, merged, curve = Merger(), MergedMap.empty(), list[Drive]()
     truth: dict[NodeId, Pose2] = {}
-    first_nodes: frozenset[NodeId] = frozenset()
+    folder = TemporaryDirectory()
+    path, early = Path(folder.name) / "store.db", SqliteStore(Path(folder.name) / "early.db")
+    at_first = resident()
     for epoch in track(range(1, drives + 1), "driving", console=console):
         if epoch > 1 and moved:
             house = house.refurnished(moved, rng)
         tour = house.tour(stops, rng)
         nodes, edges = take_map(house, MapId("r0", epoch), tour, rng)
+        now_ns = round(epoch * APART * DAY_NS)
+        nodes = [replace(node, stamp_ns=now_ns + node.stamp_ns) for node in nodes]
         truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
         bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+        map_id = MapId("r0", epoch)
+        changes = [Change(map_id, number, now_ns, body) for number, body in enumerate(bodies, start=1)]
+        entries = [Entry.read(map_id, one.sequence, encode_change(one)) for one in changes]
         began = time.process_time()
-        for number, body in enumerate(bodies, start=1):
-            merger.on_change(Change(MapId("r0", epoch), number, 0, body))
+        for change in changes:
+            merger.on_change(change)
         taken = time.process_time()
         merged = merger.merged()
         spent, old = time.process_time() - taken, len(merged.superseded)
         node_ms = 1e3 * (taken - began) / len(nodes)
-        curve.append(Drive(len(merged.poses) - old, old, len(merged.components), node_ms, spent))
-        first_nodes = first_nodes or frozenset(merged.poses)
-        console.print(f"drive {epoch}: {curve[-1].nodes} nodes, {old} superseded, merged in {spent:.1f} s")
+        plan = plan_of(merged, merger.maps.values(), merger.pruning, now_ns, keep_days)
+        # A store that is closed is one file.
+        with closing(SqliteStore(path)) as store:
+            store.apply(map_id, 1, entries)
+            if plan is not None:
+                store.prune(plan.nodes, plan.edges, merger.pruning.records(plan))
+                merger.prune(plan)
+        counts = len(merged.poses) - old, old, len(merged.pruned), len(merged.components)
+        curve.append(Drive(*counts, node_ms, spent, resident() - at_first, path.stat().st_size))
+        if epoch <= EARLY[-1]:
+            early.apply(map_id, 1, entries)
+        console.print(
+            f"drive {epoch}: {curve[-1].nodes} nodes, {old} superseded, merged in {spent:.1f} s, "
+            f"{curve[-1].memory / 1e6:.0f} MB, store {curve[-1].store / 1e6:.2f} MB, "
+            f"{len(merger.pruning.marginals)} marginal links"
+        )
+    merged = merger.merged()
     views = [house.look(rng) for _ in range(queries)]
     stood = [truth[sorted(truth)[int(k)]] for k in rng.choice(len(truth), queries)]
     again = [(take_view(house, here, rng)[0], here) for here in stood]
@@ -134,18 +186,58 @@ def run(
         "curve": [one.nodes for one in curve],
         "node_ms": [round(one.node_ms, 2) for one in curve],
         "merge_s": [round(one.merge_s, 2) for one in curve],
+        "memory_mb": [round(one.memory / 1e6, 1) for one in curve],
+        "store_mb": [round(one.store / 1e6, 2) for one in curve],
+        **in_the_long_run(curve),
         "components": curve[-1].components,
         "routes_found": routes_found(merged, rng),
     }
-    for name, hidden in (
-        ("first", frozenset(truth) - first_nodes),
-        ("after", frozenset(merged.superseded)),
-        ("all_nodes", frozenset[NodeId]()),
+    earlier = {f"after_{count}": driven_through(early, count) for count in EARLY if count < drives}
+    early.close()
+    folder.cleanup()
+    for name, mapped, hide in (
+        *((name, mapped, True) for name, mapped in earlier.items()),
+        ("after", merger, True),
+        ("all_nodes", merger, False),
     ):
+        hidden = frozenset(mapped.merged().superseded) if hide else frozenset[NodeId]()
         for where, asked in (("", views), ("_visited", again)):
-            right, wrong = answered(merger, merged, hidden, asked, truth)
+            right, wrong = answered(mapped, mapped.merged(), hidden, asked, truth)
             figures |= {f"recall{where}_{name}": right, f"wrong{where}_{name}": wrong}
     return figures, curve
+
+
+def driven_through(store: Store, drives: int) -> Merger:
+    """The first drives again, as a map of their own."""
+    merger = Merger()
+    for map_id in sorted(store.maps())[:drives]:
+        for change in store.replay(map_id):
+            merger.on_change(change)
+        merger.merged()
+    return merger
+
+
+def resident() -> int:
+    """Memory of this process, bytes, without garbage and without what the allocator holds in reserve."""
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def in_the_long_run(curve: Sequence[Drive]) -> dict[str, float | list[float]]:
+    """What the last drives cost by those about the fiftieth."""
+    if len(curve) < FIFTIETH + 2 * SOME:
+        return {}
+    about, last = curve[FIFTIETH - 1 - SOME // 2 :][:SOME], curve[-SOME:]
+
+    def ratio(cost: Callable[[Drive], float]) -> float:
+        return round(sum(map(cost, last)) / sum(map(cost, about)), 3)
+
+    return {
+        "memory_ratio": ratio(lambda drive: drive.memory),
+        "merge_ratio": ratio(lambda drive: drive.merge_s),
+        "store_ratio": ratio(lambda drive: drive.store),
+    }
 
 
 def answered(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
 from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.store import (
@@ -29,6 +29,8 @@ from mapweave.wire.log_messages import Refusal
 log = logging.getLogger(__name__)
 
 READ_AT_ONCE = 256
+PRUNED_AT_ONCE = 256
+"""Elements of one map: a log is read through once for so many."""
 
 
 class SqlStore(Store):
@@ -121,6 +123,31 @@ class SqlStore(Store):
                     yield Change(map_id, last, stamp_ns, decode_body(body))
                 except InvalidMessage as error:
                     log.error("change %d of %s cannot be read (%s); it is left out", last, map_id, error)
+
+    def prune(self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]) -> None:
+        """Delete what logs say of some nodes and edges, for good; see `Store`."""
+        node_numbers, edge_numbers = _numbers(nodes), _numbers(edges)
+        with self._transaction():
+            for kinds, numbers in (
+                ((NodePut, NodeRetired), node_numbers),
+                ((EdgePut, EdgeRetired), edge_numbers),
+            ):
+                names = [kind.__name__ for kind in kinds]
+                for map_id, some in numbers:
+                    marks = ", ".join("?" * len(some))
+                    self._write(
+                        "DELETE FROM change WHERE agent = ? AND epoch = ? AND kind IN (?, ?) "
+                        f"AND number IN ({marks})",
+                        (*map_id, *names, *some),
+                    )
+            for map_id, some in node_numbers:
+                marks = ", ".join("?" * len(some))
+                self._write(
+                    f"DELETE FROM node WHERE agent = ? AND epoch = ? AND number IN ({marks})",
+                    (*map_id, *some),
+                )
+            for name, value in results.items():
+                self._put("result", (name, value))
 
     def damaged(self, map_id: MapId | None = None) -> list[Gap]:
         """Changes that were found damaged and are not restored yet, of one map or of all."""
@@ -301,3 +328,15 @@ class SqlStore(Store):
                 if count is not None and highest >= count:
                     return f"edge {edge.id} shares landmark {highest} of {end}, which has {count}"
         return ""
+
+
+def _numbers(elements: Iterable[NodeId]) -> list[tuple[MapId, Sequence[int]]]:
+    """The numbers of elements by their maps, so many at once."""
+    by_map: dict[MapId, list[int]] = {}
+    for element in sorted(elements):
+        by_map.setdefault(element.map, []).append(element.number)
+    return [
+        (map_id, numbers[first : first + PRUNED_AT_ONCE])
+        for map_id, numbers in by_map.items()
+        for first in range(0, len(numbers), PRUNED_AT_ONCE)
+    ]

@@ -7,13 +7,13 @@ servers share (mapweave.mapserver.log.postgres_store).
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.wire.log_messages import Refusal
@@ -22,6 +22,8 @@ ID = "store id"
 """Among the results."""
 HISTORY = "history"
 """Among the results, too: see mapweave.mapserver.map_history."""
+PRUNING = "pruning"
+"""Likewise: see mapweave.mapserver.merging.pruning."""
 MOST_REFUSED_KEPT = 100
 """Refused changes of a map of which the bytes are kept; of further ones only the reason."""
 MAX_CONSTRAINTS = 10_000
@@ -135,6 +137,20 @@ class Store(Protocol):
         """Every change behind `last` that was taken, in order.
 
         Those that cannot be read, or are out of bounds since they were taken, are left out.
+        """
+
+    def prune(self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]) -> None:
+        """Delete what logs say of some nodes and edges, for good, and store results in their place.
+
+        All in one transaction. The logs' watermarks stay, so robots do not send them again.
+
+        Args:
+            nodes: that have left the map.
+            edges: likewise.
+            results: by their names, see `put_result`.
+
+        Raises:
+            InvalidFile: the disk does not take it; nothing is pruned.
         """
 
     def damaged(self, map_id: MapId | None = None) -> list[Gap]:

@@ -52,6 +52,10 @@ class Copies:
             self._count += 1
             self._came[node.id] = self._count
 
+    def gone(self, node_id: NodeId) -> None:
+        """A node is there no longer."""
+        self._came.pop(node_id, None)
+
     def compare(self, a: Node, b: Node) -> None:
         """Look for copies among two nodes that show the same place."""
         copied = copied_landmarks(a, b) if a.id.agent != b.id.agent else 0

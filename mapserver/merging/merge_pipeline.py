@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
 from mapweave.merge.pose_graph.verdicts import Verdicts
@@ -31,6 +33,10 @@ class MergePipeline:
         self._frames = PinnedFrames()
         self._superseder = NodeSuperseder(reaches)
         self._remover = LandmarkRemover()
+
+    def replace_marginals(self, marginals: Sequence[Link], standing: Set[Pair]) -> None:
+        """See `Islands.replace_marginals`."""
+        self._islands.replace_marginals(marginals, standing)
 
     def merged(
         self,

@@ -18,6 +18,7 @@ from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, NodeComparisons, compare
+from mapweave.mapserver.merging.pruning import PrunePlan, Pruning
 from mapweave.mapserver.merging.verification_cache import VerificationCache
 from mapweave.mapserver.plausibility import implausible, scattered
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
@@ -66,6 +67,7 @@ class Merger:
         self.settings = settings or MergeSettings()
         self._comparisons = NodeComparisons(self.places, self.node, self.counters, compare)
         self._verdicts = Verdicts()
+        self.pruning = Pruning()
         self._pipeline = self._new_pipeline()
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
@@ -253,13 +255,14 @@ class Merger:
         kept = {map_id: self._kept[map_id] for map_id in maps}
         merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins)
         odd = {which: reason for which, reason in self._implausible.items() if reason}
-        odd |= scattered(kept) | self._refused
+        odd |= scattered(kept, self.pruning.pruned.maps) | self._refused
         merged = replace(
             merged,
             set_apart=self._set_apart(),
             copies={which: self._kept[which] for which in self._copied},
             implausible={which: odd[which] for which in sorted(odd.keys() & kept.keys())},
             wrong=self._wrong,
+            pruned=self.pruning.pruned,
         )
         if use is not None:
             use(merged)
@@ -344,9 +347,27 @@ class Merger:
 
         return PinnedFrames().moved(leave_out(sorted(kept), attempt)[0], self._pins)
 
-    def status(self) -> str:
-        """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
-        return self.merged().summary()
+    def prune(self, plan: PrunePlan) -> None:
+        """Let the nodes of a plan go, as if their robots had retired them, and keep what is left of them."""
+        self.pruning.take(plan)
+        if not plan.nodes:
+            return
+        for map_id, hybrid_map in list(self.maps.items()):
+            for node in plan.nodes:
+                if node in hybrid_map.graph:
+                    self._replay(map_id, NodeRetired(node))
+            if not (hybrid_map.nodes or hybrid_map.edges):
+                del self.maps[map_id]
+                self._changed.discard(map_id)
+                self._kept.pop(map_id, None)
+        self.alike.remove(plan.nodes)
+        self.reaches.remove(plan.nodes)
+        self._pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
+
+    def restore_pruning(self, pruning: Pruning) -> None:
+        """Go on with what another process has pruned, before anything is merged."""
+        self.pruning = pruning
+        self._pipeline.replace_marginals(pruning.marginals, pruning.standing)
 
     def _replay(self, map_id: MapId, change: ChangeBody) -> None:
         """Take a change into its map, and forget what no longer holds."""
@@ -366,9 +387,12 @@ class Merger:
                 self.places.observe(node)
             case NodeRetired(node_id):
                 self._comparisons.forget(node_id)
+                self._copies.gone(node_id)
                 self.places.remove(removed, node_id)
             case EdgePut(edge):
                 self._comparisons.connect(edge)
 
     def _new_pipeline(self) -> MergePipeline:
-        return MergePipeline(self.settings, self.reaches)
+        pipeline = MergePipeline(self.settings, self.reaches)
+        pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
+        return pipeline

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,6 +75,11 @@ class AliasCache:
     def forget(self) -> None:
         """Drop all results: nodes that were hidden at the search are active again."""
         self._entries = {}
+
+    def remove(self, node_ids: Iterable[NodeId]) -> None:
+        """Drop the results of nodes that are gone for good."""
+        for node_id in node_ids:
+            self._entries.pop(node_id, None)
 
     def __contains__(self, node_id: NodeId) -> bool:
         """Whether this was found out of a node, as it is or as it was."""

@@ -13,7 +13,7 @@ from mapweave.commands.map_input import SOURCES, map_source, opened
 if TYPE_CHECKING:
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
-    from mapweave.hybridmap.node import MapId
+    from mapweave.hybridmap.node import Edge, MapId
     from mapweave.hybridmap.pin import Pin
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.merge.settings import MergeSettings
@@ -51,7 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     check_place(arguments.out)
     settings = settings_of(arguments).merge
     parts = parts_of({one.path: one.content for one in map(opened, arguments.files)})
-    merged = merged_with_progress(parts.maps, parts.constraints, settings, parts.annotations.pins)
+    pins = parts.annotations.pins
+    merged = merged_with_progress(parts.maps, parts.constraints, settings, pins, parts.marginals)
     write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations, parts.images))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
@@ -81,10 +82,11 @@ def merged_with_progress(
     constraints: ManualConstraints,
     settings: MergeSettings | None = None,
     pins: Sequence[Pin] = (),
+    marginals: Sequence[Edge] = (),
 ) -> MergedMap:
     """Merge, with a bar on stderr for people."""
     from mapweave.commands.map_input import merge_progress
     from mapweave.offline_merge import merge_parts
 
     with merge_progress() as report:
-        return merge_parts(maps, constraints, report, settings, pins=pins)
+        return merge_parts(maps, constraints, report, settings, pins=pins, marginals=marginals)

@@ -86,7 +86,8 @@ class LandmarkRemover:
         """
         solved = {id(graph) for graph in self._graphs}
         self._graphs = merged.graphs
-        self._links.follow(merged.links)
+        # One of poses alone shows no landmarks: by a person, or left of nodes that are gone.
+        self._links.follow(link for link in merged.links if len(link.shared))
         for node_id in self._drift.removed(merged.components):
             self._observations.pop(node_id, None)
             self._faded.pop(node_id, None)

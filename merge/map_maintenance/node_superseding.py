@@ -9,6 +9,9 @@ The active nodes dominate all nodes (each is covered directly by an active one) 
 removed. To find the fewest is NP-hard; here nodes are tried one by one, first those that cover few nodes and
 of which newer views exist.
 
+Views from next to a wall show what no other view does, and every drive adds some. So a node that many later
+views surround is superseded whatever they show.
+
 Superseded nodes keep their poses and edges, and become active again if their successor is removed.
 """
 
@@ -129,6 +132,13 @@ ENOUGH = 60
 AGAIN = 120.0
 """Nodes of one map supersede each other only if this much time is between them, s: views of one visit
 complete each other."""
+LATER = 14 * 86_400.0
+"""s after which a view is of another time,"""
+CROWD = 6
+"""and so many of it within the basin of a node supersede it, whatever they show: what none of them recognises
+is seen from next to there alone, or is gone. So there are no more nodes than there is room."""
+WAY = 1.5
+"""They are no further off by the way than so many times the basin's reach: no wall is between."""
 GATE = 16.3
 """Chi-square with 3 degrees of freedom within which a comparison of two nodes bears out the merged map."""
 FLOOR = (0.05, 0.05, 0.03)
@@ -220,7 +230,7 @@ class _Round:
                 self._blocking[node] = covered
                 return
             successors[covered] = replacement
-        successor = self._find_successor(node, node)
+        successor = self._find_successor(node, node) or self._crowded_out(node)
         if successor is None or not self._traversability.spare(node, successor.by, DETOUR):
             return
         self._traversability.remove(node)
@@ -238,6 +248,23 @@ class _Round:
                 if successor is not None:
                     return successor
         return None
+
+    def _crowded_out(self, node: NodeId) -> Superseded | None:
+        """The most similar of the later views of a place, if there are many."""
+        now = self._nodes[node].stamp_ns
+        later = [
+            (neighbour, between)
+            for neighbour, between in self._neighbours(node)
+            if self._traversability.has(neighbour) and self._nodes[neighbour].stamp_ns - now >= LATER * SECOND
+        ]
+        if len(later) < CROWD:
+            return None
+        here = self._traversability.within(node, WAY * FARTHEST)
+        later = [(neighbour, between) for neighbour, between in later if neighbour in here]
+        if len(later) < CROWD:
+            return None
+        successor, between = later[0]
+        return Superseded(successor, 0, between.distance(Pose2()), abs(between.heading))
 
     def _neighbours(self, node: NodeId) -> list[tuple[NodeId, Pose2]]:
         """Nodes within the basin, active or not, with relative poses; the most similar first."""
@@ -259,7 +286,9 @@ class _Round:
             return None
         if b.landmarks.has_depth.sum() < min(DEPTHS * a.landmarks.has_depth.sum(), ENOUGH):
             return None
-        link = self._links.between(covered, successor) or self._compare(a, b)
+        link = self._links.between(covered, successor)
+        # A link may be of poses alone: by a person, or left of nodes that are gone.
+        link = link if link is not None and len(link.shared) else self._compare(a, b)
         if link is None:
             return None
         link = link if link.a == covered else link.turned()

@@ -109,6 +109,20 @@ class Traversability:
         }
         return not limits or self._reaches(successor, node, limits)
 
+    def within(self, node: NodeId, reach: float) -> set[NodeId]:
+        """Nodes that are left and that are reached from a node by ways of some length at most, m."""
+        lengths, heap = {node: 0.0}, [(0.0, node)]
+        while heap:
+            length, here = heapq.heappop(heap)
+            if length > lengths[here]:
+                continue
+            for neighbour, step in self._ways_of(here).items():
+                farther = length + step
+                if neighbour not in self._removed and farther < min(lengths.get(neighbour, reach), reach):
+                    lengths[neighbour] = farther
+                    heapq.heappush(heap, (farther, neighbour))
+        return {*lengths} - {node}
+
     def _reaches(self, start: NodeId, without: NodeId, limits: dict[NodeId, float]) -> bool:
         """Whether all nodes are reached within their limits, m; by Dijkstra's algorithm."""
         left, farthest = dict(limits), max(limits.values())

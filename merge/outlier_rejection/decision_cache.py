@@ -30,6 +30,10 @@ class DecisionCache:
         self._groups: dict[Key, LinkGroup] = {}
         self._weighed: dict[Key, tuple[Link, Link]] = {}
 
+    def forget_others(self, maps: Mapping[MapId, HybridMap]) -> None:
+        """Forget the fragments of all maps but these, as they are."""
+        self._maps = {which: entry for which, entry in self._maps.items() if maps.get(which) is entry[0]}
+
     def fragments(self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings) -> list[Fragment]:
         """See `mapweave.merge.outlier_rejection.segmentation.fragments_of`; only maps that have changed are
         cut.

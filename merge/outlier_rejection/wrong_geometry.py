@@ -126,6 +126,7 @@ class WrongGeometrySearch:
         Returns:
             The maps that are wrong, by id.
         """
+        self._memory.forget_others(maps)
         for pair in stale:
             self._ties.pop(pair, None)
             if not set(pair).isdisjoint(left_out):

@@ -16,6 +16,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, nearest_covariance
+from mapweave.hybridmap.pruned_node import PrunedNodes
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 
@@ -135,6 +136,8 @@ class MergedMap:
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
         contradicted: links by hand that the rest of the map contradicts, by their nodes, and how.
         pins: people's pins of components' frames, oldest first.
+        pruned: superseded nodes that have left the maps. What they measured is in marginal links, see
+            mapweave.merge.pose_graph.marginalization.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -152,6 +155,7 @@ class MergedMap:
     wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
     contradicted: Mapping[tuple[NodeId, NodeId], str] = field(default_factory=dict)
     pins: tuple[Pin, ...] = ()
+    pruned: PrunedNodes = field(default_factory=PrunedNodes)
 
     @staticmethod
     def empty() -> MergedMap:
@@ -187,6 +191,10 @@ class MergedMap:
         """
         which = MapId(*end[:2])
         hybrid_map = self.maps.get(which)
+        if isinstance(end, NodeId) and end in self.pruned and end not in self.poses:
+            raise InvalidValue(self.pruned.words(end, self.poses))
+        if hybrid_map is None and which in self.pruned.maps:
+            raise InvalidValue(f"map {which} has left the map: newer nodes have superseded all of its nodes")
         if which in self.set_apart:
             raise InvalidValue(f"map {which} is set apart: {self.set_apart[which]}")
         if hybrid_map is None:

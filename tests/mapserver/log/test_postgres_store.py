@@ -20,7 +20,7 @@ from hypothesis.stateful import (
 from mapweave.cli import main
 from mapweave.hybridmap.change import Change, ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, MapweaveError
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, Entry
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
@@ -108,6 +108,14 @@ def test_both_stores_give_the_same_for_the_same(
                 store.add_constraint(body)
                 store.add_annotation(body[::-1])
                 store.put_result("poses", body)
+
+        @rule(
+            nodes=st.sets(st.sampled_from([NodeId(*m, k) for m in (MAP, OTHER) for k in (1, 2)])),
+            edges=st.sets(st.sampled_from([EdgeId(*MAP, 11), EdgeId(*MAP, 12)])),
+        )
+        def prune(self, nodes: set[NodeId], edges: set[EdgeId]) -> None:
+            for store in self.stores:
+                store.prune(nodes, edges, {"poses": b"pruned"})
 
         @rule()
         def reopen(self) -> None:

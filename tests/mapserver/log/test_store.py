@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.entry import Applied, Entry
 from mapweave.mapserver.log.opening import open_store
@@ -230,6 +230,40 @@ def test_a_transaction_that_fails_leaves_nothing(store: Store) -> None:
     assert store.maps() == [MAP], "nothing of the other runs either"
     make_room()
     assert store.apply(MAP, 5, [entry(2), broken(3), entry(4)]).watermark == 4
+
+
+def test_what_is_pruned_is_gone_and_is_not_taken_again(
+    place: Path | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise InvalidFile("the disk is full")
+
+    store = open_store(place)
+    bodies: list[ChangeBody] = [
+        node_put(1, 3),
+        node_put(2, 5),
+        edge_put(11, 1, 2),
+        node_put(3, 2),
+        edge_put(12, 2, 3),
+    ]
+    log = [entry(k + 1, body) for k, body in enumerate(bodies)]
+    store.apply(MAP, 5, log)
+    store.apply(OTHER, 6, [Entry.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))])
+    edges = [EdgeId(*MAP, k) for k in (11, 12)]
+    with monkeypatch.context() as patch, pytest.raises(InvalidFile, match="full"):
+        patch.setattr(store, "_put", refuse)
+        store.prune([NodeId(*MAP, 2)], edges, {"pruned 0": b"one node"})
+    assert sequences(store) == [1, 2, 3, 4, 5] and store.landmarks(NodeId(*MAP, 2)) == 5
+    store.prune([NodeId(*MAP, 2)], edges, {"pruned 0": b"one node"})
+    for _ in range(2):
+        assert sequences(store) == [1, 4] and store.result("pruned 0") == b"one node"
+        assert store.present() == {NodeId(*MAP, 1), NodeId(*MAP, 3), NodeId(*OTHER, 1)}
+        assert store.kept("r0") == {MAP: (2, 5)} and store.landmarks(NodeId(*MAP, 2)) is None
+        assert store.watermark(MAP) == 5 and store.damaged() == []
+        assert store.apply(MAP, 5, log).changes == (), "a robot that sends all again changes nothing"
+        store.close()
+        store = open_store(place)
+    store.close()
 
 
 def test_the_wire_bytes_of_the_maps(store: Store) -> None:

@@ -76,7 +76,7 @@ def test_two_maps_become_one(scene: Scene, merger: Merger) -> None:
     truth_from_merged = scene.truth[anchor] @ merged.poses[anchor].merged_from_robot.mean.inverse()
     for node, place in merged.poses.items():
         assert scene.truth[node].distance(truth_from_merged @ place.merged_from_robot.mean) < 0.4
-    assert merger.status().startswith("28 nodes, 2 maps, 1 component, ")
+    assert merger.merged().summary().startswith("28 nodes, 2 maps, 1 component, ")
 
 
 def test_order_of_arrival_does_not_matter(scene: Scene, merger: Merger) -> None:

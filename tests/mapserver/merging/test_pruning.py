@@ -1,0 +1,206 @@
+"""Superseded nodes leave the map after a time: what stays is where it was, also after a restart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import RetiredNodes
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.opening import open_store
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.map_files import map_file_of, merged_of
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.pruning import DAY_NS
+from mapweave.mapserver.merging.pruning_record import PruningRecord
+from mapweave.mapserver.places import Places
+from mapweave.mapserver.routes import Router
+from mapweave.merge.pose_graph.marginalization import is_marginal
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.opened_map import open_map
+from mapweave.storage.map_file import pack_map_file, unpack_map_file
+from mapweave.wire.codec import encode_change
+from synthetic.world import room, take_map
+
+MAPS = OLD, OTHER, NEW = MapId("r0", 1), MapId("r1", 1), MapId("r0", 2)
+BEGIN = 1_700_000_000_000_000_000
+DAYS = 14.0
+
+
+class Logs:
+    """Two robots through one hall, and the first once more beside its way."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(3)
+        world = room(0, 0, 8, 4, 1600, rng)
+        self.changes: dict[MapId, list[Change]] = {}
+        for map_id, y, heading in ((OLD, 2.0, 0.3), (OTHER, 1.8, 0.35), (NEW, 2.15, 0.25)):
+            tour = [Pose2(1.5 + 0.6 * k, y, heading) for k in range(7)]
+            nodes, edges = take_map(world, map_id, tour, rng, sigma_xy=0.01, sigma_heading=0.01)
+            bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+            self.changes[map_id] = [Change(map_id, k + 1, BEGIN, body) for k, body in enumerate(bodies)]
+
+
+@pytest.fixture(scope="module")
+def logs() -> Logs:
+    return Logs()
+
+
+@dataclass
+class Server:
+    """A merger with its store and its record of what was pruned."""
+
+    store: Store
+    named: list[object] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.merger = Merger()
+        self.record = PruningRecord(self.store, DAYS, lambda: self.named, ())
+        self.record.restore(self.merger)
+        for map_id in self.store.maps():
+            self.merger.read((map_id, change.body) for change in self.store.replay(map_id))
+
+    def take(self, changes: list[Change]) -> None:
+        map_id = changes[0].map
+        entries = [Entry.read(map_id, one.sequence, encode_change(one)) for one in changes]
+        for change in self.store.apply(map_id, 5, entries).changes:
+            self.merger.on_change(change)
+
+    def merged(self) -> MergedMap:
+        return self.merger.merged()
+
+    def prune(self, days: float) -> bool:
+        self.merged()
+        return self.record.prune(self.merger, BEGIN + round(days * DAY_NS))
+
+
+@contextmanager
+def serving(path: Path) -> Iterator[Server]:
+    store = open_store(path)
+    try:
+        yield Server(store)
+    finally:
+        store.close()
+
+
+def poses_apart(a: MergedMap, b: MergedMap) -> float:
+    return max(a.pose(node).distance(b.pose(node)) for node in b.poses)
+
+
+def test_what_is_superseded_for_long_leaves_and_the_rest_stays(logs: Logs, tmp_path: Path) -> None:
+    path = tmp_path / "s0.sqlite"
+    with serving(path) as server:
+        for map_id in MAPS:
+            server.take(logs.changes[map_id])
+        before = server.merged()
+        anchor, old = before.graphs[0].nodes[0], sorted(before.superseded)
+        assert len(before.components) == 1 and len(old) >= 6 and anchor in old
+        kept = old[-1]
+        server.named.append(ManualConstraint(RetiredNodes((kept,)), False, "anna", 1))
+        assert not server.prune(0.0) and not server.prune(DAYS - 1.1), "not yet"
+    with serving(path) as server:
+        server.named.append(ManualConstraint(RetiredNodes((kept,)), False, "anna", 1))
+        assert not server.prune(DAYS - 0.5), "a restart begins no new time, and it is looked once a day"
+        assert server.prune(DAYS + 0.01)
+        gone = set(old) - {anchor, kept}
+        merged = server.merged()
+        assert set(before.poses) - set(merged.poses) == gone and set(merged.pruned.nodes) == gone
+        assert gone.isdisjoint(server.store.present()) and not any(
+            node in server.merger.places for node in gone
+        )
+        assert len(merged.components) == 1 and poses_apart(before, merged) < 0.01
+        own = {link.pair for link in before.links if gone.isdisjoint(link.pair)}
+        assert own <= {link.pair for link in merged.links}
+        assert any(is_marginal(link) for link in merged.links) and not merged.contradicted
+    with serving(path) as server:
+        again = server.merged()
+        assert set(again.poses) == set(merged.poses) and again.pruned == merged.pruned
+        assert poses_apart(merged, again) < 1e-3
+    # Who opens the store, or a file of the map, has the same map.
+    for other in (open_map(path).merged(), merged_of(unpack_map_file(pack_map_file(map_file_of(again))))):
+        assert set(other.poses) == set(again.poses) and poses_apart(again, other) < 2e-3
+
+
+@pytest.fixture(scope="module")
+def pruned(
+    logs: Logs, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[MergedMap, MergedMap, Server]]:
+    """Before, after, and the server."""
+    with serving(tmp_path_factory.mktemp("store") / "s0.sqlite") as server:
+        for map_id in MAPS:
+            server.take(logs.changes[map_id])
+        before = server.merged()
+        server.prune(0.0)
+        assert server.prune(DAYS + 1.0)
+        yield before, server.merged(), server
+
+
+def test_words_name_what_replaces_it(pruned: tuple[MergedMap, MergedMap, Server]) -> None:
+    before, after, _ = pruned
+    node = min(after.pruned.nodes)
+    by = before.superseded[node].by
+    with pytest.raises(InvalidValue, match=f"{node} left the map on 2023-11-29 .* UTC: {by} replaces it"):
+        after.check(node)
+    found = Places(Router(after), Annotations()).resolve(str(node))
+    assert found.node == by and str(node) in found.note
+
+
+def test_routes_from_and_to_it_hold(pruned: tuple[MergedMap, MergedMap, Server]) -> None:
+    before, after, _ = pruned
+    nodes = sorted(after.pruned.nodes)
+    for start, goal in ((nodes[0], nodes[-1]), (nodes[-1], nodes[0])):
+        legs = Router(after).route(start, goal).legs
+        assert legs, "there is a way"
+        assert all(leg.node.id in after.poses for leg in legs)
+        # Along the legs the robot gets to where the goal was, or next to it.
+        at = before.pose(start)
+        for leg in legs:
+            at = at @ leg.previous_from_node.mean
+        assert at.distance(after.pose(legs[-1].node.id)) < 0.02
+        assert at.distance(before.pose(goal)) < 2.5
+        near = Router(after).route(start, goal, start_from_robot=Pose2(0.1, 0.0, 0.0)).legs
+        assert near[-1].node.id == legs[-1].node.id
+
+
+def test_a_node_that_is_sent_again_is_there_again(
+    logs: Logs, pruned: tuple[MergedMap, MergedMap, Server]
+) -> None:
+    _, after, server = pruned
+    node = min(after.pruned.nodes)
+    body = next(
+        one.body
+        for one in logs.changes[node.map]
+        if isinstance(one.body, NodePut) and one.body.node.id == node
+    )
+    assert isinstance(body, NodePut)
+    last = logs.changes[node.map][-1].sequence
+    server.take([Change(node.map, last + 1, BEGIN, replace(body, node=replace(body.node, stamp_ns=7)))])
+    merged = server.merged()
+    assert node in merged.poses and len(merged.components) <= 2
+    merged.check(node)
+
+
+def test_a_line_of_successors_is_followed() -> None:
+    a, b, c, d = (NodeId("r0", k, 1) for k in range(1, 5))
+    step = Pose2(1.0, 0.0, math.pi / 2)
+    nodes = PrunedNodes(
+        {a: PrunedNode(b, step, BEGIN), b: PrunedNode(c, step, BEGIN), d: PrunedNode(d, step, 0)}
+    )
+    found = nodes.successor(a, {c})
+    assert found is not None and found[0] == c
+    assert found[1].vector == pytest.approx([1.0, 1.0, -math.pi])
+    assert nodes.successor(b, {b}) == (b, Pose2()) and nodes.successor(a, set()) is None
+    assert nodes.successor(d, set()) is None, "it was sent again, and pruned again"
