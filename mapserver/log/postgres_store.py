@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import psycopg
 
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log.entry import Position, Traffic
+from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.postgres_follower import CHANNEL, LOG, RECORD, PostgresFollower, words_of
 from mapweave.mapserver.log.sql_store import SqlStore
 from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, News, Run, fresh_id
@@ -78,6 +77,7 @@ class PostgresStore(SqlStore):
             InvalidValue: the address is none, or has a password.
             InvalidFile: there is no connection, or the tables are of another version.
         """
+        super().__init__()
         self.address = PostgresAddress.read(address)
         self._write_lock, self._read_lock = threading.RLock(), threading.RLock()
         self._name, self._session_id = name, 0
@@ -86,10 +86,6 @@ class PostgresStore(SqlStore):
         """The thread in a transaction."""
         self._touched: dict[str, None] = {}
         self._warnings: list[str] = []
-        self._counted: dict[MapId, int] = {}
-        """Up to which change of each map `_sums` counts."""
-        self._sums: dict[str, tuple[int, int]] = {}
-        """Changes and their bytes on the wire, by kind."""
         self._warned = False
         options = {"default_transaction_read_only": "on"} if read_only else {}
         self._reader, self._writer = (
@@ -120,34 +116,6 @@ class PostgresStore(SqlStore):
         for lock, session in ((self._write_lock, self._writer), (self._read_lock, self._reader)):
             with lock:
                 session.close()
-
-    def traffic(self, map_id: MapId | None = None) -> Traffic:
-        """What a map has cost on the wire, or all maps together if none is named.
-
-        A server asks twice a second, so of all maps only what has come since the last time is read.
-        """
-        if map_id is not None:
-            return super().traffic(map_id)
-        with self._read_lock:
-            grown = [
-                (*m, self._counted.get(m, 0), watermark)
-                for m, (_, watermark) in self.positions().items()
-                if watermark > self._counted.get(m, 0)
-            ]
-            query = (
-                "SELECT kind, count(*), CAST(sum(wire_bytes) AS BIGINT) FROM change JOIN "
-                "unnest(CAST(? AS TEXT[]), CAST(? AS BIGINT[]), CAST(? AS BIGINT[]), CAST(? AS BIGINT[])) "
-                "AS grown (agent, epoch, first, last) USING (agent, epoch) "
-                "WHERE sequence > first AND sequence <= last GROUP BY kind"
-            )
-            columns = [list(column) for column in zip(*grown, strict=True)]
-            for kind, puts, size in self._read(query, columns) if grown else ():
-                before = self._sums.get(kind, (0, 0))
-                self._sums[kind] = before[0] + puts, before[1] + size
-            self._counted |= {MapId(agent, epoch): last for agent, epoch, _, last in grown}
-            nodes = int(self._read("SELECT count(*) FROM node")[0][0])
-            put, edge = (self._sums.get(kind.__name__, (0, 0)) for kind in (NodePut, EdgePut))
-            return Traffic(nodes, *put, *edge)
 
     def _make(self) -> None:
         """Make the tables where there are none; servers that start together take turns."""
@@ -243,6 +211,15 @@ class PostgresStore(SqlStore):
             (agents, epochs),
         ).fetchall()
         return {MapId(agent, epoch): Position(int(log_id), mark) for agent, epoch, log_id, mark in found}
+
+    def _wire_bytes(self, grown: Sequence[tuple[str, int, int, int]]) -> Iterable[tuple[str, int, int]]:
+        query = (
+            "SELECT kind, count(*), CAST(sum(wire_bytes) AS BIGINT) FROM change JOIN "
+            "unnest(CAST(? AS TEXT[]), CAST(? AS BIGINT[]), CAST(? AS BIGINT[]), CAST(? AS BIGINT[])) "
+            "AS grown (agent, epoch, first, last) USING (agent, epoch) "
+            "WHERE sequence > first AND sequence <= last GROUP BY kind"
+        )
+        return self._read(query, [list(column) for column in zip(*grown, strict=True)])
 
     def _lock_table(self, table: str) -> None:
         self._writer.connection.execute(f"LOCK TABLE {table} IN SHARE ROW EXCLUSIVE MODE")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from abc import abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -35,6 +36,21 @@ PRUNED_AT_ONCE = 256
 
 class SqlStore(Store):
     """Tables as in mapweave.mapserver.log.integrity. Marks of values are `?`."""
+
+    def __init__(self) -> None:
+        self._traffic_lock = threading.Lock()
+        self._counted: dict[MapId, int] = {}
+        """Up to which change of each map `_sums` counts."""
+        self._sums: dict[str, tuple[int, int]] = {}
+        """Changes and their bytes on the wire, by kind."""
+
+    @abstractmethod
+    def _wire_bytes(self, grown: Sequence[tuple[str, int, int, int]]) -> Iterable[tuple[str, int, int]]:
+        """Changes and their bytes by kind, of stretches of logs.
+
+        Args:
+            grown: agent, epoch, the change before the first one and the last one.
+        """
 
     @abstractmethod
     def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
@@ -148,6 +164,7 @@ class SqlStore(Store):
                 )
             for name, value in results.items():
                 self._put("result", (name, value))
+        self._count_again()
 
     def damaged(self, map_id: MapId | None = None) -> list[Gap]:
         """Changes that were found damaged and are not restored yet, of one map or of all."""
@@ -176,6 +193,7 @@ class SqlStore(Store):
                         self._put("damaged", (*map_id, covered + 1, gap.last))
             for entry in entries:
                 self._take(map_id, entry, changes, refusals, restored=True)
+        self._count_again()
         for refusal in refusals:
             log.warning("refused %s %d: %s", map_id, refusal.sequence, refusal.reason)
         if any(self._may_undo(change) for change in changes):
@@ -207,17 +225,38 @@ class SqlStore(Store):
         return int(self._read("SELECT count(*) FROM refused")[0][0])
 
     def traffic(self, map_id: MapId | None = None) -> Traffic:
-        """What a map has cost on the wire, or all maps together if none is named."""
-        query = (
-            "SELECT count(*), CAST(coalesce(sum(wire_bytes), 0) AS BIGINT) FROM change "
-            "WHERE kind = ? AND (CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?))"
-        )
-        agent, epoch = map_id or (None, None)
-        node_puts, node_bytes = self._read(query, (NodePut.__name__, agent, agent, epoch))[0]
-        edge_puts, edge_bytes = self._read(query, (EdgePut.__name__, agent, agent, epoch))[0]
-        count = "SELECT count(*) FROM node WHERE CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?)"
-        nodes = self._read(count, (agent, agent, epoch))[0][0]
-        return Traffic(nodes, node_puts, node_bytes, edge_puts, edge_bytes)
+        """What a map has cost on the wire, or all maps together if none is named.
+
+        A server asks twice a second, so of all maps only what has come since the last time is read.
+        """
+        if map_id is None:
+            with self._traffic_lock:
+                self._count_new_changes()
+                sums = dict(self._sums)
+            rows = self._read("SELECT count(*) FROM node")
+        else:
+            whole = (*map_id, 0, self.watermark(map_id))
+            sums = {kind: (puts, size) for kind, puts, size in self._wire_bytes([whole])}
+            rows = self._read("SELECT count(*) FROM node WHERE agent = ? AND epoch = ?", map_id)
+        put, edge = (sums.get(kind.__name__, (0, 0)) for kind in (NodePut, EdgePut))
+        return Traffic(int(rows[0][0]), *put, *edge)
+
+    def _count_new_changes(self) -> None:
+        grown = [
+            (*m, self._counted.get(m, 0), watermark)
+            for m, (_, watermark) in self.positions().items()
+            if watermark > self._counted.get(m, 0)
+        ]
+        for kind, puts, size in self._wire_bytes(grown) if grown else ():
+            before = self._sums.get(kind, (0, 0))
+            self._sums[kind] = before[0] + puts, before[1] + size
+        self._counted |= {MapId(agent, epoch): last for agent, epoch, _, last in grown}
+
+    def _count_again(self) -> None:
+        """After changes that were counted are deleted, or others are put among them."""
+        with self._traffic_lock:
+            self._counted.clear()
+            self._sums.clear()
 
     def constraints(self) -> list[bytes]:
         """The manual constraints, in order."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ class SqliteStore(SqlStore):
         Raises:
             InvalidFile: damaged as a whole, of another kind, or in use.
         """
+        super().__init__()
         self._lock = threading.RLock()
         self._database = Database(path, "map store", APPLICATION_ID, VERSION, SCHEMA, repair, ADVICE)
         for gap in self.damaged():
@@ -75,6 +76,14 @@ class SqliteStore(SqlStore):
         query = "SELECT log_id, watermark FROM log WHERE agent = ? AND epoch = ?"
         found = ((map_id, self._read(query, map_id)) for map_id in {run.map_id for run in runs})
         return {map_id: Position(int(rows[0][0]), rows[0][1]) for map_id, rows in found if rows}
+
+    def _wire_bytes(self, grown: Sequence[tuple[str, int, int, int]]) -> Iterable[tuple[str, int, int]]:
+        query = (
+            "SELECT kind, count(*), sum(wire_bytes) FROM change "
+            "WHERE agent = ? AND epoch = ? AND sequence > ? AND sequence <= ? GROUP BY kind"
+        )
+        for stretch in grown:
+            yield from self._read(query, stretch)
 
     def _lock_table(self, table: str) -> None:
         """Nothing: the whole file is this process's."""

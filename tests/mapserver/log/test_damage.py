@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +21,10 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.explainer import ConstraintRecord
 from mapweave.mapserver.log import sql_store
+from mapweave.mapserver.log.entry import Traffic
 from mapweave.mapserver.log.integrity import checksum
 from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.log.store import Store
 from mapweave.storage.map_file import read_map_file
 from mapweave.wire.codec import encode_body, encode_change
 from tests.mapserver.log.acknowledged_fleet import (
@@ -72,6 +74,13 @@ def fleet(whole: Path, tmp_path: Path) -> Iterator[Fleet]:
     fleet.stop_robots()
 
 
+def total(store: Store) -> Traffic:
+    """The traffic of all maps, by adding up."""
+    return Traffic(
+        *(sum(column) for column in zip(*(astuple(store.traffic(m)) for m in store.maps()), strict=True))
+    )
+
+
 @pytest.mark.parametrize("seed", first_quick(range(14), 5))
 def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
@@ -100,9 +109,11 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     served = {(change.map, change.sequence): encode_change(change) for change in fleet.seen}
     expected = {(one, k): data for one, log in logs.items() for k, data in enumerate(log, 1)}
     assert served == {key: data for key, data in expected.items() if key not in hit}
+    assert fleet.store.traffic() == total(fleet.store)
     fleet.start_robots()
     eventually(lambda: not fleet.store.damaged())
     fleet.ingest.close()
+    assert fleet.store.traffic() == total(fleet.store), "what is healed is counted"
     assert fleet.lacks() == 0
     fleet.stop_robots()
     assert all(set(log) <= set(logs[one]) for one, log in fleet.stored().items())

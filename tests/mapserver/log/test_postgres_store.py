@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import threading
+from dataclasses import astuple
 from pathlib import Path
 
 import psycopg
@@ -128,6 +129,9 @@ def test_both_stores_give_the_same_for_the_same(
         def same(self) -> None:
             one, other = (content(store) for store in self.stores)
             assert one == other
+            for store in self.stores:
+                of_maps = [astuple(store.traffic(m)) for m in (MAP, OTHER)]
+                assert astuple(store.traffic()) == tuple(map(sum, zip(*of_maps, strict=True)))
 
         def teardown(self) -> None:
             for store in self.stores:
