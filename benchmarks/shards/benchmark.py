@@ -288,6 +288,8 @@ def main() -> None:
     o = parser.parse_args()
     if min(*o.shards, o.robots - LATE, o.nodes, o.askers, o.ray_nodes) < 1 or o.seconds <= 0.0:
         parser.error(f"numbers must be positive, and there must be more than {LATE} robots")
+    if o.seed < 0:
+        parser.error("--seed must not be negative")
     fleet = BuildingFleet(o.robots, o.nodes, o.seed)
     rows: dict[str, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as name, Progress(console=Console(stderr=True)) as progress:
