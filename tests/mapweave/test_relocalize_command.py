@@ -6,6 +6,7 @@ import json
 import re
 import socket
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,7 @@ from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import View
+from mapweave.hybridmap.query import RelocalizeAnswer, View
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
@@ -156,18 +157,18 @@ def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, 
 
 
 def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypatch) -> None:
-    real, asked = Services._relocalize, []
+    real, asked = Services.locate, []
 
-    def busy_twice(self: Services, payload: bytes) -> bytes:
+    def busy_twice(self: Services, *question) -> Future[RelocalizeAnswer]:
         asked.append(1)
         if len(asked) <= 2:
             raise Busy(0.2)
-        return real(self, payload)
+        return real(self, *question)
 
-    monkeypatch.setattr(Services, "_relocalize", busy_twice)
+    monkeypatch.setattr(Services, "locate", busy_twice)
     assert main(["relocalize", str(photo), "--connect", served]) == 0
     assert len(asked) == 3
-    monkeypatch.setattr(Services, "_relocalize", lambda *_: (_ for _ in ()).throw(Busy(60.0)))
+    monkeypatch.setattr(Services, "locate", lambda *_: (_ for _ in ()).throw(Busy(60.0)))
     assert main(["relocalize", str(photo), "--connect", served]) == 1
     assert "the map server refused: busy, retry after 60.0 s" in capfd.readouterr().err
 
