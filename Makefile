@@ -38,7 +38,7 @@ test: setup
 slow: setup
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
 
-# About a quarter of an hour on two cores: every scenario, in real processes.
+# About half an hour on two cores: every scenario, in real processes, and the longest tests.
 scenarios: setup
 	$(BIN)/python -m pytest -m scenario -rA --durations=0
 

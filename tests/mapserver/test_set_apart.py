@@ -372,8 +372,8 @@ def test_a_content_whose_loops_have_singular_covariances_changes_nothing(beside:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Beside) -> None:
-    for seed in range(120, 3120):
+def test_800_random_legal_contents_change_nothing_for_sound_robots(beside: Beside) -> None:
+    for seed in range(120, 920):
         beside.check(seed)
 
 

@@ -66,12 +66,14 @@ wheel_noise = {d.wheel_noise}
     return path
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(560)
 @pytest.mark.parametrize(
     ("kind", "least_nodes"),
     # Sensors that reach 20 cm find no way from the start to another place.
-    [(Koala25InSimulation, 10), (KoalaSilverInSimulation, 5)],
+    [
+        pytest.param(Koala25InSimulation, 10, marks=pytest.mark.slow),
+        pytest.param(KoalaSilverInSimulation, 5, marks=pytest.mark.scenario),
+    ],
 )
 def test_a_koala_maps_is_carried_off_and_parks(
     kind: type[InSimulation], least_nodes: int, tmp_path: Path

@@ -212,7 +212,8 @@ class Exploration:
             self.truth = {node.id: simulation.truth_at(node.id.agent, node.stamp_ns) for node in self.nodes}
 
 
-@pytest.mark.slow
+@pytest.mark.scenario
+@pytest.mark.timeout(500)
 def test_exploring_twin_rooms_are_distinguished_within_100_seconds() -> None:
     """In most rooms; in some they are hardly in sight of each other."""
     collected = []
@@ -222,8 +223,14 @@ def test_exploring_twin_rooms_are_distinguished_within_100_seconds() -> None:
     assert sum(clash is not None and bool(clash.where) for clash in collected) >= 3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "seed"), [("arena", 1), ("arena", 2), ("office", 5)])
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        pytest.param("arena", 1, marks=pytest.mark.slow),
+        pytest.param("arena", 2, marks=pytest.mark.scenario),
+        pytest.param("office", 5, marks=pytest.mark.slow),
+    ],
+)
 def test_robots_that_explore_together_are_never_refused(kind: str, seed: int) -> None:
     made = Exploration(kind, seed, 4 if kind == "arena" else 3, 80.0)
     loose = ExclusionSettings(doubt=0.5)
