@@ -52,8 +52,8 @@ class Drive:
 
 @pytest.mark.parametrize(
     ("broken", "read"),
-    [(NONE, "none"), (FEWER, "5"), (MORE, "48"), (NAN, "23")],
-    ids=["none", "fewer", "more", "nan"],
+    first_quick([(NONE, "none"), (NAN, "23"), (FEWER, "5"), (MORE, "48")], 2),
+    ids=["none", "nan", "fewer", "more"],
 )
 @pytest.mark.parametrize(
     ("mission", "ticks"), [(Explore(), 20), (GoTo(NodeId("r0", 1, 1)), 130)], ids=["explore", "goto"]

@@ -150,7 +150,7 @@ def test_a_map_that_is_there_is_asked(drive: Path, capfd, tmp_path: Path) -> Non
     ("see", "camera_toml"),
     [
         pytest.param(lambda pose: render(pose, SMALL), SMALL_TOML, id="160x120", marks=pytest.mark.slow),
-        pytest.param(seen_by_fisheye, FISHEYE_TOML, id="fisheye"),
+        pytest.param(seen_by_fisheye, FISHEYE_TOML, id="fisheye", marks=pytest.mark.slow),
     ],
 )
 def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, capfd, tmp_path: Path) -> None:

@@ -55,6 +55,7 @@ def test_graduation_finds_the_cheapest_set_of_all(seed: int) -> None:
     assert {(m.a, m.b) for m in result} == {(m.a, m.b) for m in cheapest}
 
 
+@pytest.mark.slow
 def test_half_of_the_links_may_be_false() -> None:
     """Least squares alone is ruined; the others withstand. Not in every fleet."""
     names = ("least_squares", "gnc", "mapweave")

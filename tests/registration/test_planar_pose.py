@@ -97,6 +97,7 @@ def test_covariance_is_calibrated() -> None:
     assert 0.90 < np.mean(np.array(distances) < 7.81) <= 1.0
 
 
+@pytest.mark.slow
 def test_common_scale_error_is_covered() -> None:
     """All depths 2 % too long together, as after a drive with a wrong wheel radius."""
     rng = np.random.default_rng(7)

@@ -111,6 +111,7 @@ def test_the_surest_cause_is_the_true_one(parameter: Parameter, amount: float):
     assert "mapweave calibrate drive" in str(named[0])
 
 
+@pytest.mark.slow
 def test_the_mode_of_a_second_implementation():
     """Bundle adjustment by scipy over mount angles and lever, with one inverse depth a track."""
     true = DriveGeometry(forward=0.25, heading=0.03, pitch=0.05, height=0.25)

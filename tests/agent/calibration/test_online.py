@@ -14,6 +14,7 @@ from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from synthetic.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
+from tests.quick import first_quick
 
 BLANK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 SOURCE = object()
@@ -64,7 +65,7 @@ def watched(
 TRUE = DriveGeometry(forward=0.1, height=0.3)
 
 
-@pytest.mark.parametrize(("shape", "seed"), [("eight", 0), ("turning", 1), ("turning", 2)])
+@pytest.mark.parametrize(("shape", "seed"), first_quick([("eight", 0), ("turning", 1), ("turning", 2)], 1))
 def test_a_right_geometry_is_left_alone(shape: str, seed: int):
     """Turns on the spot above all: there a camera behind the axle is like wheels that turn too little."""
     online = watched(drive(np.random.default_rng(seed), TRUE, 40.0, shape), TRUE, seed)
@@ -81,7 +82,7 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameter", "amount", "used"),
     [
-        (Parameter.FORWARD, 0.05, False),
+        pytest.param(Parameter.FORWARD, 0.05, False, marks=SLOW),
         (Parameter.HEADING, math.radians(2.0), True),
         (Parameter.DELAY, 0.05, True),
         pytest.param(Parameter.FORWARD, 0.1, True, marks=SLOW),

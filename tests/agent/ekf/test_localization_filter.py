@@ -84,6 +84,7 @@ def test_from_a_metre_and_a_radian_wrong(camera: Camera) -> None:
     assert off(filter_, world)[2] < 0.02
 
 
+@pytest.mark.slow
 def test_converges_consistently_over_random_starts() -> None:
     starts = [try_start(np.random.default_rng([6, k]), steps=40) for k in range(50)]
     assert np.mean([start.converged for start in starts]) >= 0.98
@@ -110,6 +111,7 @@ def test_driving_makes_the_map_better() -> None:
     assert misfit.mean() < 5.0
 
 
+@pytest.mark.slow
 def test_the_error_of_the_maps_own_pixels_is_not_averaged_away() -> None:
     """The vertical slopes are the same in each image: as white noise they made the pose's NEES 60."""
     nees = []

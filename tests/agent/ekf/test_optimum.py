@@ -42,6 +42,7 @@ def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) ->
     assert max(ratios) < 1.25
 
 
+@pytest.mark.slow
 def test_pose_errors_match_the_covariance(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     """Average NEES in its interval; with each step linearised only where the wheels say, it is 8 to 10."""
     nees = [filter_.pose.mahalanobis2(run.poses[-1]) for run, filter_ in runs]

@@ -111,6 +111,7 @@ def test_the_papers_way_turns_to_a_side_by_chance_and_goes_on_by_chance(walls):
     assert commands[:150] != [step.command for step in live(walls, by_chance, 150, {}, seed=1)]
 
 
+@pytest.mark.slow
 def test_our_exploration_turns_all_the_way_around(walls):
     sides = turns(live(walls, ExplorerSettings(), 250, {}))
     assert len(sides) >= 3

@@ -63,6 +63,7 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     assert merger.merged().wrong.keys() == {ODD}
 
 
+@pytest.mark.slow
 def test_a_correct_map_of_a_similar_room_is_not_wrong() -> None:
     """The fourth robot knows the twin of a room that the others know, and it is sound."""
     fleet = draw_fleet(SEED, SCENES["twins"], Fault.NONE, stops=2)

@@ -13,6 +13,7 @@ import pytest
 
 from mapweave.processes import parent_watchdog
 from mapweave.scenarios.children import ChildFailed, Children, free_port
+from tests.quick import first_quick
 from tests.waiting import eventually
 
 PARENT = """
@@ -42,7 +43,7 @@ def runs(pid: int) -> bool:
     return not state.exists() or state.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("how", first_quick([signal.SIGKILL, signal.SIGTERM], 1))
 def test_children_of_a_process_that_is_killed_end_by_themselves(tmp_path: Path, how: signal.Signals) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = [sys.executable, "-c", PARENT, str(tmp_path), endpoint]

@@ -22,6 +22,7 @@ from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
 from synthetic.fleet import FleetSettings, draw_fleet
 from synthetic.merge_rivals import error, joined_falsely, oracle
+from tests.quick import first_quick
 
 FLOOR = 12.0
 
@@ -110,7 +111,7 @@ def test_a_pair_is_not_judged_by_itself() -> None:
     assert every.without(every).share == 0.0
 
 
-@pytest.mark.parametrize("alike", [1, 4])
+@pytest.mark.parametrize("alike", first_quick([4, 1], 1))
 def test_fleets_with_90_percent_false_links_are_joined_correctly_or_not_at_all(alike: int) -> None:
     """Most are as good as with the true links known, and none is joined by false links alone."""
     good = 0
