@@ -81,6 +81,7 @@ def test_a_run_is_near_the_truth(run: MappingDrive) -> None:
     assert result["landmarks_left"] <= result["landmarks"] <= result["tracks"]
 
 
+@pytest.mark.slow
 def test_a_person_in_the_view_changes_nothing_else() -> None:
     alone, passed = drive(2, "arena", "line", 60), drive(2, "arena", "line", 60, person=True)
     bearings = np.array([m.person for m in passed.moments])

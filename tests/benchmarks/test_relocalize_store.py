@@ -4,6 +4,7 @@ from pathlib import Path
 
 import networkx as nx
 import numpy as np
+import pytest
 
 from benchmarks.relocalize.distractors import Differences, Distractors
 from benchmarks.relocalize.places import Place
@@ -16,6 +17,7 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from synthetic.world import room, take_map
 
 
+@pytest.mark.slow
 def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     tour = [Pose2(2.5, 2.0, 0.7 * k) for k in range(6)]

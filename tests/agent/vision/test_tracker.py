@@ -13,6 +13,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
+from tests.quick import first_quick
 
 CAMERA = Camera(320, 240, 277.0, 276.0, 158.0, 121.0, mount_height=0.3)
 IDEAL = Lens(CAMERA)
@@ -137,7 +138,7 @@ def test_points_are_added_kept_and_forgotten(pictures):
     assert len(tracker.ids) == 0
 
 
-@pytest.mark.parametrize("name", PHOTOGRAPHS)
+@pytest.mark.parametrize("name", first_quick(PHOTOGRAPHS, 2))
 def test_errors_do_not_add_up(pictures, name):
     """Approach by a third and retreat: what frame to frame tracking gathers, the first patch undoes."""
     image = pictures.photograph(name)
