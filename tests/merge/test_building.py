@@ -9,7 +9,7 @@ from mapweave.mapserver.merging.merger import Merger
 from synthetic.building import Building
 
 
-@pytest.mark.slow
+@pytest.mark.scenario
 def test_ten_thousand_nodes_with_true_links_become_one_map() -> None:
     """What was left of strain between rounds once made two true ways of joining contradict each other."""
     building = Building.draw(100, 100, seed=3)
