@@ -23,6 +23,7 @@ from mapweave.wire.bus import Closing, Reply, Request, Sample, never
 from mapweave.wire.bus_settings import QUEUE_LIMIT, RETRY_FIRST, RETRY_LONGEST, BusSettings
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.keyexpr import check_key, check_pattern
+from mapweave.wire.open_files import allow_many_files
 from mapweave.wire.zenoh_config import session_values
 from mapweave.wire.zenoh_entities import Declared, Owner, Service, Subscription, Token, Watcher, read_reply
 
@@ -273,6 +274,7 @@ class ZenohBus:
 
 
 def _open_router(settings: BusSettings) -> zenoh.Session:
+    allow_many_files()
     if settings.access is not None:
         # Zenoh itself says why it refuses a handshake: a foreign authority, no certificate, a wrong password.
         zenoh.init_log_from_env_or(REFUSALS)

@@ -22,6 +22,9 @@ ACCEPT_PENDING = 1000
 """Connections of which a router does not know yet who they are."""
 ACCEPT_TIMEOUT = 2.0
 """s; a silent new connection is dropped after this time. A handshake takes two round trips."""
+MAX_SESSIONS = 16384
+"""Robots, people and routers that a router takes at once. With Zenoh's own 1000 the thousandth robot
+tries to connect for ever and is given no reason."""
 
 LARGEST = {"put": 2**18, "query": 2**20, "reply": 2**25}
 """Bytes of what a client may send: twice a change, several views, the largest piece of a log. The router
@@ -60,6 +63,7 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "transport/shared_memory/enabled": False,
     }
     if routes:
+        values["transport/unicast/max_sessions"] = MAX_SESSIONS
         values["transport/link/rx/max_message_size"] = LARGEST_MESSAGE
         values["low_pass_filter"] = [
             {"id": name, "flows": ["ingress"], "messages": [name], "key_exprs": ["mapweave/**"],
