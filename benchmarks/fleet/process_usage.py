@@ -13,17 +13,22 @@ HZ = os.sysconf("SC_CLK_TCK")
 
 
 def cpu_seconds(pid: int) -> tuple[float, float]:
-    """What a process has used, s: by its own threads, and by those of Zenoh in it."""
-    own = zenoh = 0.0
+    """What a process has used, s: by its own threads, also those that have ended, and by those of Zenoh in it."""
+    zenoh = 0.0
     for task in Path(f"/proc/{pid}/task").iterdir():
-        name, _, rest = (task / "stat").read_text().partition("(")[2].rpartition(")")
-        fields = rest.split()
-        used = (int(fields[11]) + int(fields[12])) / HZ
-        if ZENOH.match(name):
-            zenoh += used
-        else:
-            own += used
-    return own, zenoh
+        try:
+            name, used = _used(task / "stat")
+        except FileNotFoundError:  # it has just ended
+            continue
+        zenoh += used if ZENOH.match(name) else 0.0
+    return _used(Path(f"/proc/{pid}/stat"))[1] - zenoh, zenoh
+
+
+def _used(stat: Path) -> tuple[str, float]:
+    """Name of a thread or process, and what it has used, s."""
+    name, _, rest = stat.read_text().partition("(")[2].rpartition(")")
+    fields = rest.split()
+    return name, (int(fields[11]) + int(fields[12])) / HZ
 
 
 def resident_mb(pid: int) -> float:
