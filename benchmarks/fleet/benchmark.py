@@ -107,9 +107,13 @@ def ask(bus: ZenohBus, views: Sequence[View], begin: float, end: float) -> tuple
     """Ask where it is; returns how long each answer took, s, and how often there was none."""
     took, lost = [], 0
     messages = [encode_view(view) for view in views]
-    for k in range(round((end - begin) * QUESTIONS_PER_S)):
+    for k in range(questions := round((end - begin) * QUESTIONS_PER_S)):
         time.sleep(max(0.0, begin + k / QUESTIONS_PER_S - time.monotonic()))
         asked = time.monotonic()
+        if asked > end:
+            # Earlier ones took so long that these come too late.
+            lost += questions - k
+            break
         replies = bus.ask(Keys(FLEET).any_relocalize(), messages[k % len(messages)], 10.0)
         if replies and not replies[0].error:
             took.append(time.monotonic() - asked)

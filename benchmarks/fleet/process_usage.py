@@ -13,7 +13,7 @@ HZ = os.sysconf("SC_CLK_TCK")
 
 
 def cpu_seconds(pid: int) -> tuple[float, float]:
-    """What a process has used, s: by its own threads, also those that have ended, and by those of Zenoh in it."""
+    """What a process has used, s: by its own threads, also those that have ended, and by Zenoh's in it."""
     zenoh = 0.0
     for task in Path(f"/proc/{pid}/task").iterdir():
         try:
