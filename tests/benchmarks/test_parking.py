@@ -18,6 +18,7 @@ def scene() -> Scene:
     return Scene((4, 0), one_view=True)
 
 
+@pytest.mark.slow
 def test_starts_are_drawn_by_the_rule(scene):
     rng = np.random.default_rng(3)
     for _ in range(20):

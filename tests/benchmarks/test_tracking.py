@@ -64,6 +64,7 @@ def test_all_trackers_follow_most_points(drive: Drive):
         assert np.isfinite(errors).sum() > 0.5 * outcome.in_view.sum(), name
 
 
+@pytest.mark.slow
 def test_the_last_line_is_for_scripts():
     done = run("--drives", "1", "--frames", "12", "--seed", "3", "--json")
     assert done.returncode == 0, done.stderr

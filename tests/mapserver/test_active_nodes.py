@@ -78,6 +78,7 @@ def certainties(merger: Merger, views: Sequence[View]) -> list[Certainty]:
     return [relocalizer.answer(view).certainty for view in views]
 
 
+@pytest.mark.slow
 def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     rng = np.random.default_rng(4)
     world, maps = room(0, 0, 5, 4, 700, rng), [MapId(agent, 1) for agent in "abc"]

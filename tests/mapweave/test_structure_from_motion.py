@@ -66,7 +66,7 @@ class Walk:
         return errors, np.array(relative), scale
 
 
-@pytest.mark.parametrize("seed", first_quick(range(5), 1))
+@pytest.mark.parametrize("seed", first_quick(range(5), 0))
 def test_a_walk_is_found_again_up_to_its_scale(seed: int) -> None:
     walk = Walk(seed)
     errors, turns, scale = walk.off(reconstruct(walk.views, 0.6))

@@ -116,6 +116,7 @@ def test_clearances_are_those_of_the_drawing(offices: list[World]) -> None:
         np.testing.assert_allclose(world.plan.clearances(points), drawn, atol=2.5 / SCALE)
 
 
+@pytest.mark.slow
 def test_there_is_enough_to_see(offices: list[World]) -> None:
     """From free places with random headings a robot finds 60 features, and almost always 15."""
     rng = np.random.default_rng(1)

@@ -84,7 +84,7 @@ SLOW = pytest.mark.slow
     [
         pytest.param(Parameter.FORWARD, 0.05, False, marks=SLOW),
         (Parameter.HEADING, math.radians(2.0), True),
-        (Parameter.DELAY, 0.05, True),
+        pytest.param(Parameter.DELAY, 0.05, True, marks=SLOW),
         pytest.param(Parameter.FORWARD, 0.1, True, marks=SLOW),
         pytest.param(Parameter.LEFT, 0.1, False, marks=SLOW),
         pytest.param(Parameter.PITCH, math.radians(3.0), True, marks=SLOW),

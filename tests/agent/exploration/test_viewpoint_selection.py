@@ -163,6 +163,7 @@ def test_floor_behind_walls_attracts_no_exploration():
     assert result[0] < end
 
 
+@pytest.mark.slow
 def test_visible_floor_agrees_with_a_test_of_each_cell():
     """Every cell is looked at along a line of its own, in steps of a centimetre."""
     floor, here, reach = corridor(), np.array([2.05, 0.35]), 2.5

@@ -135,6 +135,7 @@ def test_a_robot_beside_another_one_gets_away(bearing):
     assert room > 0.03
 
 
+@pytest.mark.slow
 def test_as_near_as_it_can_get_to_what_is_walled_in():
     rng = np.random.default_rng(5)
     scene = Scene(

@@ -84,6 +84,7 @@ def test_a_block_is_forgotten_after_a_while_and_for_longer_each_time(home):
     assert waits[1] == pytest.approx(10.0, abs=3.0)
 
 
+@pytest.mark.slow
 def test_it_goes_around_by_another_way(home):
     eyes = Eyes(home, Pose2(2.5, 2.0))
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9))

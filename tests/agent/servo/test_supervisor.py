@@ -134,6 +134,7 @@ def test_landmarks_without_depth_are_ignored(robot: RobotDescription) -> None:
     assert not servo.start(Pose2(-1.0, 0.2, 0.0), np.full((9, 3), np.nan))
 
 
+@pytest.mark.slow
 def test_a_long_search_is_made_at_rest(
     robot: RobotDescription, simulate: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -85,6 +85,7 @@ def test_a_bad_day(tmp_path):
         assert (options.out / name).stat().st_size > 500
 
 
+@pytest.mark.slow
 def test_another_trial_takes_the_place_of_the_first_and_touches_nothing_else(tmp_path):
     path = tmp_path / "short.toml"
     path.write_text('robots = 1\n[world]\nkind = "arena"\n[[events]]\nat = 1.0\ndo = "wait"\n')
