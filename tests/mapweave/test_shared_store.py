@@ -70,8 +70,16 @@ def test_either_of_two_servers_may_be_killed(
         bus = ZenohBus(BusSettings(mode="client", endpoints=tuple(endpoints.values())))
 
         def status(name: str) -> Mapping[str, Scalar]:
-            replies = bus.ask(KEYS.server_status(name), b"", 5.0)
-            return next((decode_record(reply.payload) for reply in replies if not reply.error), {})
+            """Asked again where no answer comes in time, as while the servers' routers find each other."""
+            found: list[Mapping[str, Scalar]] = []
+
+            def answered() -> bool:
+                replies = bus.ask(KEYS.server_status(name), b"", 5.0)
+                found.extend(decode_record(reply.payload) for reply in replies if not reply.error)
+                return bool(found)
+
+            eventually(answered, PATIENCE)
+            return found[0]
 
         eventually(lambda: sum(bool(status(name).get("leads")) for name in ports) == 1, PATIENCE)
         robots = [robot_of(tmp_path, bus, maps[0], "r0")]
