@@ -107,7 +107,6 @@ class Agent:
         keys = Keys(FLEET)
         slow = orders.disturbance == "slow"
         self._bus = (MuteBus if slow else ZenohBus)(BusSettings(endpoints=(orders.endpoint,)))
-        # The sessions of a process share a few threads of Zenoh: one after another, none times out.
         if not self._bus.wait_connected(CONNECTING):
             raise SystemExit(f"{name} does not get a connection")
         journal = SlowTimedJournal if slow else TimedJournal

@@ -46,7 +46,7 @@ from benchmarks.fleet import floor_process
 from benchmarks.fleet.agents_process import FLEET, INTERVAL, PATIENCE, Orders
 from benchmarks.fleet.disturbance import KINDS, THAW_BEFORE, Freeze
 from benchmarks.fleet.drives import drive, name_of
-from benchmarks.fleet.process_usage import cpu_seconds, resident_mb, total
+from benchmarks.fleet.process_usage import Usage, resident_mb, total
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.query import View
 from mapweave.processes import parent_watchdog
@@ -104,14 +104,14 @@ def end_all(generators: Sequence[Generator]) -> None:
 
 
 def ask(bus: ZenohBus, views: Sequence[View], begin: float, end: float) -> tuple[list[float], int]:
-    """Ask where it is; returns how long each answer took, s, and how often there was none."""
+    """Ask where it is; returns how long each answer took, s, and how often there was none in time."""
     took, lost = [], 0
     messages = [encode_view(view) for view in views]
     for k in range(questions := round((end - begin) * QUESTIONS_PER_S)):
         time.sleep(max(0.0, begin + k / QUESTIONS_PER_S - time.monotonic()))
         asked = time.monotonic()
         if asked > end:
-            # Earlier ones took so long that these come too late.
+            # Answers took so long that there is no time left for these.
             lost += questions - k
             break
         replies = bus.ask(Keys(FLEET).any_relocalize(), messages[k % len(messages)], 10.0)
@@ -171,16 +171,18 @@ def measure_fleet(
         asking.start()
         server, pids = children.pid("server"), [generator.pid for generator in generators]
         time.sleep(max(0.0, begin - time.monotonic()))
-        before = (*cpu_seconds(server), total(pids))
+        usage = Usage(server)
+        before = (*usage.take(), total(pids))
         words: dict[str, str] = {}
         while time.monotonic() < end:
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
+            usage.take()
             progress.update(step, completed=time.monotonic() - begin)
             if disturbers and not words and time.monotonic() > end - 2 * THAW_BEFORE:
                 words = shown(bus)
         took = time.monotonic() - begin
         own, zenoh, generated = (
-            (b - a) / took for a, b in zip(before, (*cpu_seconds(server), total(pids)), strict=True)
+            (b - a) / took for a, b in zip(before, (*usage.take(), total(pids)), strict=True)
         )
         rss = resident_mb(server)
         asking.join()

@@ -12,23 +12,39 @@ ZENOH = re.compile(r"^(acc|app|net|rx|tx)-\d+$")
 HZ = os.sysconf("SC_CLK_TCK")
 
 
-def cpu_seconds(pid: int) -> tuple[float, float]:
-    """What a process has used, s: by its own threads, also those that have ended, and by Zenoh's in it."""
-    zenoh = 0.0
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        try:
-            name, used = _used(task / "stat")
-        except FileNotFoundError:  # it has just ended
-            continue
-        zenoh += used if ZENOH.match(name) else 0.0
-    return _used(Path(f"/proc/{pid}/stat"))[1] - zenoh, zenoh
+class Usage:
+    """Processor time of a process. Zenoh begins and ends threads as it likes: take it often."""
+
+    def __init__(self, pid: int) -> None:
+        """Begin with the threads that are there."""
+        self._pid = pid
+        self._zenoh: dict[tuple[str, int], float] = {}
+        """What Zenoh's threads had used when they were last seen, s, by number and start."""
+        self.take()
+
+    def take(self) -> tuple[float, float]:
+        """What it has used, s: by its own threads and by those of Zenoh, also those that have ended."""
+        for task in Path(f"/proc/{self._pid}/task").iterdir():
+            try:
+                name, used, start = _stat(task / "stat")
+            except (FileNotFoundError, ProcessLookupError):  # it has just ended
+                continue
+            if ZENOH.match(name):
+                self._zenoh[task.name, start] = used
+        zenoh = sum(self._zenoh.values())
+        return used_by(self._pid) - zenoh, zenoh
 
 
-def _used(stat: Path) -> tuple[str, float]:
-    """Name of a thread or process, and what it has used, s."""
-    name, _, rest = stat.read_text().partition("(")[2].rpartition(")")
+def used_by(pid: int) -> float:
+    """What all threads of a process have used, s, also those that have ended."""
+    return _stat(Path(f"/proc/{pid}/stat"))[1]
+
+
+def _stat(path: Path) -> tuple[str, float, int]:
+    """Name of a thread or process, what it has used, s, and when it began."""
+    name, _, rest = path.read_text().partition("(")[2].rpartition(")")
     fields = rest.split()
-    return name, (int(fields[11]) + int(fields[12])) / HZ
+    return name, (int(fields[11]) + int(fields[12])) / HZ, int(fields[19])
 
 
 def resident_mb(pid: int) -> float:
@@ -39,4 +55,4 @@ def resident_mb(pid: int) -> float:
 
 def total(pids: Iterable[int]) -> float:
     """Of all threads of all processes, s."""
-    return sum(sum(cpu_seconds(pid)) for pid in pids)
+    return sum(map(used_by, pids))
