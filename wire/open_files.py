@@ -28,4 +28,4 @@ def allow_many_files() -> None:
         try:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
         except (OSError, ValueError) as error:
-            log.warning("no more than %d open files are allowed (%s): as many robots connect", soft, error)
+            log.warning("at most %d connections: the limit of open files cannot be raised (%s)", soft, error)

@@ -83,4 +83,4 @@ def test_a_system_that_refuses_is_reported(
     monkeypatch.setattr(resource, "getrlimit", lambda what: (1024, 4096))
     monkeypatch.setattr(resource, "setrlimit", refuses)
     allow_many_files()
-    assert "no more than 1024 open files are allowed" in caplog.text
+    assert "at most 1024 connections: the limit of open files" in caplog.text
