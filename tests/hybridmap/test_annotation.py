@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.annotation import (
@@ -76,7 +76,6 @@ entries = st.one_of(
 )
 
 
-@settings(max_examples=30)
 @given(st.lists(entries, max_size=6))
 def test_messages_and_files_bring_annotations_unchanged(made) -> None:
     record = Annotations(tuple(made))
@@ -87,7 +86,6 @@ def test_messages_and_files_bring_annotations_unchanged(made) -> None:
     assert unpack_map_file(pack_map_file(content)).annotations == record.made
 
 
-@settings(max_examples=40)
 @given(st.lists(entries, max_size=8), st.integers(0, 8))
 def test_two_records_join_by_their_dates(made, cut) -> None:
     first, second = Annotations(tuple(made[:cut])), Annotations(tuple(made[cut:]))

@@ -370,10 +370,17 @@ def test_a_content_whose_loops_have_singular_covariances_changes_nothing(beside:
     beside.check(2209)
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_800_random_legal_contents_change_nothing_for_sound_robots(beside: Beside) -> None:
-    for seed in range(120, 920):
+@pytest.mark.parametrize(
+    "seeds",
+    [
+        pytest.param(range(120, 920), marks=pytest.mark.slow),
+        pytest.param(range(920, 3120), marks=pytest.mark.scenario),
+    ],
+    ids=str,
+)
+def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Beside, seeds: range) -> None:
+    for seed in seeds:
         beside.check(seed)
 
 

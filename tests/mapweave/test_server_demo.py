@@ -165,8 +165,6 @@ def test_the_demo_keeps_nothing(tmp_path: Path) -> None:
     begin = time.monotonic()
     command = [sys.executable, "-m", "mapweave", "server", "--demo", "--data", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert (
-        done.returncode != 0
-        and done.stderr.strip() == "mapweave: --demo keeps nothing: leave out --data and --store"
-    )
+    assert done.returncode != 0
+    assert done.stderr.strip() == "mapweave: --demo keeps nothing: leave out --data and --store"
     assert not list(tmp_path.iterdir()) and time.monotonic() < begin + 30.0

@@ -14,7 +14,6 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.query import View
 from mapweave.structure_from_motion import CAMERA_FROM_LEVEL, Structure, reconstruct
 from synthetic.world import random_vectors
-from tests.quick import first_quick
 
 CAMERA = Camera(640, 480, 520.0, 522.0, 318.0, 243.0, mount_height=1.3)
 
@@ -66,7 +65,8 @@ class Walk:
         return errors, np.array(relative), scale
 
 
-@pytest.mark.parametrize("seed", first_quick(range(5), 0))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
 def test_a_walk_is_found_again_up_to_its_scale(seed: int) -> None:
     walk = Walk(seed)
     errors, turns, scale = walk.off(reconstruct(walk.views, 0.6))

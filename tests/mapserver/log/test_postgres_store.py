@@ -81,7 +81,7 @@ def content(store: Store) -> list[object]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("examples", [3, pytest.param(15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [4, pytest.param(30, marks=pytest.mark.slow)])
 def test_both_stores_give_the_same_for_the_same(
     postgres: PostgresServer, tmp_path: Path, examples: int
 ) -> None:
