@@ -1,8 +1,9 @@
 """Answers of the fleet on trial: each is held against the robot's own view, and given up if that differs.
 
 A whereabouts or a route says what will be in view. Until a node of it is seen where it should be, the robot
-drives no further than it may drive blindly; then the answer is refuted. Several refuted answers in a row, or
-a drive out of all proportion to its route, end the mission: no answer makes a robot drive for ever.
+drives no further than it may drive blindly; then the answer is refuted. Two answers that agree, by the wheels
+between them, on where the goal is bear each other out as well. Several refuted answers in a row, or a drive
+out of all proportion to its route, end the mission: no answer makes a robot drive for ever.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import math
 from collections.abc import Sequence
 
 from mapweave.agent.global_localization.candidates import Candidate
+from mapweave.agent.global_localization.pose_consistency import PoseHypothesis, consistent
 from mapweave.agent.global_localization.refuted_places import RefutedPlaces
-from mapweave.agent.localization.fix import TURN_SHARE
+from mapweave.agent.localization.fix import TURN_SHARE, Fix
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteLeg
 
 TRIALS = 6
@@ -45,17 +48,33 @@ class AnswerTrial:
         self._failed = 0
         self._route: Sequence[RouteLeg] = ()
         self._last = ""
+        self._searched = False
+        self._before: tuple[NodeId, PoseHypothesis] | None = None
 
     def found(self, place: Candidate | None) -> None:
         """Take where the robot is said to be, or found itself on its own map."""
         self.node = None if place is None or place.recognized is not None else place.node
+        self._searched = place is not None
 
-    def took(self, route: Sequence[RouteLeg]) -> None:
-        """Take the route that is driven from now on."""
+    def took(self, route: Sequence[RouteLeg], fix: Fix) -> None:
+        """Take the route that is driven from now on, and where the robot is on it."""
         self._route, self.borne_out = route, False
+        if self._searched:
+            node_from_goal = Pose2()
+            for leg in route:
+                node_from_goal = node_from_goal @ leg.previous_from_node.mean
+            self._compare(route[-1].node.id, node_from_goal.inverse() @ fix.node_from_robot.mean)
         legs = [leg.previous_from_node.mean for leg in route]
         length = sum(math.hypot(leg.x, leg.y) for leg in legs)
         self._longest = max(self._longest, min(length, LONGEST_ROUTE))
+
+    def _compare(self, goal: NodeId, goal_from_robot: Pose2) -> None:
+        """Hold the answers to a search against those to the one before: the wheels know what is between."""
+        motion = self._motion
+        now = PoseHypothesis(goal_from_robot, motion.odom_from_robot, motion.way, motion.turned, True)
+        if self._before is not None and self._before[0] == goal and consistent(self._before[1], now):
+            self._failed = 0
+        self._before, self._searched = (goal, now), False
 
     def saw(self, node: NodeId) -> None:
         """A node of the route is in view where it should be."""

@@ -289,8 +289,9 @@ class Navigator:
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
         """Follow a route until it is driven, or blocked, or the robot is lost."""
-        follower = self._follower(route, self._compared(route, fix))
-        self._trial.took(route)
+        fix = self._compared(route, fix)
+        follower = self._follower(route, fix)
+        self._trial.took(route, fix)
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
         self._following, self._touched = True, ""
         while True:

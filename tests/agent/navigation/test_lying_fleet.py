@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from mapweave.agent.global_localization.refuted_places import RefutedPlaces
-from mapweave.agent.localization.fix import TURN_SHARE
+from mapweave.agent.localization.fix import TURN_SHARE, Fix
 from mapweave.agent.mission import Answer, Question, WhereAmI
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.answer_trial import TRIALS, AnswerTrial
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.node import NodeId
-from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import RouteAnswer
 from synthetic.world import take_map
 from tests.agent.scripted_fleet import (
@@ -106,6 +106,30 @@ def test_the_own_view_corrects_a_wrong_pose_before_the_robot_drives(home, wrong)
     assert abs(fix.node_from_robot.mean.heading - (START.inverse() @ eyes.pose).heading) < 0.05
 
 
+@pytest.mark.parametrize("apart", [0.0, 0.4])
+def test_answers_that_agree_with_the_wheels_are_not_called_wrong(home, apart):
+    """The robot sees nothing of its nodes, but each answer has it where the wheels say that it is by now.
+
+    Before, it gave up a right goal after 12 m: places that it knew only from other sides.
+    """
+    eyes, goal = Eyes(home, START), START @ Pose2(20.0)
+    asked = iter(range(1, 10_000, 2))
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            node = NodeId("s", 1, next(asked))
+            return found(question, here(node, Pose2(0.0, apart * (node.number % 4 - 2))))
+        way = (eyes.pose.inverse() @ goal).x
+        return Answer(
+            question.number, RouteAnswer(straight(bare(question.start), bare(B), step=way), "a way")
+        )
+
+    trial = Trial(navigator(eyes, NOWHERE, B), eyes, fleet)
+    trial.run(200.0, lambda: trial.navigator.given_up or eyes.pose.distance(goal) < 0.3)
+    assert trial.navigator.given_up == bool(apart), "contradicting answers are given up as before"
+    assert (eyes.pose.distance(goal) < 0.3) != bool(apart)
+
+
 @pytest.mark.parametrize(("step", "bound"), [(9.0, 50.0 + 5.0 * 9.0), (1e4, 550.0)])
 def test_no_mission_takes_more_way_than_its_bound(step, bound):
     """However often nodes of its routes are seen: a goal may move away for ever."""
@@ -113,7 +137,7 @@ def test_no_mission_takes_more_way_than_its_bound(step, bound):
     trial = AnswerTrial(motion, RefutedPlaces(motion))
     route = straight(bare(A), bare(B), step=step)
     for tick in range(600):
-        trial.took(route)
+        trial.took(route, Fix(A, PoseGaussian(Pose2(), np.zeros((3, 3)))))
         trial.saw(B)
         motion.take_in(Observation(tick, Odometry(1.0, 0.0)), ())
         assert bool(trial.ended) == (motion.way > bound)
