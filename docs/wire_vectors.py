@@ -287,7 +287,7 @@ def answers() -> dict[str, tuple[Any, ...]]:
         "server/s0/known": (query.KnownRequest(MAP, 1.25, -2.5, 8.5), query.KnownAnswer(views, "2 views")),
         "server/s0/reserve": (
             query.ReserveRequest("r0", NODE, Pose2(0.1, 0.0, 0.2), (NEXT, FAR)),
-            query.ReserveAnswer(1, "r1", FAR, "r1 drives there", True),
+            query.ReserveAnswer(1, "r1", FAR, "r1 drives there", True, True),
         ),
         "server/s0/nearby": (
             nearby.NearbyRequest(

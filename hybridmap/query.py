@@ -252,6 +252,7 @@ class ReserveAnswer:
         aside: both wait for each other: this robot steps aside, to this node; None if it only waits.
         reason: in words.
         closed: whether a person has closed the way ahead; the robot asks for another one.
+        occupied: whether the holder stands at the end of the route, without a way of its own.
     """
 
     granted: Annotated[int, Meta(ge=0, le=MAX_LEGS)]
@@ -259,6 +260,7 @@ class ReserveAnswer:
     aside: NodeId | None
     reason: Words
     closed: bool = False
+    occupied: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,8 @@ MAP_SIGMA = 0.05
 """Standard deviation of a robot's map against another's in the merged map, m: of answers in simulated offices
 half are off by less than 0.03 m, and a tenth by more than 0.05 m. Of each pair the pose graph knows it, but
 that costs more than all the rest of the answer."""
+STILL = 0.05
+"""A robot that has moved no further than this between its last two questions stands, m."""
 CELL = 16.0
 """Side of the cells by which robots are found, m. What is not in a cell beside a robot's needs more than the
 5 s between two questions to come near, at 1 m/s each."""
@@ -83,6 +85,24 @@ class Nearby:
         robots = tuple(_seen_from(here, other) for other in around[:MAX_NEARBY])
         return NearbyAnswer(robots, "" if robots else "no other robot of this part of the map is near")
 
+    def standing(self, node: NodeId, radius: float, merged: MergedMap, now: float) -> list[str]:
+        """Robots that stand where a robot of some radius, m, would touch them, if it were at a node.
+
+        Args:
+            node: of the newest merged map.
+            radius: of the robot that wants to be there, m.
+            merged: the newest merged map.
+            now: of the same clock, s.
+        """
+        component = merged.component_of(node)
+        if component is None:
+            return []
+        request = NearbyRequest("", ((node, Pose2()),), 0.0, 0.0, radius, 0.0, 0.0)
+        here = _Sighting(now, merged.graphs[component].anchor, merged.pose(node), request)
+        with self._turn:
+            around = [one.request.robot for one in self._others(here) if _touch(here, one)]
+            return sorted(name for name in around if _still(self._seen[name]))
+
     def _others(self, here: _Sighting) -> list[_Sighting]:
         """Where the robots of the cells around one were when they last asked before now."""
         frame, i, j = here.cell
@@ -101,6 +121,16 @@ class Nearby:
             if not self._cells[cell]:
                 del self._cells[cell]
         return seen
+
+
+def _touch(one: _Sighting, other: _Sighting) -> bool:
+    """Whether two robots would touch each other."""
+    return one.pose.distance(other.pose) < one.request.radius + other.request.radius
+
+
+def _still(seen: tuple[_Sighting, ...]) -> bool:
+    """Whether a robot has been seen twice at one place."""
+    return len(seen) == 2 and seen[0].frame == seen[1].frame and seen[0].pose.distance(seen[1].pose) < STILL
 
 
 def _seen_from(here: _Sighting, other: _Sighting) -> NearbyRobot:

@@ -3,7 +3,8 @@
 A robot asks for the way ahead of it, again every second. It gets as much of it as no other robot holds, and
 holds that until it asks again, or falls silent: leases expire, so a robot that died releases its own. Two
 parts of ways exclude each other if robots on them would touch, whichever edges they are: two robots that
-mapped one corridor have an edge each for it, and on a wide floor both may drive.
+mapped one corridor have an edge each for it, and on a wide floor both may drive. A robot without a way holds
+nothing: others drive around it. Only where it stands at another's goal does that one stop before.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from scipy.spatial import cKDTree
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
+from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.routes import Router
+from mapweave.merge.pose_graph.merged_map import MergedMap
 
 LEASE = 5.0
 """A robot that has not asked for so long holds nothing any more, s; it asks every second."""
@@ -82,8 +85,13 @@ class _Aside:
 class Reservations:
     """Leases by robot. Thread-safe."""
 
-    def __init__(self) -> None:
-        """No robot holds anything."""
+    def __init__(self, nearby: Nearby) -> None:
+        """No robot holds anything.
+
+        Args:
+            nearby: knows where robots stand.
+        """
+        self._nearby = nearby
         self._leases: dict[str, _Lease] = {}
         self._turn = threading.Lock()
 
@@ -111,6 +119,11 @@ class Reservations:
             radius = max(router.roads.union.nodes[node].radius for node in request.route) or RADIUS
             others = {name: one for name, one in self._leases.items() if one.component == component}
             granted, held, holder = _free(stops, radius, others)
+            taken = self._at_goal(request, radius, merged, now) if granted == len(request.route) else ""
+            if taken:
+                granted, holder = granted - 1, taken
+                held = np.vstack([here[None], *(_points(a, b) for a, b in pairwise(stops[:-1]))])
+            reason = f"{holder} stands at {request.route[-1]}" if taken else f"{holder} drives there"
             way = np.vstack([_points(a, b) for a, b in pairwise(stops)])
             lease = _Lease(request, component, radius, here, held, way, now + LEASE, holder)
             self._leases[request.robot] = lease
@@ -118,11 +131,16 @@ class Reservations:
                 return ReserveAnswer(granted, "", None, "")
             aside = self._yields(request.robot, router)
             if aside is None:
-                return ReserveAnswer(granted, holder, None, f"{holder} drives there")
+                return ReserveAnswer(granted, holder, None, reason, occupied=bool(taken))
             # Others that hold some of its way aside get no more of it from their next question on.
             self._leases[request.robot] = replace(lease, held=aside.way)
             free = _free(aside.way, radius, others)[0] == len(aside.way) - 1
-            return ReserveAnswer(0, holder, aside.node if free else None, f"{holder} drives there")
+            return ReserveAnswer(0, holder, aside.node if free else None, reason)
+
+    def _at_goal(self, request: ReserveRequest, radius: float, merged: MergedMap, now: float) -> str:
+        """The robot that stands at the end of a robot's way, without a way of its own; empty if none does."""
+        there = self._nearby.standing(request.route[-1], radius, merged, now)
+        return next((name for name in there if name != request.robot and name not in self._leases), "")
 
     def _yields(self, robot: str, router: Router) -> _Aside | None:
         """Where a robot steps aside; None if robots do not wait for each other in a circle, or another does.

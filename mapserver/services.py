@@ -101,8 +101,8 @@ class Services:
         self._missions = missions
         self._roster = roster
         self._relays = relays
-        self._reservations = Reservations()
         self._nearby = Nearby()
+        self._reservations = Reservations(self._nearby)
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
             lambda: places().annotations, images,

@@ -382,13 +382,15 @@ class Navigator:
         began, self._following, go_on = self._motion.now, False, True
         while go_on and not right_of_way.may_drive(follower.leg, follower.fix):
             if right_of_way.holder:
-                self.stage, self.detail = Stage.YIELDING, f"{right_of_way.holder} drives there"
+                self.stage, self.detail = Stage.YIELDING, right_of_way.reason
                 self._trouble = f"{right_of_way.holder} is in the way"
             if right_of_way.closed:
                 self._trouble = self.detail = right_of_way.closed
             self._aside = right_of_way.aside
             go_on = self._aside is None and not right_of_way.closed
             if go_on and self._motion.now - began > YIELDED:
+                if right_of_way.occupied and follower.blocked[1] in (self.goal, *self._via[:1]):
+                    self._give_up(right_of_way.reason)
                 # It is stuck, or stands there: another way may be free.
                 self._blocks.add(*follower.blocked, self._motion.now)
                 go_on = False

@@ -23,14 +23,17 @@ class RightOfWay:
     """Of one drive along a route.
 
     Attributes:
-        holder: the robot that drives where this one wants to; empty without one.
+        holder: the robot that drives or stands where this one wants to; empty without one.
+        reason: why this one waits, in words.
+        occupied: whether the holder stands at the end of the route.
         aside: the node to which this one must step aside; None if it need not.
         closed: why the way ahead is closed, in words; empty if it is not.
     """
 
     def __init__(self, motion: MotionPrimitives, route: Sequence[NodeId]) -> None:
         """Take a route; nothing is known of it yet."""
-        self.holder = ""
+        self.holder = self.reason = ""
+        self.occupied = False
         self.aside: NodeId | None = None
         self.closed = ""
         self._motion = motion
@@ -62,6 +65,8 @@ class RightOfWay:
     def _take(self, content: object, first: int) -> None:
         if isinstance(content, ReserveAnswer):
             self._granted, self.holder, self.aside = first + content.granted, content.holder, content.aside
+            self.reason, self.occupied = content.reason, content.occupied
             self.closed = content.reason if content.closed else ""
         else:
             self._granted, self.holder, self.aside, self.closed = len(self._route), "", None, ""
+            self.occupied = False

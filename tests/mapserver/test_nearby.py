@@ -101,3 +101,21 @@ def test_the_order_of_those_that_ask_at_once_changes_no_answer(merged: MergedMap
         return out
 
     assert play("r0", "r1", "r3") == play("r3", "r1", "r0")
+
+
+def test_only_a_robot_seen_twice_at_one_place_stands_at_a_node(merged: MergedMap) -> None:
+    """Robots of 0.16 m around the second node, (3, 1), seen from both nodes of the map."""
+    nearby = Nearby()
+    from_first = PLACES[0].inverse() @ PLACES[1]
+    for now in (10.0, 15.0):
+        nearby.ask(request("stands", 1, Pose2(0.2, 0.2)), merged, now)
+        nearby.ask(request("too far", 1, Pose2(0.25, 0.25)), merged, now)
+        nearby.ask(request("drives", 1, Pose2(0.012 * now, 0.0)), merged, now)
+        nearby.ask(request("elsewhere", 2, PLACES[1]), merged, now)
+        nearby.ask(request("of the first", 0, from_first), merged, now)
+    nearby.ask(request("once", 1, Pose2()), merged, 15.0)
+    assert nearby.standing(NODES[1], 0.16, merged, 16.0) == ["of the first", "stands"]
+    assert nearby.standing(NODES[1], 0.0, merged, 16.0) == ["of the first"], "a smaller one has room"
+    assert nearby.standing(NODES[0], 0.16, merged, 16.0) == []
+    assert nearby.standing(NODES[1], 0.16, merged, 15.1 + KEPT) == [], "who is silent is gone"
+    assert nearby.standing(NodeId(*A, 99), 0.16, merged, 16.0) == []

@@ -10,10 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.reservations import AHEAD, LEASE, Reservations
 from mapweave.mapserver.routes import Router
 from tests.agent.scripted_fleet import bare
@@ -56,7 +58,8 @@ class Traffic:
     """Robots that ask for the way from node to node."""
 
     def __init__(self, router: Router) -> None:
-        self.router, self.reservations, self.now = router, Reservations(), 0.0
+        self.router, self.nearby, self.now = router, Nearby(), 0.0
+        self.reservations = Reservations(self.nearby)
 
     def ask(self, robot: str, *way: int, off: float = 0.0) -> ReserveAnswer:
         route = tuple(map(node, way[1:] if len(way) > 1 else way))
@@ -155,6 +158,22 @@ def test_robots_side_by_side_may_part(router: Router) -> None:
     assert traffic.ask("r0", 4, 5, 6, off=0.2).granted == 2
     assert traffic.ask("r1", 4, 5, 6, off=-0.2).holder == "r0", "behind the first one it waits"
     assert traffic.ask("r1", 4, 3, 2, off=-0.2).granted == 2
+
+
+def test_who_has_parked_holds_its_place_but_not_the_way_past_it(router: Router) -> None:
+    """At 4, on no way: others drive by, but do not get to where it stands."""
+    traffic = Traffic(router)
+    parked = NearbyRequest("r9", ((node(4), Pose2(0.1)),), 0.01, 0.01, 0.16, 0.3, 0.3)
+    for traffic.now in (0.0, 5.0):
+        traffic.nearby.ask(parked, router.merged, traffic.now)
+    assert traffic.ask("r1", 6, 5, 4, 3) == ReserveAnswer(3, "", None, "")
+    traffic.now += LEASE
+    taken = ReserveAnswer(1, "r9", None, "r9 stands at a.1.5", occupied=True)
+    assert traffic.ask("r0", 2, 3, 4) == taken
+    assert traffic.ask("r9", 4, 5, 4).holder == "", "neither itself nor who waits is in its way"
+    assert traffic.ask("r0", 2, 3, 4).reason == "r9 drives there"
+    traffic.now = 21.0
+    assert traffic.ask("r0", 2, 3, 4) == ReserveAnswer(2, "", None, ""), "it is silent for 16 s"
 
 
 def test_of_what_is_not_on_the_map_nothing_is_held(router: Router) -> None:

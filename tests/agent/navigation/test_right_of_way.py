@@ -12,6 +12,7 @@ from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
+from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.reservations import Reservations
 from tests.agent.scripted_fleet import (
     BODY,
@@ -53,7 +54,8 @@ def test_a_robot_whose_way_is_held_stands_and_says_so_and_then_drives_on(home):
     def traffic(question: MayIDrive) -> Answer:
         asked.append(question)
         granted = len(question.route) if free[0] else 0
-        return Answer(question.number, ReserveAnswer(granted, "" if free[0] else "r7", None, ""))
+        words = "" if free[0] else "r7 drives there"
+        return Answer(question.number, ReserveAnswer(granted, "" if free[0] else "r7", None, words))
 
     trial.traffic = traffic
     trial.run(10.0)
@@ -74,6 +76,18 @@ def test_a_robot_that_waits_too_long_looks_for_another_way(home):
         (),
         ((A, B),),
     ]
+
+
+def test_a_robot_whose_goal_is_taken_waits_and_then_says_by_whom(home):
+    """Before, it manoeuvred beside the parked robot for 300 s, with "no progress, though nothing is near"."""
+    trial = trial_to(home)
+    taken = ReserveAnswer(0, "r7", None, f"r7 stands at {B}", occupied=True)
+    trial.traffic = lambda question: Answer(question.number, taken)
+    trial.run(YIELDED - 5.0)
+    assert trial.navigator.stage == Stage.YIELDING and trial.navigator.detail == f"r7 stands at {B}"
+    trial.run(10.0)
+    assert trial.navigator.given_up and trial.navigator.detail == f"r7 stands at {B}"
+    assert not any(command.forward for command in trial.commands)
 
 
 def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
@@ -98,7 +112,7 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
 
     They drive by exact wheels and see nothing, so what keeps them apart is the reservation alone.
     """
-    poses, reservations = router.roads.poses, Reservations()
+    poses, reservations = router.roads.poses, Reservations(Nearby())
 
     def robot(name: str, start: int, goal: int) -> Trial:
         facing = Pose2(0.0, 0.0, 0.0 if goal > start else math.pi)
