@@ -116,6 +116,18 @@ def test_a_clock_that_fails_later_is_for_the_pipeline_to_say() -> None:
     assert [robot.sense().stamp_ns for _ in stamps] == stamps  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize("in_a_second", [1.0, 1e3, 1e6])
+def test_a_clock_since_the_start_passes_other_units_since_1970(in_a_second: float) -> None:
+    """After 1795 s, or 21 days, a count of nanoseconds is that of milli- or microseconds since 1970.
+
+    Before, the agent of a robot with such a clock ended half an hour after the start.
+    """
+    middle = round(NOW_S * in_a_second)
+    stamps = [middle + k * 100_000_000 for k in range(-12, 13)]
+    robot = checked(*(good(stamp_ns=stamp) for stamp in stamps))
+    assert [robot.sense().stamp_ns for _ in stamps] == stamps  # type: ignore[union-attr]
+
+
 def test_seconds_since_the_start_are_no_nanoseconds() -> None:
     robot = checked(good(stamp_ns=0), good(stamp_ns=1))
     robot.sense()
