@@ -47,6 +47,8 @@ from mapweave.wire.zenoh_bus import ZenohBus
 
 TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
+SILENT = 5.0
+"""After what silence of a robot who waits for it is told, s; it reports twice a second."""
 
 
 def connect(
@@ -269,6 +271,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         mission: MissionReport,
         seconds: float,
         on_report: Callable[[MissionReport, AgentStatus], None] = lambda report, status: None,
+        on_silence: Callable[[float], None] = lambda silent: None,
     ) -> MissionReport:
         """Wait until a mission is over; returns its last report, which is open if the time is over first.
 
@@ -276,11 +279,14 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             mission: as it was given.
             seconds: at most.
             on_report: called with each status of the robot.
+            on_silence: called, again and again, with for how long nothing has been heard of the robot, s, if
+                that is more than `SILENT`. It may come back: missions survive a restart of its agent.
         """
         order, over = mission.order, threading.Event()
-        last = [mission]
+        last, heard = [mission], [time.monotonic()]
 
         def hear(sample: Sample) -> None:
+            heard[0] = time.monotonic()
             status = decode(sample.payload, AgentStatus)
             report = status.mission
             if report is None:
@@ -296,8 +302,12 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
 
         listening = self._bus.subscribe(self._keys.agent_status(order.robot), hear)
         try:
-            if mission.open:
-                over.wait(seconds)
+            end = time.monotonic() + seconds
+            while mission.open and not over.wait(min(SILENT, max(end - time.monotonic(), 0.0))):
+                if (now := time.monotonic()) >= end:
+                    break
+                if now - heard[0] > SILENT:
+                    on_silence(now - heard[0])
         finally:
             listening.close()
         return last[0]

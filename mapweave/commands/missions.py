@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
         report = give(fleet)
         if arguments.wait and report.open:
             print(words(report), file=sys.stderr)
-            report = fleet.wait(report, arguments.timeout, _progress())
+            report = fleet.wait(report, arguments.timeout, _progress(), _silence(arguments.robot))
     _print([report], arguments.json)
     return _exit_status([report], arguments.wait)
 
@@ -159,6 +159,16 @@ def _progress() -> Callable[[MissionReport, AgentStatus], None]:
         if status.status.doing != last[0] and report.open:
             last[0] = status.status.doing
             print(f"{status.robot}: {last[0]} ({report.progress:.0%})", file=sys.stderr, flush=True)
+
+    return show
+
+
+def _silence(robot: str) -> Callable[[float], None]:
+    """Prints a line while nothing is heard of the robot."""
+
+    def show(silent: float) -> None:
+        words = f"{robot}: nothing heard for {silent:.0f} s: is its agent running, and its network up?"
+        print(words, file=sys.stderr, flush=True)
 
     return show
 

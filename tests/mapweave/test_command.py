@@ -6,6 +6,8 @@ import io
 import json
 import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -23,8 +25,11 @@ from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import read_map_file
+from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import serve_senders
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.mapweave.command_line import complaint, parsers
 from tests.mapweave.test_kept_maps import PATIENCE, Body
@@ -163,6 +168,43 @@ def test_without_a_router_one_line_says_so_and_what_to_do(
             f"no router at {where}: what listens there does not let this in; if the fleet has keys" in output
         )
         assert time.monotonic() - began < 5.0, "Zenoh's own patience is 10 s, that for an answer 20 s"
+
+
+@pytest.mark.usefixtures("signals")
+def test_who_waits_for_a_robot_that_falls_silent_is_told(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot takes its mission, reports, and is gone. Before, nothing was said until the time was over."""
+    monkeypatch.setattr("mapweave.fleet.SILENT", 0.3)
+    endpoint, keys = f"tcp/127.0.0.1:{free_port()}", Keys(FLEET)
+    taken: list[MissionReport] = []
+
+    def take(request: Request) -> None:
+        taken.append(MissionReport(decode(request.payload, MissionOrder), MissionState.RUNNING))
+        request.reply(encode(taken[0]))
+
+    with closing(ZenohBus(BusSettings(mode="router", listen=(endpoint,)))) as bus:
+        serving = serve_senders(bus, keys.mission("r0"), lambda request, who: take(request))
+        words = ["explore", "r0", "--wait", "--timeout", "3", "--fleet", FLEET, "--connect", endpoint]
+        doing = Status("exploring", "", 1, 0, Pose2(), False)
+
+        def report() -> None:
+            eventually(lambda: taken, PATIENCE)
+            for _ in range(5):
+                bus.publish(keys.agent_status("r0"), encode(AgentStatus(doing, 1, "r0", mission=taken[0])))
+                time.sleep(0.1)
+
+        with ThreadPoolExecutor() as robot:
+            reporting = robot.submit(report)
+            assert main(words) == NO
+            reporting.result()
+        for one in serving:
+            one.close()
+    said = capfd.readouterr().err.splitlines()
+    assert "r0: exploring (0%)" in said
+    silent = [line for line in said if line.startswith("r0: nothing heard for ")]
+    assert 1 <= len(silent) <= 9 and silent[0].endswith("is its agent running, and its network up?")
+    assert said.index("r0: exploring (0%)") < said.index(silent[0])
 
 
 def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
