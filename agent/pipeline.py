@@ -208,7 +208,7 @@ class Pipeline:
                 crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)
                 self._navigator = Navigator(
                     self._description, self._lens, self._sift, self.map, goal, self._settings,
-                    self._settings.seed, via[passed:], crossing, near,
+                    self._settings.seed, via[passed:], crossing, near, lambda: self._others.beside,
                 )  # fmt: skip
 
     def taken_through(self) -> None:

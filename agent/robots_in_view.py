@@ -43,6 +43,8 @@ MOST_SHARE = 0.25
 MOST_TOGETHER = 0.5
 """Share of the image that all regions together may cover: the rest is used, however many robots a server says
 there are."""
+BESIDE = 0.5
+"""Nearer than this another robot is beside this one, m between their edges."""
 IN_FRONT = 3
 """So many landmarks of a region that are nearer than the robot, and most of it, show that something hides
 the robot."""
@@ -93,6 +95,21 @@ class RobotsInView:
             self._asked, self._due = None, self._now + EVERY[1]
         regions = self._regions(landmarks)
         return replace(observation, left_out=regions) if len(regions) else observation
+
+    @property
+    def beside(self) -> str:
+        """The nearest robot and how far it is, in words; empty if none is beside this one."""
+        if self._seen is None:
+            return ""
+        at, odom_then, robots = self._seen
+        robot_from_then = self._odom_from_robot.inverse() @ odom_then
+        around: list[tuple[float, str]] = []
+        for one in robots:
+            pose = robot_from_then @ one.robot_from_other
+            off = math.hypot(pose.x, pose.y) - self.description.radius - one.radius
+            if off < BESIDE and one.age + self._now - at < OLDEST:
+                around.append((max(off, 0.0), one.robot))
+        return f"{min(around)[1]} is {min(around)[0]:.1f} m off" if around else ""
 
     @property
     def due(self) -> bool:

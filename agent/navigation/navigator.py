@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import replace
 from enum import StrEnum
 
@@ -99,10 +99,12 @@ class Navigator:
         via: tuple[NodeId, ...] = (),
         crossing: PortalCrossing | None = None,
         near: NodeId | None = None,
+        beside: Callable[[], str] = str,
     ) -> None:
         """Start lost, or at a portal, with a goal and nodes to pass before, in order.
 
-        The robot is on the floor of the node `near`, if that is known.
+        The robot is on the floor of the node `near`, if that is known. `beside` names a robot next to it, in
+        words, if there is one.
         """
         self.stage: str = Stage.LOST
         self.detail = ""
@@ -128,6 +130,7 @@ class Navigator:
         self._trial = AnswerTrial(self._motion, self._positioning.refuted)
         self._detector = NodeDetector(description, lens, sift, self._rng, s)
         self._blocks = BlockedEdges(s.navigation)
+        self._beside = beside
         self._traverse_recorder = TraverseRecorder(description)
         self._refinement = LandmarkRefinement(own_map)
         self._expected: Pose2 | None = None
@@ -421,7 +424,9 @@ class Navigator:
         self._blocks.add(a, b, self._motion.now)
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
-        self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._obstacle() or NO_PROGRESS}"
+        beside = self._beside()
+        words = self._obstacle() or ("no progress" if beside else NO_PROGRESS)
+        self.stage, self.detail = Stage.BLOCKED, "; ".join(filter(None, (f"{where}: {words}", beside)))
         self._trouble = self.detail
         yield from self._motion.stand(PAUSE)
         if self.fix is not None and not self.fix.in_sight and self.fix.blind > TRUSTED:

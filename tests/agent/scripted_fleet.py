@@ -96,9 +96,10 @@ def navigator(
     settings: NavigatorSettings | None = None,
     body: RobotDescription = BODY,
     via: tuple[NodeId, ...] = (),
+    beside: Callable[[], str] = str,
 ) -> Navigator:
     every = AgentSettings(navigation=settings or NavigatorSettings())
-    return Navigator(body, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every, via=via)  # type: ignore[arg-type]
+    return Navigator(body, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every, via=via, beside=beside)  # type: ignore[arg-type]
 
 
 def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:

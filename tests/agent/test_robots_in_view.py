@@ -191,3 +191,16 @@ def test_the_pipeline_asks_once_it_is_on_its_map_and_marks_the_image(walls) -> N
     assert nearest in pipeline.map.nodes
     there = pipeline.map.nodes[nearest].map_from_robot.mean @ node_from_robot
     assert there.distance(pipeline.mapper.map_from_robot.mean) < 0.05
+
+
+def test_a_robot_beside_this_one_is_named() -> None:
+    eyes = Eyes(other(0.5, 0.0), replace(other(0.4, -0.4), robot="r2"), replace(other(3.0, 0.0), robot="r3"))
+    assert eyes.others.beside == f"r1 is {0.5 - BODY.radius - 0.16:.1f} m off"
+    eyes.step(0.5, Odometry(0.0, math.pi / 2))
+    assert eyes.others.beside.startswith("r1 is"), "turning changes no distance"
+    eyes.step(0.5, Odometry(-2.0, 0.0))
+    assert eyes.others.beside == ""
+    eyes.step(0.5, Odometry(2.0, 0.0))
+    assert eyes.others.beside.startswith("r1 is")
+    eyes.step(OLDEST)
+    assert eyes.others.beside == "", "what is old is not said"

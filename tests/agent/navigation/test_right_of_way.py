@@ -106,6 +106,15 @@ def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
     assert trial.asked[-1].goal == B
 
 
+def test_a_robot_in_the_way_is_named(home):
+    trial = trial_to(home)
+    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: "r7 is 0.2 m off")
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.held = True
+    trial.run(60.0, lambda: trial.navigator.stage == Stage.BLOCKED)
+    assert trial.navigator.detail == f"between {A} and {B}: no progress; r7 is 0.2 m off"
+
+
 @pytest.mark.parametrize("reserved", [True, False])
 def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
     """Each wants to where the other comes from. With reservations one lets the other pass, in the niche.
