@@ -41,6 +41,8 @@ from mapweave.wire.pose_codec import pack_camera, pack_pose, unpack_camera, unpa
 
 Value = TypeVar("Value")
 Packers = Mapping[type, Callable[[Any], Any]]
+PLAIN = frozenset({NoneType, bool, int, str, bytes})
+"""Types that plain data has as they are."""
 
 
 class Form(NamedTuple):
@@ -131,11 +133,14 @@ def packed(value: Any, packers: Packers = PACKERS) -> Any:
     Raises:
         InvalidValue: a number is out of the range of messages.
     """
-    if (pack_value := packers.get(type(value))) is not None:
+    kind = type(value)
+    if (pack_value := packers.get(kind)) is not None:
         return pack_value(value)
-    if is_dataclass(value):
-        tag = {"kind": value.TAG} if hasattr(value, "TAG") else {}
-        return tag | {field.name: packed(getattr(value, field.name), packers) for field in fields(value)}
+    if kind in PLAIN:
+        return value
+    if is_dataclass(kind):
+        tag, names = _form(kind)
+        return tag | {name: packed(getattr(value, name), packers) for name in names}
     match value:
         case msgspec.Struct():
             return msgspec.to_builtins(value, builtin_types=(bytes,))
@@ -154,6 +159,13 @@ def packed(value: Any, packers: Packers = PACKERS) -> Any:
         case frozenset():
             return [packed(element, packers) for element in sorted(value)]
     return value
+
+
+@cache
+def _form(kind: type) -> tuple[dict[str, str], tuple[str, ...]]:
+    """The tag of a dataclass, if it has one, and the names of its fields."""
+    tag = {"kind": kind.TAG} if hasattr(kind, "TAG") else {}
+    return tag, tuple(field.name for field in fields(kind))
 
 
 def encode(value: Any, limit: Limit) -> bytes:
