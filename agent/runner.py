@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from mapweave.agent.synchronization import FreeRunning, Synchronization
 log = logging.getLogger(__name__)
 
 REPORT_EVERY = 5
-"""Ticks between two status reports."""
+"""Ticks between two status reports, unless servers want fewer."""
 
 
 class Runner:
@@ -72,7 +73,7 @@ class Runner:
         self._on_step = on_step
         self._questions: tuple[Question, ...] = ()
         self._answers: tuple[Answer, ...] = ()
-        self._ticks = 0
+        self._ticks, self._reported = 0, -math.inf
 
     def tick(self, observation: Observation) -> Step:
         """Take one observation; changes and status go their way, questions wait for `exchange`."""
@@ -102,7 +103,9 @@ class Runner:
         if line:
             self._print(line)
         changed = self._missions.follow(step.status)
-        now = self._ticks % REPORT_EVERY == 0 or bool(step.questions) or changed
+        now = self._ticks % REPORT_EVERY == 0 and self._clock() - self._reported >= self._fleet.report_period
+        now = now or bool(step.questions) or changed
+        self._reported = self._clock() if now else self._reported
         status = self._monitor.explained(step.status)
         self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
         self._ticks += 1

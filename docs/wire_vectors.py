@@ -351,7 +351,7 @@ def changes() -> list[dict[str, Any]]:
         ("beacon", KEYS.head(MAP), Head(2**63, 1008, {"s0": 1000, "s1": 1008})),
         ("log question", KEYS.log(MAP), LogRequest(1003, 1008)),
         ("log answer", KEYS.log(MAP), LogAnswer(2**63, 1003, 1008, ((1007, made[7]), (1008, b"")))),
-        ("acknowledgement", KEYS.ack("s0", "r0"), Ack(MAP, 2**63, 1005, (Refusal(1004, "no landmark"),), 77)),
+        ("acknowledgement", KEYS.ack("s0", "r0"), Ack(MAP, 2**63, 1005, (Refusal(1004, "none"),), 77, 2.5)),
         ("newest map", KEYS.ack("s0", "r0"), NewestMap(3)),
     )  # fmt: skip
     vectors += [

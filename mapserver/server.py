@@ -160,11 +160,16 @@ class MapServer:
         self._cluster.start()
         worker.start()
         base = self._base
+        self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
+        self._roster = Roster(
+            self._bus, self._keys, clock.monotonic, self._hear, self._quotas, lambda: self._ingest.lags()
+        )
+        self._missions.roster = self._roster
         self._ingest = Ingest(
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
             self._quotas, self._gone, worker.unmerged, worker.note_refusal,
-            self._metrics.acknowledged,
+            self._metrics.acknowledged, self._roster.status_period,
         )  # fmt: skip
         clock.give_way(lambda: self._ingest.busy)
         self._plans = PlanService(
@@ -172,11 +177,6 @@ class MapServer:
             lambda: self._annotations.annotations, self._path, base.images,
             self._store if self._store.shared else None,
         )  # fmt: skip
-        self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
-        self._roster = Roster(
-            self._bus, self._keys, clock.monotonic, self._hear, self._quotas, self._ingest.lags
-        )
-        self._missions.roster = self._roster
         self._services = Services(
             self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
             self._events, self._missions, self._roster,

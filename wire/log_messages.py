@@ -22,6 +22,8 @@ MAX_ROWS = 256
 """Changes in one answer for a range of a log."""
 
 MAX_SERVERS = 64
+LONGEST_STATUS_PERIOD = 4.0
+"""s; a robot that has sent nothing for 5 s is shown as silent."""
 MAX_REFUSALS = 16
 MAX_REASON = 300
 MAX_SMALL_BYTES = 65536
@@ -114,6 +116,7 @@ class Ack(LogMessage, frozen=True):
         refusals: the newest of those that were refused.
         store: random, drawn when the server's store was made; 0 if unknown. A server that has lost its store
             acknowledges with another, and less.
+        status_period: least time between two statuses, s, if the server has too many robots for more; else 0.
     """
 
     limit = Limit("ack", MAX_SMALL_BYTES)
@@ -122,6 +125,7 @@ class Ack(LogMessage, frozen=True):
     watermark: Number = field(name="q")
     refusals: Annotated[tuple[Refusal, ...], Meta(max_length=MAX_REFUSALS)] = field(name="r", default=())
     store: Annotated[int, Meta(ge=0, le=2**63 - 1)] = field(name="s", default=0)
+    status_period: Annotated[float, Meta(ge=0.0, le=LONGEST_STATUS_PERIOD)] = field(name="p", default=0.0)
 
     def encode(self) -> bytes:
         """With the newest refusals and the beginning of their reasons."""

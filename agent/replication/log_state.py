@@ -22,6 +22,7 @@ class LogState:
         refusals: what servers have refused for good: (server, sequence) to reason.
         failure: why servers do not take this log at all; empty if they do.
         stores: by which id each server's store was known last, see mapweave.wire.log_messages.Ack.
+        status_periods: that each server wants, s, likewise.
     """
 
     map: MapId
@@ -31,6 +32,7 @@ class LogState:
     refusals: dict[tuple[str, int], str] = field(default_factory=dict)
     failure: str = ""
     stores: dict[str, int] = field(default_factory=dict)
+    status_periods: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
     def of(journal: Journal, map_id: MapId) -> LogState:
@@ -64,6 +66,7 @@ class LogState:
         Returns:
             What is new and worth a line in the log.
         """
+        self.status_periods[server] = ack.status_period
         news = []
         for refusal in ack.refusals:
             if (server, refusal.sequence) not in self.refusals:

@@ -135,6 +135,12 @@ class Replicator:
         """The map whose changes are taken."""
         return self._map
 
+    @property
+    def status_period(self) -> float:
+        """The least time between two statuses that servers want now, s: they have many robots; else 0."""
+        with self._changed:
+            return max(self._current.status_periods.values(), default=0.0)
+
     def submit(self, bodies: Iterable[ChangeBody], stamp_ns: int) -> None:
         """Hand over changes. Encodes them, and waits for neither disk nor network.
 

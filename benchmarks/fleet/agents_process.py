@@ -37,7 +37,7 @@ FLEET, SERVER = "fleet", "s0"
 INTERVAL = 10.0
 """Between two nodes of a robot, s."""
 REPORTS = 2.0
-"""Status reports of a robot in a second, as `mapweave agent` sends them."""
+"""Status reports of a robot in a second, as `mapweave agent` sends them; fewer if the server says so."""
 CONNECTING = 30.0
 """Longest wait for a session, s."""
 PATIENCE = 60.0
@@ -113,7 +113,10 @@ class Agent:
         self.journal = journal(Path(orders.folder) / f"{name}.sqlite", name)
         self._map = self.journal.open_map(1)
         self._replicator = Replicator(self._bus, keys, self.journal, self._map, (SERVER,))
-        self._client = FleetClient(self._bus, keys, self._map, MissionControl(name))
+        replicator = self._replicator
+        self._client = FleetClient(
+            self._bus, keys, self._map, MissionControl(name), status_period=lambda: replicator.status_period
+        )
         self.submitted: list[float] = []
         self.stops: list[list[ChangeBody]] = drive(number, stops, orders.seed).changes[::-1]
 
@@ -126,6 +129,11 @@ class Agent:
     def report(self) -> None:
         """Publish a status."""
         self._client.report(Status("mapping", "", 1, 0, Pose2(), True), time.time_ns())
+
+    @property
+    def report_period(self) -> float:
+        """Time to its next status, s."""
+        return max(1.0 / REPORTS, self._client.report_period)
 
     def waits(self) -> bool:
         """Whether something is not acknowledged."""
@@ -165,7 +173,7 @@ def run_schedule(agents: Sequence[Agent], orders: Orders, begin: float) -> None:
             agents[k].map_on()
         else:
             agents[k].report()
-        after = at + (INTERVAL if maps else 1.0 / REPORTS)
+        after = at + (INTERVAL if maps else agents[k].report_period)
         if after < end:
             heapq.heappush(due, (after, k, maps))
 

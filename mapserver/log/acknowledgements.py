@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import MapId, check_name
@@ -17,7 +17,13 @@ class Acknowledgements:
     """Those of one server."""
 
     def __init__(
-        self, bus: Bus, keys: Keys, server_name: str, store: Store, taken: Collection[MapId]
+        self,
+        bus: Bus,
+        keys: Keys,
+        server_name: str,
+        store: Store,
+        taken: Collection[MapId],
+        status_period: Callable[[], float],
     ) -> None:
         """Begin with nothing sent.
 
@@ -27,9 +33,11 @@ class Acknowledgements:
             server_name: under which they go out.
             store: has the logs; stays the caller's.
             taken: maps that are here and not in the store: no new one may have their names.
+            status_period: of the robots' statuses, s; 0: their own.
         """
         self._bus, self._keys, self._name = bus, keys, check_name(server_name)
         self._store, self._taken = store, tuple(taken)
+        self._status_period = status_period
 
     def serve(self) -> Closing:
         """Begin to answer which numbers an agent must not give to a new map: it may have lost its disk."""
@@ -38,7 +46,16 @@ class Acknowledgements:
     def acknowledge(self, agent_log: AgentLog) -> None:
         """Notify an agent of what is settled."""
         watermark, refusals = agent_log.watermark, agent_log.refusals
-        self._send(Ack(agent_log.map, agent_log.log_id, watermark, refusals, self._store.id))
+        self._send(
+            Ack(
+                agent_log.map,
+                agent_log.log_id,
+                watermark,
+                refusals,
+                self._store.id,
+                self._status_period(),
+            )
+        )
 
     def refuse(self, map_id: MapId, log_id: int, reason: str, watermark: int = 0) -> None:
         """Notify an agent that its log is not taken, or not beyond the watermark."""

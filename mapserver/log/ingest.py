@@ -75,6 +75,7 @@ class Ingest:
         unmerged: Callable[[str], int] = lambda robot: 0,
         note_refusal: Callable[[MapId, str], None] = lambda map_id, reason: None,
         observe_ack: Callable[[float], None] = lambda seconds: None,
+        status_period: Callable[[], float] = lambda: 0.0,
     ) -> None:
         """Replay the store, then listen.
 
@@ -96,6 +97,7 @@ class Ingest:
             note_refusal: called for a map of which a change was refused or is not believed, with the reason.
             observe_ack: called for each published change with the time from its receipt to its
                 acknowledgement, s.
+            status_period: of the robots' statuses, s; 0: their own.
 
         Raises:
             InvalidFile: the store cannot be read.
@@ -109,7 +111,7 @@ class Ingest:
         self._logs = KnownLogs()
         self._intakes = Intakes(store, self._quotas, retired)
         self._group = GroupCommit(store, self._intakes)
-        self._acks = Acknowledgements(bus, keys, server_name, store, taken)
+        self._acks = Acknowledgements(bus, keys, server_name, store, taken, status_period)
         self._pieces = Pieces()
         self._puller = Puller(bus, keys, self._intakes, unmerged, s.ask_timeout, self._put_pulled)
         self._pulls = self._puller.schedule

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import socket
 import threading
 import time
@@ -10,9 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mapping_monitor import MappingMonitor
-from mapweave.agent.mission import Idle
+from mapweave.agent.mission import Idle, WhichWay
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Step
@@ -23,6 +26,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.bus import Bus
@@ -166,28 +170,34 @@ def test_a_dead_network_holds_up_no_tick(walls, description, tmp_path) -> None:
         bus.close()
 
 
+NODE = NodeId("r0", 1, 1)
+
+
 class Slow:
     """A pipeline whose ticks take long, by a clock of its own."""
 
     lost = False
     map = HybridMap()
 
-    def __init__(self, durations: list[float]) -> None:
-        self.durations, self.now = durations, 0.0
+    def __init__(self, durations: list[float], asks_at: float = math.inf) -> None:
+        self.durations, self.asks_at, self.now = durations, asks_at, 0.0
 
     def clock(self) -> float:
         return self.now
 
     def step(self, observation: Observation, answers: object, driven: object) -> Step:
-        self.now += self.durations.pop(0)
-        return Step(Command(), (), (), Status("mapping", "", 0, 0, Pose2(), False))
+        before, self.now = self.now, self.now + self.durations.pop(0)
+        questions = (WhichWay(1, NODE, NODE),) if before <= self.asks_at < self.now else ()
+        return Step(Command(), (), questions, Status("mapping", "", 0, 0, Pose2(), False))
 
 
 class Fleet:
     """No fleet; keeps what is reported."""
 
-    def __init__(self) -> None:
+    def __init__(self, report_period: float = 0.0) -> None:
+        self.report_period = report_period
         self.skipped: list[int] = []
+        self.published: list[int] = []
 
     def server_in_reach(self) -> bool:
         return True
@@ -200,6 +210,21 @@ class Fleet:
 
     def report(self, status: Status, stamp_ns: int, battery: float | None, now: bool, skipped: int) -> None:
         self.skipped.append(skipped)
+        self.published += [round(stamp_ns * 1e-8)] * now
+
+
+@pytest.mark.parametrize(
+    ("period", "published"), [(0.0, [0, 5, 10, 15, 20, 23, 25]), (1.2, [0, 15, 23]), (4.0, [0, 23])]
+)
+def test_statuses_go_out_as_rarely_as_the_servers_want(
+    description: RobotDescription, period: float, published: list[int]
+) -> None:
+    """Ticks of 0.1 s. With a question to the fleet one goes out at once."""
+    slow, fleet = Slow([0.1] * 30, asks_at=2.35), Fleet(period)
+    runner = Runner(slow, fleet, None, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
+    for tick in range(30):
+        runner.tick(Observation(tick * 100_000_000, Odometry(0.0, 0.0)))
+    assert fleet.published == published
 
 
 def test_images_that_come_during_a_long_tick_are_skipped_and_counted(description, caplog) -> None:

@@ -332,6 +332,7 @@ class Plain:
         return {
             "map": fields["m"], "log_id": fields["l"], "watermark": fields["q"], "refusals": refusals,
             "store": fields.get("s", 0),
+            "status_period": fields.get("p", 0.0),
         }  # fmt: skip
 
     def _newest_map(self, data: bytes) -> Any:

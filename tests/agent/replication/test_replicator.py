@@ -42,8 +42,10 @@ class HandServer:
         self.bus.subscribe(KEYS.changes(), self.changes.append)
         self.bus.subscribe(KEYS.heads(), lambda sample: self.heads.append(Head.decode(sample.payload)))
 
-    def acknowledge(self, log_id: int, watermark: int, *refusals: Refusal, store: int = 0) -> None:
-        ack = Ack(MAP, log_id, watermark, refusals, store)
+    def acknowledge(
+        self, log_id: int, watermark: int, *refusals: Refusal, store: int = 0, period: float = 0.0
+    ) -> None:
+        ack = Ack(MAP, log_id, watermark, refusals, store, period)
         self.bus.publish(KEYS.ack(self.name, "r0"), ack.encode())
 
     def ask(self, first: int, last: int) -> LogAnswer:
@@ -103,6 +105,20 @@ def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: Ha
     ]  # fmt: skip
     assert {sample.key for sample in server.changes} == {KEYS.change(MAP)}
     assert agent.replicator.status().bytes_sent == sum(len(s.payload) for s in server.changes)
+
+
+def test_the_longest_status_period_that_servers_want_counts(agent: Agent, hub: MemoryHub) -> None:
+    first, second = HandServer(hub), HandServer(hub, "s1")
+    assert agent.replicator.status_period == 0.0
+    first.acknowledge(agent.log_id, 0, period=2.5)
+    eventually(lambda: agent.replicator.status_period == 2.5)
+    second.acknowledge(agent.log_id, 0, period=1.0)
+    first.acknowledge(agent.log_id, 0, period=0.75)
+    eventually(lambda: agent.replicator.status_period == 1.0)
+    second.acknowledge(agent.log_id, 0)
+    eventually(lambda: agent.replicator.status_period == 0.75)
+    first.bus.close()
+    second.bus.close()
 
 
 def test_the_disk_comes_first(hub: MemoryHub, path: Path) -> None:

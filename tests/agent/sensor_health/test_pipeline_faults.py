@@ -137,6 +137,8 @@ class Scripted:
     def server_in_reach(self) -> bool:
         return False
 
+    report_period = 0.0
+
     def driven(self) -> None:
         return None
 

@@ -1,0 +1,30 @@
+"""How many statuses a server asks of its robots: as many together, however many they are."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+import pytest
+
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.quotas import Quotas
+from mapweave.mapserver.roster import Roster
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.waiting import eventually
+
+KEYS = Keys("fleet")
+
+
+@pytest.mark.parametrize(("robots", "period"), [(0, 0.0), (200, 0.0), (300, 0.75), (1000, 2.5), (3000, 4.0)])
+def test_the_period_of_statuses_grows_with_the_number_of_robots(robots: int, period: float) -> None:
+    with ExitStack() as stack:
+        bus = MemoryBus(MemoryHub())
+        stack.callback(bus.close)
+        roster = Roster(bus, KEYS, lambda: 0.0, lambda status: None, Quotas())
+        stack.callback(roster.close)
+        tokens = [bus.announce(KEYS.agent_alive(MapId(f"r{k}", 1))) for k in range(robots)]
+        eventually(lambda: roster.status_period() == period and roster.alive("r0") is bool(robots))
+        for token in tokens[50:]:
+            token.close()
+        eventually(lambda: roster.status_period() == 0.0)
