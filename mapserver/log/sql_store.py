@@ -39,8 +39,8 @@ class SqlStore(Store):
 
     def __init__(self) -> None:
         self._traffic_lock = threading.Lock()
-        self._counted: dict[MapId, int] = {}
-        """Up to which change of each map `_sums` counts."""
+        self._counted: dict[tuple[str, int], int] = {}
+        """Up to which change of each map, by robot and epoch, `_sums` counts."""
         self._sums: dict[str, tuple[int, int]] = {}
         """Changes and their bytes on the wire, by kind."""
 
@@ -242,15 +242,16 @@ class SqlStore(Store):
         return Traffic(int(rows[0][0]), *put, *edge)
 
     def _count_new_changes(self) -> None:
+        counted = self._counted
         grown = [
-            (*m, self._counted.get(m, 0), watermark)
-            for m, (_, watermark) in self.positions().items()
-            if watermark > self._counted.get(m, 0)
+            (agent, epoch, counted.get((agent, epoch), 0), watermark)
+            for agent, epoch, watermark in self._read("SELECT agent, epoch, watermark FROM log")
+            if watermark > counted.get((agent, epoch), 0)
         ]
         for kind, puts, size in self._wire_bytes(grown) if grown else ():
             before = self._sums.get(kind, (0, 0))
             self._sums[kind] = before[0] + puts, before[1] + size
-        self._counted |= {MapId(agent, epoch): last for agent, epoch, _, last in grown}
+        counted |= {(agent, epoch): last for agent, epoch, _, last in grown}
 
     def _count_again(self) -> None:
         """After changes that were counted are deleted, or others are put among them."""
