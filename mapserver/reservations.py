@@ -10,7 +10,7 @@ nothing: others drive around it. Only where it stands at another's goal does tha
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -21,7 +21,6 @@ from scipy.spatial import cKDTree
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
-from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
@@ -39,6 +38,9 @@ ASIDE, APART = 12, 0.3
 """Places that are tried to step aside to, and m between two: a place has a node for each heading."""
 
 Points = NDArray[np.float64]
+Standing = Callable[[NodeId, float, MergedMap, float], Sequence[str]]
+"""Names the robots that stand where one of some radius, m, would touch them if it were at a node of the map.
+The last argument is the time, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +87,13 @@ class _Aside:
 class Reservations:
     """Leases by robot. Thread-safe."""
 
-    def __init__(self, nearby: Nearby) -> None:
+    def __init__(self, standing: Standing) -> None:
         """No robot holds anything.
 
         Args:
-            nearby: knows where robots stand.
+            standing: see mapweave.mapserver.nearby.Nearby.standing.
         """
-        self._nearby = nearby
+        self._standing = standing
         self._leases: dict[str, _Lease] = {}
         self._turn = threading.Lock()
 
@@ -139,7 +141,7 @@ class Reservations:
 
     def _at_goal(self, request: ReserveRequest, radius: float, merged: MergedMap, now: float) -> str:
         """The robot that stands at the end of a robot's way, without a way of its own; empty if none does."""
-        there = self._nearby.standing(request.route[-1], radius, merged, now)
+        there = self._standing(request.route[-1], radius, merged, now)
         return next((name for name in there if name != request.robot and name not in self._leases), "")
 
     def _yields(self, robot: str, router: Router) -> _Aside | None:

@@ -102,7 +102,7 @@ class Services:
         self._roster = roster
         self._relays = relays
         self._nearby = Nearby()
-        self._reservations = Reservations(self._nearby)
+        self._reservations = Reservations(self._nearby.standing)
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
             lambda: places().annotations, images,

@@ -48,7 +48,7 @@ from mapweave.wire.zenoh_bus import ZenohBus
 TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
 SILENT = 5.0
-"""After what silence of a robot who waits for it is told, s; it reports twice a second."""
+"""After what silence a robot that is waited for is named, s; it reports twice a second."""
 
 
 def connect(

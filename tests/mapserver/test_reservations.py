@@ -59,7 +59,7 @@ class Traffic:
 
     def __init__(self, router: Router) -> None:
         self.router, self.nearby, self.now = router, Nearby(), 0.0
-        self.reservations = Reservations(self.nearby)
+        self.reservations = Reservations(self.nearby.standing)
 
     def ask(self, robot: str, *way: int, off: float = 0.0) -> ReserveAnswer:
         route = tuple(map(node, way[1:] if len(way) > 1 else way))

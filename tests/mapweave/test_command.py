@@ -171,7 +171,7 @@ def test_without_a_router_one_line_says_so_and_what_to_do(
 
 
 @pytest.mark.usefixtures("signals")
-def test_who_waits_for_a_robot_that_falls_silent_is_told(
+def test_a_robot_that_falls_silent_is_named_to_who_waits_for_it(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot takes its mission, reports, and is gone. Before, nothing was said until the time was over."""

@@ -78,7 +78,7 @@ def test_a_robot_that_waits_too_long_looks_for_another_way(home):
     ]
 
 
-def test_a_robot_whose_goal_is_taken_waits_and_then_says_by_whom(home):
+def test_a_robot_whose_goal_is_taken_waits_and_then_gives_up(home):
     """Before, it manoeuvred beside the parked robot for 300 s, with "no progress, though nothing is near"."""
     trial = trial_to(home)
     taken = ReserveAnswer(0, "r7", None, f"r7 stands at {B}", occupied=True)
@@ -121,7 +121,7 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
 
     They drive by exact wheels and see nothing, so what keeps them apart is the reservation alone.
     """
-    poses, reservations = router.roads.poses, Reservations(Nearby())
+    poses, reservations = router.roads.poses, Reservations(Nearby().standing)
 
     def robot(name: str, start: int, goal: int) -> Trial:
         facing = Pose2(0.0, 0.0, 0.0 if goal > start else math.pi)
