@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.floor_plan import PlacedPlan
 
 SILENT = 5.0
-"""A robot that has sent nothing for longer is shown as silent, s; it sends twice a second."""
+"""A robot that has sent nothing for longer is shown as silent, s; each sends at least every 4 s."""
 COLUMNS = (
     "robot", "mission", "doing", "at", "last node", "links", "nodes", "battery", "unsent", "lag", "age",
     "trouble",
