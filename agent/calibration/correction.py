@@ -18,7 +18,7 @@ from mapweave.agent.calibration.camera_motions import ROBOT_FROM_LEVEL, robot_fr
 from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.vision.lens import Distortion, Lens
 
 
@@ -85,6 +85,12 @@ def corrected(description: RobotDescription, geometry: DriveGeometry) -> tuple[R
         lens, camera = LevelLens(camera, description.distortion, level, turn), level
     axle = description.axle * geometry.wheel_scale / geometry.turn_scale
     return replace(description, camera=camera, axle=axle), lens
+
+
+def frame_change(before: DriveGeometry, after: DriveGeometry) -> Pose2:
+    """`old_from_new` of the robot's frame when another geometry is used: the camera stays where it is."""
+    old_from_camera, new_from_camera = (Pose2(g.forward, 0.0, g.heading) for g in (before, after))
+    return old_from_camera @ new_from_camera.inverse()
 
 
 class OdometryCorrection:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import WheelTrack
-from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
+from mapweave.agent.calibration.correction import OdometryCorrection, corrected, frame_change, geometry_of
 from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.floor_tiles import FloorTiles
@@ -30,7 +30,7 @@ from mapweave.agent.calibration.ranger_scale import RangerScale
 from mapweave.agent.calibration.report import Cause, causes
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, RobotDescription
-from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.vision.lens import Lens
 
 P = Parameter
@@ -74,7 +74,8 @@ class OnlineCalibration:
         description: the robot as everything behind the lens shall know it now.
         lens: of its images now.
         causes: parameters that were found to be declared wrongly, in the order in which they were found.
-        pending: the robot and lens that the mapper shall change to with its next node, if any.
+        pending: what the mapper shall change to with its next node, if anything: the robot, the lens, and
+            `old_from_new` of the robot's frame.
     """
 
     def __init__(self, description: RobotDescription) -> None:
@@ -83,7 +84,7 @@ class OnlineCalibration:
         self._geometry = geometry_of(description)
         self.description, self.lens = corrected(description, self._geometry)
         self.causes: list[Cause] = []
-        self.pending: tuple[RobotDescription, Lens] | None = None
+        self.pending: tuple[RobotDescription, Lens, Pose2] | None = None
         self._next = self._geometry
         self._correction = OdometryCorrection()
         self._plain = Lens(description.camera, description.distortion)
@@ -178,7 +179,7 @@ class OnlineCalibration:
     def switched(self) -> None:
         """The mapper has changed to what was pending."""
         if self.pending is not None:
-            self.description, self.lens = self.pending
+            self.description, self.lens, _ = self.pending
             self._geometry, self.pending = self._next, None
 
     def _start(
@@ -260,7 +261,7 @@ class OnlineCalibration:
         along = belongs & estimate.shown & settled & (off > estimate.sigmas)
         along[named_only] = False
         self._next = DriveGeometry.of(np.where(change | along, estimate.vector, target))
-        self.pending = corrected(self._declared, self._next)
+        self.pending = (*corrected(self._declared, self._next), frame_change(self._geometry, self._next))
 
     def _refresh(self) -> None:
         """Reduce one pair again, each in its turn, between the images that make new ones."""

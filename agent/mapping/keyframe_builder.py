@@ -19,7 +19,7 @@ from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
-from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.registration.recognition import Recognition, register
@@ -95,10 +95,16 @@ class KeyframeBuilder:
         self._new: list[ChangeBody] = []
         self._rng = np.random.default_rng(0)
 
-    def recalibrate(self, description: RobotDescription) -> None:
-        """Make nodes with another camera from now on; those made before keep theirs."""
+    def recalibrate(self, description: RobotDescription, old_from_new: Pose2) -> None:
+        """Make nodes with another camera from now on; those made before keep theirs.
+
+        Args:
+            description: of the robot.
+            old_from_new: of its frame.
+        """
         clock = self._description.clock
         self._description, self._camera = replace(description, clock=clock), description.camera
+        self._move(PoseGaussian(old_from_new, np.zeros((3, 3))))
 
     def forget_clock(self) -> None:
         """The clock has jumped: times of nodes made from now on are not to be compared with other robots'."""
@@ -164,7 +170,9 @@ class KeyframeBuilder:
 
     def move_anchor(self, moved: PoseGaussian) -> None:
         """Begin the next episode at another anchor: `old_anchor_from_new`, by the filter."""
-        moved = self._sober(moved)
+        self._move(self._sober(moved))
+
+    def _move(self, moved: PoseGaussian) -> None:
         self.map_from_anchor = self.map_from_anchor @ moved
         if self._last is not None:
             self._last.node_from_anchor = self._last.node_from_anchor @ moved

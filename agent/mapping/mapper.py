@@ -58,7 +58,7 @@ class Mapper:
         self._description = description
         self._settings = settings
         self._lens = lens or Lens(description.camera, description.distortion)
-        self._pending: tuple[RobotDescription, Lens] | None = None
+        self._pending: tuple[RobotDescription, Lens, Pose2] | None = None
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
         self._cartographer = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
@@ -192,9 +192,15 @@ class Mapper:
         elif self._anchor is not None and not self.doubtful:
             self._wayside.step(observation, self._tracking.pose.mean)
 
-    def recalibrate(self, description: RobotDescription, lens: Lens) -> None:
-        """Know the robot's geometry better from the next node on."""
-        self._pending = description, lens
+    def recalibrate(self, description: RobotDescription, lens: Lens, old_from_new: Pose2) -> None:
+        """Know the robot's geometry better from the next node on.
+
+        Args:
+            description: of the robot.
+            lens: of its camera.
+            old_from_new: of the robot's frame: the axle is elsewhere, as seen from the camera.
+        """
+        self._pending = description, lens, old_from_new
 
     def forget_clock(self) -> None:
         """The clock has jumped: see KeyframeBuilder."""
@@ -309,7 +315,8 @@ class Mapper:
         """Change to another geometry, between two episodes; returns whether there was any."""
         if self._pending is None:
             return False
-        (self._description, self._lens), self._pending = self._pending, None
+        (self._description, self._lens, old_from_new), self._pending = self._pending, None
         self._sift = Sift(self._lens, self._settings.sift)
-        self._cartographer.recalibrate(self._description)
+        self._cartographer.recalibrate(self._description, old_from_new)
+        self._wayside.move_anchor(old_from_new)
         return True

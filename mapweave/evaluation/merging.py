@@ -199,8 +199,8 @@ def evaluate_merging(
         raise DeviceError(
             f"{folder}: no robot has mapped anything; are there features, and does odometry.csv move?"
         )
-    stamps = {n.id: n.stamp_ns for part in merged.maps.values() for n in part.nodes.values()}
-    true_poses = {node: pose for node, stamp in stamps.items() if (pose := truth.at(stamp)) is not None}
+    nodes = [node for part in merged.maps.values() for node in part.nodes.values()]
+    true_poses = {n.id: pose for n in nodes if (pose := truth.robot_at(n.stamp_ns, n.camera)) is not None}
     return MergeEvaluation(folder.resolve().name, images, merged, true_poses, took)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.pose import Pose2
 
@@ -54,3 +55,12 @@ class Truth:
             return None
         nearest = int(np.abs(self.stamps_ns - stamp_ns).argmin())
         return self.poses[nearest] if abs(int(self.stamps_ns[nearest]) - stamp_ns) <= 1_000_000 else None
+
+    def robot_at(self, stamp_ns: int, camera: Camera) -> Pose2 | None:
+        """`world_from_robot` at a stamp, of a robot with this camera, if the camera's pose is known there.
+
+        The robot's origin is on its axle. Where calibration finds the camera further ahead than declared, the
+        axle is another point, and a map of it is not to be compared with where the camera was.
+        """
+        pose = self.at(stamp_ns)
+        return None if pose is None else pose @ Pose2(-camera.mount_forward)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.calibration.camera_motions import robot_from_camera
-from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
+from mapweave.agent.calibration.correction import OdometryCorrection, corrected, frame_change, geometry_of
 from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from synthetic.room_drive import CAMERA
@@ -34,6 +34,19 @@ def test_the_level_lens_goes_both_ways(distortion: tuple[float, float, float, fl
     _, lens = corrected(RobotDescription(CAMERA, distortion), TRUE)
     raw = np.random.default_rng(0).uniform(20, 220, (50, 2))
     assert np.allclose(lens.distort(lens.undistort(raw)), raw, atol=1e-3)
+
+
+def test_another_geometry_moves_the_robots_frame_and_not_the_camera():
+    """One point is in one pixel of the image, in whichever frame of the robot it is given."""
+    old = DriveGeometry(forward=0.05, heading=-0.02, pitch=0.03, height=0.3)
+    new = DriveGeometry(forward=0.75, heading=0.07, pitch=0.03, height=0.3)
+    in_old = np.array([[2.0, 0.3, 0.3], [3.0, -0.8, 0.3], [1.5, 0.0, 0.3], [6.0, 1.0, 0.3]])
+    in_new = frame_change(old, new).inverse().apply(in_old)
+    raw = []
+    for geometry, points in ((old, in_old), (new, in_new)):
+        description, lens = corrected(RobotDescription(CAMERA, BENT), geometry)
+        raw.append(lens.distort(description.camera.project(points)))
+    assert np.abs(raw[0] - raw[1]).max() < 0.5, "pitch is about an axis that has turned"
 
 
 def test_a_geometry_without_angles_changes_no_lens():

@@ -6,12 +6,14 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.vision.lens import Lens
 
 
 def drive(mapper, walls, positions, start=1):
@@ -59,6 +61,30 @@ def test_an_edge_is_the_drive_between_two_views(walls, description):
     in_a = a.points_in_robot[edge.shared[:, 0]]
     in_b = Pose2(0.5).apply(b.points_in_robot[edge.shared[:, 1]])
     assert np.median(np.linalg.norm(in_a - in_b, axis=1)) < 0.08
+
+
+@pytest.mark.parametrize("forward", [0.3, -0.2])
+def test_a_camera_found_further_ahead_moves_the_robot_and_no_landmark(walls, description, forward):
+    """Before, the robot stayed where it was, and so the walls moved by as much."""
+    mapper = Mapper(MapId("r0", 1), description)
+    first = drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025)))
+    mounted = description.camera.mount_forward + forward
+    known = replace(description, camera=replace(description.camera, mount_forward=mounted))
+    mapper.recalibrate(known, Lens(known.camera, known.distortion), Pose2(-forward))
+    mapper.finish(first)
+    assert mapper.map_from_robot.mean.x == pytest.approx(0.5 - forward, abs=0.01)
+    second = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
+    mapper.finish(second)
+    a, b = mapper.map.nodes.values()
+    assert b.map_from_robot.mean.distance(Pose2(0.5 - forward)) < 0.015
+    (edge,) = mapper.map.edges.values()
+    assert edge.a_from_b.mean.distance(Pose2(0.5 - forward)) < 0.015
+    near = [
+        np.median(node.map_from_robot.mean.apply(node.points_in_robot[left])[:, 0])
+        for node in (a, b)
+        for left in [node.landmarks.pixels[:, 0] < 100]
+    ]
+    assert near[0] == pytest.approx(near[1], abs=0.05)
 
 
 def test_a_view_without_features_gives_no_node(walls, description):
