@@ -54,7 +54,7 @@ class DriveMap:
         """
         self.nodes, self.covered = len(nodes), covered
         self.trials: list[Trial] = []
-        self._stamps = {node.id: node.stamp_ns for node in nodes.values()}
+        self._nodes = nodes
         self._relocalizer, self._truth = relocalizer, truth
 
     @staticmethod
@@ -67,14 +67,14 @@ class DriveMap:
             settings: of the pipeline.
             ticks: as many numbers as there are images; going through them shows progress.
         """
-        covered = []
+        covered, camera = list[Pose2](), robot.describe().camera
         map_id = MapId("map", 1)
         pipeline = Pipeline(map_id, robot.describe(), settings)
         pipeline.set_mission(Carried())
         merger, sequence = Merger(), 0
         for _, observation in zip(ticks, iter(robot.sense, None), strict=False):
             assert observation is not None, "the recording ends the loop"
-            if (pose := truth.at(observation.stamp_ns)) is not None:
+            if (pose := truth.robot_at(observation.stamp_ns, camera)) is not None:
                 covered.append(pose)
             for change in pipeline.step(observation, ()).changes:
                 sequence += 1
@@ -92,7 +92,8 @@ class DriveMap:
             truth: of the same clock as the nodes' stamps, for scoring alone.
         """
         nodes = {node.id: node for one in merged.maps.values() for node in one.nodes.values()}
-        covered = [pose for node in nodes.values() if (pose := truth.at(node.stamp_ns)) is not None]
+        true_poses = (truth.robot_at(node.stamp_ns, node.camera) for node in nodes.values())
+        covered = [pose for pose in true_poses if pose is not None]
         return DriveMap(nodes, relocalizer_in(merged), covered, truth)
 
     def questions(self, robot: Replay) -> Iterator[Verdict]:
@@ -108,7 +109,7 @@ class DriveMap:
             extracted = time.perf_counter()
             answer = self._relocalizer.answer(view)
             done = time.perf_counter()
-            true = self._truth.at(observation.stamp_ns)
+            true = self._truth.robot_at(observation.stamp_ns, description.camera)
             expected = None if true is None else self._covers(true)
             odom_from_robot = odom_from_robot @ observation.odometry.motion()
             way += abs(observation.odometry.forward)
@@ -148,8 +149,8 @@ class DriveMap:
 
     def _error(self, place: Whereabouts, true: Pose2 | None) -> tuple[float, float]:
         """Of the position, m, and of the heading, degrees; NaN without truth."""
-        stamp_ns = self._stamps.get(place.node)
-        at_node = None if stamp_ns is None else self._truth.at(stamp_ns)
+        node = self._nodes.get(place.node)
+        at_node = None if node is None else self._truth.robot_at(node.stamp_ns, node.camera)
         if true is None or at_node is None:
             return math.nan, math.nan
         answered = at_node @ (place.node_from_robot.mean if place.distance_known else Pose2())
