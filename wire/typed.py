@@ -139,7 +139,7 @@ def packed(value: Any, packers: Packers = PACKERS) -> Any:
     if kind in PLAIN:
         return value
     if is_dataclass(kind):
-        tag, names = _form(kind)
+        tag, names = _layout(kind)
         return tag | {name: packed(getattr(value, name), packers) for name in names}
     match value:
         case msgspec.Struct():
@@ -162,7 +162,7 @@ def packed(value: Any, packers: Packers = PACKERS) -> Any:
 
 
 @cache
-def _form(kind: type) -> tuple[dict[str, str], tuple[str, ...]]:
+def _layout(kind: type) -> tuple[dict[str, str], tuple[str, ...]]:
     """The tag of a dataclass, if it has one, and the names of its fields."""
     tag = {"kind": kind.TAG} if hasattr(kind, "TAG") else {}
     return tag, tuple(field.name for field in fields(kind))

@@ -91,7 +91,7 @@ class CheckedRobot:
         self._robot.close()
 
     def _check_unit(self, stamp_ns: int) -> None:
-        """Of the first stamp alone: half an hour from the start is as many ns as it is ms since 1970."""
+        """Of the first stamp alone: a clock since the start comes by such numbers later."""
         now = self._clock()
         for unit, in_a_second in UNITS.items():
             if abs(stamp_ns / in_a_second - now) < SKEW:
