@@ -394,8 +394,9 @@ class Navigator:
             if go_on and self._motion.now - began > YIELDED:
                 if right_of_way.occupied and follower.blocked[1] in (self.goal, *self._via[:1]):
                     self._give_up(right_of_way.reason)
-                # It is stuck, or stands there: another way may be free.
-                self._blocks.add(*follower.blocked, self._motion.now)
+                else:
+                    # It is stuck, or stands there: another way may be free.
+                    self._blocks.add(*follower.blocked, self._motion.now)
                 go_on = False
             if go_on:
                 yield Command()
