@@ -47,7 +47,6 @@ class FleetClient:
         answer_timeout: float = 3.0,
         unsent: Callable[[], int] = lambda: 0,
         placed: Callable[[], int] = lambda: 0,
-        status_period: Callable[[], float] = lambda: 0.0,
         teleoperation: Teleoperation | None = None,
         limits: tuple[float, float] = (0.0, 0.0),
     ) -> None:
@@ -61,7 +60,6 @@ class FleetClient:
             answer_timeout: how long a question may take, s.
             unsent: counts the changes that it has not acknowledged; called from any thread.
             placed: counts the nodes of the map with a merged pose; likewise.
-            status_period: the least time between two statuses that servers want, s.
             teleoperation: takes the commands of a person who drives; it outlives this map.
             limits: of the robot's speeds, m/s and rad/s, for that person.
         """
@@ -76,7 +74,7 @@ class FleetClient:
         self._battery: float | None = None
         self._trouble, self._trouble_at = "", 0.0
         self._missions = missions
-        self._unsent, self._placed, self._status_period = unsent, placed, status_period
+        self._unsent, self._placed = unsent, placed
         self._timeout = answer_timeout
         self._teleoperation, self._limits = teleoperation or Teleoperation(), limits
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
@@ -96,11 +94,6 @@ class FleetClient:
     def driven(self) -> Driven | None:
         """The command of a person who drives the robot now; None if no one does."""
         return self._teleoperation.driven()
-
-    @property
-    def report_period(self) -> float:
-        """The least time between two statuses of which none says more than the other, s; 0: any."""
-        return self._status_period()
 
     def server_in_reach(self) -> bool:
         """Whether a map server is known to be reachable in both directions."""

@@ -103,13 +103,17 @@ class Runner:
         if line:
             self._print(line)
         changed = self._missions.follow(step.status)
-        now = self._ticks % REPORT_EVERY == 0 and self._clock() - self._reported >= self._fleet.report_period
+        now = self._ticks % REPORT_EVERY == 0 and self._due()
         now = now or bool(step.questions) or changed
         self._reported = self._clock() if now else self._reported
         status = self._monitor.explained(step.status)
         self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
         self._ticks += 1
         self._on_step(observation, step)
+
+    def _due(self) -> bool:
+        """Whether servers want a status again of which nothing new is known."""
+        return self._clock() - self._reported >= self._replicator.status_period
 
     def _report_fault(self, step: Step) -> None:
         """One line when a sensor fails, and one when it is back."""

@@ -22,6 +22,10 @@ Line = Annotated[str, Meta(max_length=MAX_STATUS_WORDS)]
 IDENTITY = Pose2()
 NOTHING_DRIVEN = DriveStatistics()
 NO_COMPONENT = -1
+LONGEST_STATUS_PERIOD = 4.0
+"""Between two statuses of a robot, s. It sends two a second, unless a server with many robots wants fewer."""
+SILENT = 5.0
+"""A robot that has sent nothing for longer is named as silent, s."""
 
 
 def one_line(text: str) -> str:

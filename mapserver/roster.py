@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from mapweave.hybridmap.agent_status import (
+    LONGEST_STATUS_PERIOD,
     MAX_ACCUSATION,
     MAX_ROBOTS,
     NO_COMPONENT,
@@ -24,7 +25,6 @@ from mapweave.merge.explanation.map_standing import MapStanding, map_standings
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import LONGEST_STATUS_PERIOD
 from mapweave.wire.messages import decode
 
 OWN_PERIOD = 0.5

@@ -22,7 +22,7 @@ from mapweave.fleet_annotations import FleetAnnotations
 from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
 from mapweave.fleet_plans import FleetPlans
-from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
+from mapweave.hybridmap.agent_status import SILENT, AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import (
     MissionKind,
@@ -47,8 +47,6 @@ from mapweave.wire.zenoh_bus import ZenohBus
 
 TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
-SILENT = 5.0
-"""After what silence a robot that is waited for is named, s; it reports twice a second."""
 
 
 def connect(

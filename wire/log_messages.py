@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar, Self
 import msgspec
 from msgspec import Meta, field
 
+from mapweave.hybridmap.agent_status import LONGEST_STATUS_PERIOD
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import MAX_FLOAT, MAX_NUMBER, Key, Name, Number
 from mapweave.hybridmap.node import MapId
@@ -22,8 +23,6 @@ MAX_ROWS = 256
 """Changes in one answer for a range of a log."""
 
 MAX_SERVERS = 64
-LONGEST_STATUS_PERIOD = 4.0
-"""s; a robot that has sent nothing for 5 s is shown as silent."""
 MAX_REFUSALS = 16
 MAX_REASON = 300
 MAX_SMALL_BYTES = 65536

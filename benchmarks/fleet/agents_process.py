@@ -113,10 +113,7 @@ class Agent:
         self.journal = journal(Path(orders.folder) / f"{name}.sqlite", name)
         self._map = self.journal.open_map(1)
         self._replicator = Replicator(self._bus, keys, self.journal, self._map, (SERVER,))
-        replicator = self._replicator
-        self._client = FleetClient(
-            self._bus, keys, self._map, MissionControl(name), status_period=lambda: replicator.status_period
-        )
+        self._client = FleetClient(self._bus, keys, self._map, MissionControl(name))
         self.submitted: list[float] = []
         self.stops: list[list[ChangeBody]] = drive(number, stops, orders.seed).changes[::-1]
 
@@ -133,7 +130,7 @@ class Agent:
     @property
     def report_period(self) -> float:
         """Time to its next status, s."""
-        return max(1.0 / REPORTS, self._client.report_period)
+        return max(1.0 / REPORTS, self._replicator.status_period)
 
     def waits(self) -> bool:
         """Whether something is not acknowledged."""

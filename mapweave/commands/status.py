@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
     from mapweave.hybridmap.floor_plan import PlacedPlan
 
-SILENT = 5.0
-"""A robot that has sent nothing for longer is shown as silent, s; each sends at least every 4 s."""
 COLUMNS = (
     "robot", "mission", "doing", "at", "last node", "links", "nodes", "battery", "unsent", "lag", "age",
     "trouble",
@@ -155,6 +153,8 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
 
 def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
     """A robot's line, see `COLUMNS`."""
+    from mapweave.hybridmap.agent_status import SILENT
+
     status = robot.status
     age = "gone" if not robot.alive else f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
     if status is None:

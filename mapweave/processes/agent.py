@@ -222,14 +222,11 @@ class Agent:
     def _start(self, map_id: MapId, pipeline: Pipeline) -> None:
         options = self._options
         self.pipeline = pipeline
-        self.replicator = replicator = Replicator(
-            self._bus, self._keys, self.journal, map_id, servers=(options.server,)
-        )
+        self.replicator = Replicator(self._bus, self._keys, self.journal, map_id, servers=(options.server,))
         self.merged_poses = MergedPoses(self._bus, self._keys, options.name, options.server)
         self._fleet = FleetClient(
             self._bus, self._keys, map_id, self.missions, options.synchronization.answer_timeout,
-            self.replicator.unacknowledged, self._placed, lambda: replicator.status_period,
-            self._teleoperation,
+            self.replicator.unacknowledged, self._placed, self._teleoperation,
             (self._description.max_forward, self._description.max_turn),
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)

@@ -192,10 +192,10 @@ class Slow:
 
 
 class Fleet:
-    """No fleet; keeps what is reported."""
+    """No fleet and no replicator; keeps what is reported."""
 
-    def __init__(self, report_period: float = 0.0) -> None:
-        self.report_period = report_period
+    def __init__(self, status_period: float = 0.0) -> None:
+        self.status_period = status_period
         self.skipped: list[int] = []
         self.published: list[int] = []
 
@@ -221,7 +221,7 @@ def test_statuses_go_out_as_rarely_as_the_servers_want(
 ) -> None:
     """Ticks of 0.1 s. With a question to the fleet one goes out at once."""
     slow, fleet = Slow([0.1] * 30, asks_at=2.35), Fleet(period)
-    runner = Runner(slow, fleet, None, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
+    runner = Runner(slow, fleet, fleet, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
     for tick in range(30):
         runner.tick(Observation(tick * 100_000_000, Odometry(0.0, 0.0)))
     assert fleet.published == published
@@ -233,7 +233,7 @@ def test_images_that_come_during_a_long_tick_are_skipped_and_counted(description
     durations = [0.02, 0.35, 0.02, 0.02, 0.15, 0.02]
     robot = Player(description, [Observation(round(s * 1e9), Odometry(0.0, 0.0)) for s in stamps])
     slow, fleet = Slow(durations), Fleet()
-    runner = Runner(slow, fleet, None, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
+    runner = Runner(slow, fleet, fleet, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
     with caplog.at_level(logging.WARNING):
         assert runner.run(robot, threading.Event()) == 6
     assert fleet.skipped == [0, 0, 3, 3, 3, 3] and runner.skipped == 3

@@ -137,7 +137,7 @@ class Scripted:
     def server_in_reach(self) -> bool:
         return False
 
-    report_period = 0.0
+    status_period = 0.0
 
     def driven(self) -> None:
         return None
@@ -153,7 +153,7 @@ def test_the_log_has_one_line_when_a_sensor_fails_and_one_when_it_is_back():
     frozen, dead = Fault("camera", "it is frozen"), Fault("encoders", "they do not count")
     robot, lines = Scripted(None, frozen, frozen, dead, None, None), list[str]()
     parts = MissionControl("r0"), MappingMonitor(BODY)
-    runner = Runner(robot, robot, None, *parts, print_line=lines.append)  # type: ignore[arg-type]
+    runner = Runner(robot, robot, robot, *parts, print_line=lines.append)  # type: ignore[arg-type]
     for tick in range(6):
         runner.tick(Observation(tick * 100_000_000, Odometry(0.0, 0.0)))
     assert lines == ["it is frozen", "they do not count", "believes its encoders again"]
