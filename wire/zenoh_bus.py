@@ -24,6 +24,7 @@ from mapweave.wire.bus_settings import QUEUE_LIMIT, RETRY_FIRST, RETRY_LONGEST, 
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.keyexpr import check_key, check_pattern
 from mapweave.wire.open_files import allow_many_files
+from mapweave.wire.publishers import Publishers
 from mapweave.wire.zenoh_config import session_values
 from mapweave.wire.zenoh_entities import Declared, Owner, Service, Subscription, Token, Watcher, read_reply
 
@@ -57,6 +58,7 @@ class ZenohBus:
         self._in_use_changed = threading.Condition()
         self._connecting = threading.Thread(target=self._connect, name="zenoh-connect", daemon=True)
         self._links: list[object] = []
+        self._publishers = Publishers()
         if self._settings.mode == "router":
             self._session = _open_router(self._settings)
             self._watch_links(self._session)
@@ -72,7 +74,7 @@ class ZenohBus:
             if session is None:
                 return
             try:
-                session.put(key, payload, attachment=attachment or None)
+                self._publishers.of(session, key).put(payload, attachment=attachment or None)
             except zenoh.ZError:
                 # The session was closed between the check and the put: the same as no connection.
                 log.debug("put on %s after the session was closed", key)
@@ -150,6 +152,7 @@ class ZenohBus:
                 entity.detach()
             with self._in_use_changed:
                 self._in_use_changed.wait_for(lambda: self._in_use == 0)
+            self._publishers = Publishers()
             if session is not None:
                 session.close()  # type: ignore[no-untyped-call]
             session = _open_router(settings)
