@@ -98,6 +98,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         See `mapweave.exit_status`; argparse itself exits with 2 on a wrong command line.
     """
+    # FAISS reads this when it is imported. On a busy machine its threads spin while they wait for each other:
+    # a search by two of them took three times the processor time of a search by one, and longer.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     commands = parser()
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete
