@@ -124,6 +124,11 @@ class AdmissionControl:
         by = now + latest if wait > 0.0 else math.inf
         return self._pool.submit(self._unless_late, work, ticket, by, usual, asker)
 
+    @property
+    def busy(self) -> bool:
+        """Whether a question is open."""
+        return self._open > 0
+
     def counters(self) -> dict[str, int | float]:
         """Questions answered and refused so far, those open now, and how long one takes, ms."""
         with self._lock:

@@ -72,7 +72,7 @@ class MergeWorker:
         self._history = history or MapHistory()
         self._observe = observe
         self._share = share
-        self._merger = Merger(places, merge, compare)
+        self._merger = Merger(places, merge, compare, schedule.pause)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False

@@ -25,7 +25,8 @@ IdleJob = Callable[[], float | None]
 QUIET = 0.02
 """Idle work begins when nothing was posted for so long, s: a burst is taken in as a whole."""
 GIVEN_WAY = 0.02
-"""Longest wait of a job for what is more urgent, s: jobs take 4 ms, so a sixth of their speed is left."""
+"""Longest pause for what is more urgent, s: jobs and their pieces take 4 to 20 ms, so a sixth of the speed is
+left."""
 GLANCE = 0.002
 """Time between two looks whether it goes on, s."""
 OVERDUE = 2.0
@@ -71,7 +72,11 @@ class Schedule(Protocol):
         ...
 
     def give_way(self, busy: Callable[[], bool]) -> None:
-        """Hold the background's work back as long as something more urgent goes on, a little for each job."""
+        """Hold the background back as long as something more urgent goes on, a little at each pause."""
+        ...
+
+    def pause(self) -> None:
+        """Called in the background, before each job and between the pieces of a long one."""
         ...
 
     def start(self) -> None:
@@ -149,6 +154,12 @@ class LiveSchedule:
         """The background's thread takes the interpreter from all others: it sleeps meanwhile."""
         self._busy = busy
 
+    def pause(self) -> None:
+        """Sleep as long as something more urgent goes on, up to `GIVEN_WAY`."""
+        end = time.monotonic() + GIVEN_WAY
+        while self._busy() and time.monotonic() < end and not self._closing.is_set():
+            time.sleep(GLANCE)
+
     def start(self) -> None:
         """Start the threads."""
         if not self._thread.is_alive() and not self._closing.is_set():
@@ -167,9 +178,7 @@ class LiveSchedule:
 
     def _work(self) -> None:
         while (step := self._next()) is not None:
-            end = time.monotonic() + GIVEN_WAY
-            while self._busy() and time.monotonic() < end and not self._closing.is_set():
-                time.sleep(GLANCE)
+            self.pause()
             _run(step)
 
     def _next(self) -> Job | None:
@@ -276,6 +285,9 @@ class LockstepSchedule:
 
     def give_way(self, busy: Callable[[], bool]) -> None:
         """Nothing: work runs when it is its turn."""
+
+    def pause(self) -> None:
+        """Nothing, likewise."""
 
     def start(self) -> None:
         """Nothing: work runs with the next question."""

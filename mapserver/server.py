@@ -171,7 +171,7 @@ class MapServer:
             self._quotas, self._gone, worker.unmerged, worker.note_refusal,
             self._metrics.acknowledged, self._roster.status_period,
         )  # fmt: skip
-        clock.give_way(lambda: self._ingest.busy)
+        clock.give_way(lambda: self._ingest.busy or self._admission.busy)
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,
             lambda: self._annotations.annotations, self._path, base.images,

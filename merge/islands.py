@@ -9,7 +9,7 @@ the merge without retired areas, and whether a link by hand is contradicted the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 
 import networkx as nx
@@ -43,13 +43,20 @@ CONTRADICTION = "contradicts what nodes measured that have left the map since"
 class Islands:
     """Merges island by island, and keeps what it has merged."""
 
-    def __init__(self, settings: MergeSettings | None = None, exact: int = EXACT) -> None:
+    def __init__(
+        self,
+        settings: MergeSettings | None = None,
+        exact: int = EXACT,
+        pause: Callable[[], None] = lambda: None,
+    ) -> None:
         """Nothing is merged yet.
 
         Args:
             settings: how.
             exact: nodes up to which an island is decided as a whole whenever it changes.
+            pause: called between two islands.
         """
+        self._pause = pause
         self._settings = settings or MergeSettings()
         self._exact = exact
         self._cache = MergeCache()
@@ -103,15 +110,16 @@ class Islands:
         touched = touched | _touched_by(self._constraints, constraints)
         islands = self._ties(maps, verdicts, constraints)
         merged_islands: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
+        before = {one: island for island in self._merged_islands for one in island}
         for island in islands:
             if island in self._merged_islands and not island & touched:
                 merged_islands[island] = self._merged_islands[island]
                 continue
             inside = {one: maps[one] for one in sorted(island)}
-            earlier = [
-                self._merged_islands[one][1] for one in sorted(self._merged_islands, key=min) if one & island
-            ]
+            overlapping = {before[one] for one in island if one in before}
+            earlier = [self._merged_islands[one][1] for one in sorted(overlapping, key=min)]
             merged_islands[island] = self._decided(inside, verdicts.among(island), constraints, earlier)
+            self._pause()
         self._merged_islands, self._constraints = merged_islands, constraints
         island_of = {one: island for island in islands for one in island}
         whole = _together(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import pickle
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from itertools import islice
 from typing import Any
@@ -35,7 +35,7 @@ def answer_work(request: bytes) -> bytes:
     return pickle.dumps(FUNCTIONS[name](argument))
 
 
-FUNCTIONS: dict[str, Callable[[Any], Any]] = {"compare": compare}
+FUNCTIONS: dict[str, Callable[[Any], Any]] = {"compare": lambda pairs: [*compare(pairs)]}
 
 
 class WorkPool:
@@ -51,13 +51,13 @@ class WorkPool:
         """Whether workers have not answered of late."""
         return time.monotonic() < self._not_before
 
-    def compare(self, pairs: Sequence[tuple[Node, Node]]) -> list[Verdict]:
+    def compare(self, pairs: Sequence[tuple[Node, Node]]) -> Iterable[Verdict]:
         """Compare pairs of nodes; see `mapweave.mapserver.merging.node_comparisons.compare`."""
         if len(pairs) <= PAIRS:  # a single worker would be no faster
             return compare(pairs)
         rest = iter([(bounded(a), bounded(b)) for a, b in pairs])
         parts = iter(lambda: list(islice(rest, PAIRS)), [])
-        return [verdict for verdicts in self._map("compare", parts) for verdict in verdicts]
+        return (verdict for verdicts in self._map("compare", parts) for verdict in verdicts)
 
     def _map(self, name: str, arguments: Iterator[Any]) -> Iterator[Any]:
         """The results, in order."""

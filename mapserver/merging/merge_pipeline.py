@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 
 import numpy as np
 
@@ -27,9 +27,17 @@ from mapweave.merge.settings import MergeSettings
 class MergePipeline:
     """The merge, pinned frames, superseding of nodes and removal of landmarks."""
 
-    def __init__(self, settings: MergeSettings, reaches: ReachabilityCache) -> None:
-        """Nothing is merged yet."""
-        self._islands = Islands(settings)
+    def __init__(
+        self, settings: MergeSettings, reaches: ReachabilityCache, pause: Callable[[], None] = lambda: None
+    ) -> None:
+        """Nothing is merged yet.
+
+        Args:
+            settings: how.
+            reaches: where from which nodes can be seen.
+            pause: see `Islands`.
+        """
+        self._islands = Islands(settings, pause=pause)
         self._frames = PinnedFrames()
         self._superseder = NodeSuperseder(reaches)
         self._remover = LandmarkRemover()

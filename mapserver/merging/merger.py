@@ -50,6 +50,7 @@ class Merger:
         places: PlaceDatabase | None = None,
         settings: MergeSettings | None = None,
         compare: Compare = compare,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:
         """Start with no maps.
 
@@ -57,6 +58,7 @@ class Merger:
             places: is filled with the nodes that come; give it to a Relocalizer too.
             settings: how.
             compare: compares nodes.
+            pause: called between the pieces of a merge.
         """
         # A database in which there is nothing yet is one.
         self.places = PlaceDatabase() if places is None else places
@@ -65,7 +67,8 @@ class Merger:
         self.counters = MergerCounters()
         self.reaches = ReachabilityCache()
         self.settings = settings or MergeSettings()
-        self._comparisons = NodeComparisons(self.places, self.node, self.counters, compare)
+        self._pause = pause
+        self._comparisons = NodeComparisons(self.places, self.node, self.counters, compare, pause)
         self._verdicts = Verdicts()
         self.pruning = Pruning()
         self._pipeline = self._new_pipeline()
@@ -393,6 +396,6 @@ class Merger:
                 self._comparisons.connect(edge)
 
     def _new_pipeline(self) -> MergePipeline:
-        pipeline = MergePipeline(self.settings, self.reaches)
+        pipeline = MergePipeline(self.settings, self.reaches, self._pause)
         pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
         return pipeline

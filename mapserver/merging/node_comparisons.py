@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 
 from mapweave.hybridmap.node import Edge, EdgeKind, Node, NodeId
@@ -25,20 +25,18 @@ from mapweave.merge.pose_graph.verification import verify
 log = logging.getLogger(__name__)
 
 
-Compare = Callable[[Sequence[tuple[Node, Node]]], list[Verdict]]
+Compare = Callable[[Sequence[tuple[Node, Node]]], Iterable[Verdict]]
 """Gives the verdicts on pairs of nodes, in order."""
 
 
-def compare(pairs: Sequence[tuple[Node, Node]]) -> list[Verdict]:
-    """Compare pairs of nodes; what was found depends on these nodes alone."""
-    verdicts = list[Verdict]()
+def compare(pairs: Sequence[tuple[Node, Node]]) -> Iterator[Verdict]:
+    """Compare pairs of nodes, each when it is asked for; what was found depends on these nodes alone."""
     for a, b in pairs:
         try:
-            verdicts.append(verify(bounded(a), bounded(b)))
+            yield verify(bounded(a), bounded(b))
         except Exception as error:  # a defect with two nodes must not hold up all others
             log.exception("%s and %s cannot be compared", a.id, b.id)
-            verdicts.append(RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})"))
-    return verdicts
+            yield RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})")
 
 
 class NodeComparisons:
@@ -54,6 +52,7 @@ class NodeComparisons:
         node_of: Callable[[NodeId], Node | None],
         counters: MergerCounters,
         compare: Compare = compare,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:
         """Begin with no nodes.
 
@@ -62,8 +61,9 @@ class NodeComparisons:
             node_of: gives a node by its id.
             counters: of what is done.
             compare: compares nodes, here or elsewhere.
+            pause: called between two comparisons.
         """
-        self._places, self._node_of, self._compare = places, node_of, compare
+        self._places, self._node_of, self._compare, self._pause = places, node_of, compare, pause
         self._counters = counters
         self._pairs = PairTable()
         self._uncompared: dict[NodeId, None] = {}
@@ -169,6 +169,7 @@ class NodeComparisons:
                 wanted[pair] = a, b
         for pair, verdict in zip(wanted, self._compare([*wanted.values()]), strict=True):
             self.judge(pair, verdict)
+            self._pause()
             self._counters.verified += 1
             self._counters.recognised += isinstance(verdict, Link)
 

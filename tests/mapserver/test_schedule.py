@@ -133,5 +133,15 @@ def test_the_background_gives_way_and_is_not_starved() -> None:
         schedule.post(lambda: done.append(time.monotonic()))
     eventually(lambda: len(done) == 3)
     assert done[2] - began >= 3 * GIVEN_WAY, "each job waits"
+
+    def long() -> None:
+        began = time.monotonic()
+        for _ in range(3):
+            schedule.pause()
+        done.append(time.monotonic() - began)
+
+    schedule.post(long)
+    eventually(lambda: len(done) == 4)
+    assert done[3] >= 3 * GIVEN_WAY, "and each piece of a long one"
     busy.clear()
     schedule.close()

@@ -38,11 +38,14 @@ def contents(merged: MergedMap) -> tuple[object, ...]:
 )
 def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> None:
     """For any changes in any order: the outcome is that of a fresh merge, to the last bit."""
-    life, islands = Life(seed, false_share), Islands()
+    pauses: list[None] = []
+    life, islands = Life(seed, false_share), Islands(pause=lambda: pauses.append(None))
     for _ in range(45):
         life.step()
         if life.rng.random() < 0.4:
+            pauses.clear()
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.constraints)
+            assert len(pauses) >= bool(life.touched), "a pause behind each island that is decided"
             life.touched = set()
             fresh = life.rebuilt()
             assert contents(merged) == contents(fresh)
