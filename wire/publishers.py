@@ -14,7 +14,7 @@ MOST = 50_000
 class Publishers:
     """Publishers by key, the least recently used first.
 
-    A router looks once who wants what a publisher sends. For a message on a key that nobody has declared it
+    A router looks once who wants what a publisher sends. For a message on a key that is not declared it
     looks through all that the fleet has declared, each time: 6 and 150 us a message with 1000 robots.
     """
 
