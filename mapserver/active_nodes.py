@@ -111,8 +111,11 @@ def _adrift(merged: MergedMap) -> Iterator[NodeId]:
 def _out_of_range(merged: MergedMap) -> Iterator[NodeId]:
     """Nodes further away than robots drive. A frame's origin is arbitrary, so distances decide."""
     for graph in merged.graphs:
-        # Written so that NaN is out of range.
-        away = np.abs(graph.means[:, :2] - np.median(graph.means[:, :2], axis=0))
+        # Written so that NaN is out of range. Most components are smaller than that, which is soon seen.
+        positions = graph.means[:, :2]
+        if (np.ptp(positions, axis=0) <= FARTHEST).all():
+            continue
+        away = np.abs(positions - np.median(positions, axis=0))
         inside = (away <= FARTHEST).all(axis=1)
         yield from (graph.nodes[k] for k in np.flatnonzero(~inside).tolist())
 
