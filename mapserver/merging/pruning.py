@@ -107,14 +107,20 @@ class Pruning:
             self.marginals, self.standing = plan.marginals, plan.standing
             self.pruned = PrunedNodes({**self.pruned.nodes, **plan.nodes})
             self._parts += 1
-        for node in plan.nodes:
-            del self._since[node]
+        self._since = {node: stamp for node, stamp in self._since.items() if node not in plan.nodes}
+        self._linked_since = {
+            pair: stamp for pair, stamp in self._linked_since.items() if plan.nodes.keys().isdisjoint(pair)
+        }
 
     def records(self, plan: PrunePlan) -> dict[str, bytes]:
         """Results of the store that say what this will be when a plan is done; see `restore`."""
         links = tuple(Linked.of(link.a, link.b, link.a_from_b) for link in plan.marginals)
         since = tuple((node, stamp) for node, stamp in self._since.items() if node not in plan.nodes)
-        linked_since = tuple((*pair, stamp) for pair, stamp in self._linked_since.items())
+        linked_since = tuple(
+            (*pair, stamp)
+            for pair, stamp in self._linked_since.items()
+            if plan.nodes.keys().isdisjoint(pair)
+        )
         parts = self._parts + bool(plan.nodes)
         state = encode(KeptPruning(links, tuple(plan.standing), since, linked_since, self._looked_ns, parts))
         if not plan.nodes:

@@ -105,13 +105,19 @@ class NodeSuperseder:
         """Nodes of components that were solved again; removed nodes are forgotten."""
         solved = {id(graph) for graph in self._graphs}
         remaining = {id(graph) for graph in merged.graphs}
-        for graph in self._graphs:
-            if id(graph) not in remaining:
-                for node in graph.nodes:
-                    # Known still, if it is in another component now.
-                    if merged.component_of(node) is None:
-                        self._nodes_seen.pop(node, None)
-                        self._blocking.pop(node, None)
+        gone = {
+            node
+            for graph in self._graphs
+            if id(graph) not in remaining
+            for node in graph.nodes
+            # Known still, if it is in another component now.
+            if merged.component_of(node) is None
+        }
+        for node in gone:
+            self._nodes_seen.pop(node, None)
+            self._blocking.pop(node, None)
+        if gone:
+            self._comparisons.forget(gone)
         self._graphs = merged.graphs
         return {
             node: merged.maps[node.map].nodes[node]
