@@ -39,7 +39,9 @@ class Comparisons:
     def forget(self, nodes: Container[NodeId]) -> None:
         """Drop what was found of some nodes: they are gone, and their landmarks with them."""
         self._cache = {
-            pair: entry for pair, entry in self._cache.items() if pair[0] not in nodes and pair[1] not in nodes
+            pair: entry
+            for pair, entry in self._cache.items()
+            if pair[0] not in nodes and pair[1] not in nodes
         }
 
     def _verified(self, a: Node, b: Node, least: int) -> Link | None:
