@@ -28,6 +28,7 @@ from mapweave.agent.global_localization.resumption import Resumption
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.mapping.node_retirement import Released, alone
 from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
@@ -77,6 +78,7 @@ class Pipeline:
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
         calibration: OnlineCalibration | None = None,
+        released: Released = alone,
     ) -> None:
         """Start with nothing to do, and with an empty map or one that was begun.
 
@@ -89,6 +91,7 @@ class Pipeline:
             contents: of the map, as `Journal.resume` gives it.
             next_number: the first that no node or edge of the map has ever had.
             calibration: what this robot has learnt of its geometry on an earlier map.
+            released: what the fleet says of superseded nodes of the map; it must not wait for anything.
         """
         jit.load()  # a robot that drives must not wait for a compiler
         self._fisheye = Lens(description.camera, description.distortion)
@@ -102,7 +105,7 @@ class Pipeline:
         self._description = description
         self._lens = lens
         self._sift = Sift(lens, self._settings.sift)
-        self._mapper = Mapper(map_id, description, self._settings, contents, next_number, lens)
+        self._mapper = Mapper(map_id, description, self._settings, contents, next_number, lens, released)
         self._caution = CautiousDriving(description) if lacks_rangers(description) else None
         self._floor = self._new_floor()
         self._changes: list[ChangeBody] = []
@@ -256,6 +259,8 @@ class Pipeline:
         questions = [*questions, *self._who_is_near()]
         if self._blind and not self._lifted:
             command = self._sensors.trial
+        if not isinstance(self._mission, GoTo):
+            self._mapper.retire_superseded(observation.stamp_ns)
         safe, warning = self._safe(command if driven is None or self._lifted else driven.command, observation)
         self._see_changes()
         changes, self._changes = tuple(self._changes), []

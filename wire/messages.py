@@ -97,7 +97,7 @@ class KeptPruning:
 
 @dataclass(frozen=True)
 class KeptPruned:
-    """What is left of nodes that were pruned at one time.
+    """What is left of some nodes that were pruned.
 
     Attributes:
         nodes: each with what is left.

@@ -16,7 +16,7 @@ from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import View
 from mapweave.agent.observation import RobotDescription
-from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -133,6 +133,19 @@ class KeyframeBuilder:
         placed = self._node(anchor, tracking, wayside)
         if placed is None:
             return None
+        self.join(placed)
+        for leaf in leaves:
+            beside = self._node(leaf, tracking)
+            if beside is not None:
+                self._write(beside.node, self._edge(placed, beside, self._sober(leaf.anchor_from_view)))
+        return placed.node
+
+    def join(self, placed: AnchoredKeyframe) -> None:
+        """Put the node of an episode into the map, with edges to the one before and to places known already.
+
+        Args:
+            placed: at the current anchor.
+        """
         loops = self._close_loops(placed.node)
         joined: list[Edge] = []
         if self._last is not None and self._last.evidence and loops:
@@ -141,22 +154,17 @@ class KeyframeBuilder:
             joined = [self._edge(self._last, placed, self._last.node_from_anchor)]
         self._write(placed.node, *joined, *loops)
         self._last = placed
-        for leaf in leaves:
-            beside = self._node(leaf, tracking)
-            if beside is not None:
-                self._write(beside.node, self._edge(placed, beside, self._sober(leaf.anchor_from_view)))
-        return placed.node
 
-    def recognise(self, node: Node, view: View, recognition: Recognition) -> None:
+    def recognise(self, node: Node, view_tracks: NDArray[np.int64], recognition: Recognition) -> None:
         """The next episode begins at a view that shows a node of this map, however the robot came there.
 
         Args:
             node: of the map.
-            view: the anchor view, whose features all have tracks.
+            view_tracks: (K,) of the features of the anchor view; all have one.
             recognition: of the node in the view's features.
         """
         tracks = np.full(len(node.landmarks), -1, np.int64)
-        tracks[recognition.pairs[:, 0]] = view.tracks[recognition.pairs[:, 1]]
+        tracks[recognition.pairs[:, 0]] = view_tracks[recognition.pairs[:, 1]]
         self.map_from_anchor = node.map_from_robot @ recognition.node_from_robot
         self._last = AnchoredKeyframe(node, tracks, recognition.node_from_robot, recognition.evidence)
 
@@ -177,12 +185,23 @@ class KeyframeBuilder:
         if self._last is not None:
             self._last.node_from_anchor = self._last.node_from_anchor @ moved
 
+    @property
+    def last(self) -> NodeId | None:
+        """The node to which the next one is tied."""
+        return None if self._last is None else self._last.node.id
+
+    def retire(self, node: NodeId) -> None:
+        """Take a node out of the map, with its edges."""
+        change = NodeRetired(node)
+        self.map.apply(change)
+        self._new.append(change)
+
     def drove(self, traverse: Traverse | None, refined: Node | None) -> None:
         """Write down what a drive has measured."""
         if refined is not None:
             self._write(refined)
         if traverse is not None:
-            self._write(driven_edge(self.map, traverse, self._number))
+            self._write(driven_edge(self.map, traverse, self.new_id))
 
     def _write(self, *elements: Node | Edge) -> None:
         """Put nodes and edges into the map."""
@@ -191,7 +210,8 @@ class KeyframeBuilder:
             self.map.apply(change)
             self._new.append(change)
 
-    def _number(self) -> NodeId:
+    def new_id(self) -> NodeId:
+        """An id that no node or edge of the map has had."""
         number = NodeId(self._map_id.agent, self._map_id.epoch, self._next_number)
         self._next_number += 1
         return number
@@ -207,7 +227,7 @@ class KeyframeBuilder:
         ranges = d.ranges(view.proximity)
         segment = TrajectorySegment() if wayside is None else wayside.segment(view.stamp_ns, ranges)
         node = Node(
-            self._number(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius, ranges, segment
+            self.new_id(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius, ranges, segment
         )
         return AnchoredKeyframe(node, tracks)
 
@@ -254,7 +274,7 @@ class KeyframeBuilder:
             kind = EdgeKind.LOOP
         shared = np.stack([in_a, in_b], axis=1).astype(np.int64)
         evidence = a.evidence or {"shared": float(len(shared))}
-        return Edge(self._number(), a.node.id, b.node.id, a_from_b, kind, shared, evidence)
+        return Edge(self.new_id(), a.node.id, b.node.id, a_from_b, kind, shared, evidence)
 
     def _settle(self, placed: AnchoredKeyframe, loops: list[Edge]) -> None:
         """Correct where the first node after a recognition is, by the surest of its edges.
@@ -290,9 +310,7 @@ class KeyframeBuilder:
                 continue
             if self._credible(candidate, node, recognition.node_from_robot):
                 pose, pairs, evidence = recognition.node_from_robot, recognition.pairs, recognition.evidence
-                edges.append(
-                    Edge(self._number(), candidate.id, node.id, pose, EdgeKind.LOOP, pairs, evidence)
-                )
+                edges.append(Edge(self.new_id(), candidate.id, node.id, pose, EdgeKind.LOOP, pairs, evidence))
         return edges
 
     def _credible(self, earlier: Node, later: Node, measured: PoseGaussian) -> bool:

@@ -14,6 +14,7 @@ from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.mapping.anchored_keyframe import HERE
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
+from mapweave.agent.mapping.node_retirement import NodeRetirement, Released, alone
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import View
@@ -51,8 +52,9 @@ class Mapper:
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
         lens: Lens | None = None,
+        released: Released = alone,
     ) -> None:
-        """Start an empty map at the robot's pose, or resume one; see KeyframeBuilder."""
+        """Start an empty map at the robot's pose, or resume one; see KeyframeBuilder and NodeRetirement."""
         settings = settings or AgentSettings()
         self.typical_depth = DEPTHS_PER_HEIGHT * max(description.camera.mount_height, 0.05)
         self._description = description
@@ -62,6 +64,7 @@ class Mapper:
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
         self._cartographer = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
+        self._retirement = NodeRetirement(self._cartographer.map, released)
         self._wayside = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
@@ -180,6 +183,16 @@ class Mapper:
         """Take in what was measured on a drive while nothing was mapped; see Cartographer."""
         self._cartographer.drove(traverse, refined)
 
+    def retire_superseded(self, now_ns: int) -> None:
+        """Let a node go that newer ones have superseded for long, if there is one; call it once a tick.
+
+        Not while a drive to a goal may use it.
+        """
+        last = self._cartographer.last
+        node = self._retirement.next(now_ns, () if last is None else (last,))
+        if node is not None:
+            self._cartographer.retire(node)
+
     # One tick, and what ends an episode
 
     def step(self, observation: Observation) -> None:
@@ -249,7 +262,7 @@ class Mapper:
         anchor = self._tracking.take(observation, features, HERE)
         self.typical_depth = float(np.median(node.landmarks.depths[node.landmarks.has_depth]))
         self._begin_at(anchor)
-        self._cartographer.recognise(node, anchor, recognition)
+        self._cartographer.recognise(node, anchor.tracks, recognition)
 
     def _begin_at(self, anchor: View) -> None:
         self._tracking.reanchor()

@@ -9,8 +9,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from mapweave.agent.replication.compaction import undone
+from mapweave.agent.replication.log_entry import Entry
 from mapweave.hybridmap.change import Change, ChangeBody, EdgeRetired, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.mission_order import MAX_KEPT, MissionReport, Missions
@@ -38,15 +40,6 @@ CREATE TABLE ack (
 """
 
 READ_AT_ONCE = 256
-
-
-class Entry(NamedTuple):
-    """One change of a log: the node or edge that it writes or retires; body None if damaged."""
-
-    sequence: int
-    element: NodeId
-    put: bool
-    body: ChangeBody | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,8 +265,9 @@ class Journal:
     def prune(self, map_id: MapId, servers: Iterable[str]) -> int:
         """Drop changes that every one of the servers has and that a later change of the same log undoes.
 
-        The replay gives the same map before and after (its nodes perhaps in another order). Retirements stay:
-        they also take away edges.
+        The replay gives the same map before and after (its nodes perhaps in another order). Retirements of
+        which nothing is left to undo go as well, once each server that has ever had anything of the log has
+        them; not the newest change, nor that of the greatest number: they say which come next.
 
         Returns:
             How many were dropped.
@@ -290,8 +284,16 @@ class Journal:
                     "SELECT 1 FROM change AS later WHERE later.epoch = :epoch AND later.element = "
                     "change.element AND later.sequence > change.sequence AND later.sequence <= :limit)",
                     {"epoch": map_id.epoch, "limit": limit},
+                ).rowcount
+                retired = "SELECT 1 FROM change WHERE epoch = ? AND NOT put AND sequence <= ? LIMIT 1"
+                if rows.execute(retired, (map_id.epoch, limit)).fetchone() is None:
+                    return dropped
+                some = undone(self.entries(map_id), limit, min([limit, *acknowledged.values()]))
+                rows.executemany(
+                    "DELETE FROM change WHERE epoch = ? AND sequence = ?",
+                    ((map_id.epoch, sequence) for sequence in some),
                 )
-                return dropped.rowcount
+                return dropped + len(some)
 
     def missions(self) -> list[MissionReport]:
         """Missions that were kept; one that cannot be read is left out."""

@@ -69,6 +69,8 @@ class ReplicationStatus:
 SETTLED_BEACONS = 20
 """In the time of so many beacons, a map that servers have sends one: a server that is new, or has lost it,
 learns so."""
+COMPACTED = 1000
+"""After so many further changes that servers have, what later ones undo is dropped from the disk."""
 RAREST = 4
 """A beacon on which nothing follows is sent again after twice the time, up to so many times the interval: the
 beacons of a fleet that a server cannot keep up with must not hold it up further."""
@@ -119,8 +121,9 @@ class Replicator:
         self._retry_at = 0.0
         self._pause = self._settings.beacon_interval
         self._next_beacon = self._everyone_at = 0.0
-        for m in self._logs:
-            journal.prune(m, self._servers)
+        self._compacted = 0
+        for state in self._logs.values():
+            self._compact(state)
         self._work: queue.SimpleQueue[list[Draft] | Sample | Request | bool | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
         self._thread.start()
@@ -134,6 +137,12 @@ class Replicator:
     def map_id(self) -> MapId:
         """The map whose changes are taken."""
         return self._map
+
+    @property
+    def shared(self) -> bool:
+        """Whether any server has anything of the map whose changes are taken."""
+        with self._changed:
+            return any(self._current.acknowledged.values())
 
     @property
     def status_period(self) -> float:
@@ -328,8 +337,20 @@ class Replicator:
             }
             self._last_ack = time.monotonic()
             self._changed.notify_all()
+        if state is self._current and state.settled(self._servers) - self._compacted >= COMPACTED:
+            self._compact(state)
         if state.unsettled(self._servers):
             self._beacon_after(self._settings.beacon_interval)
+
+    def _compact(self, state: LogState) -> None:
+        """Drop from the disk what later changes of a log undo."""
+        if state is self._current:
+            self._compacted = state.settled(self._servers)
+        try:
+            self._journal.prune(state.map, self._servers)
+        except InvalidFile as error:
+            # It only takes more room until the next time.
+            log.warning("%s", error)
 
     def _sharing(self, server: str, ack: Ack) -> list[str]:
         """Other servers with the same store: what one acknowledges, all of them have.

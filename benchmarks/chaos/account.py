@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.chaos.agent_process import STAMP, digest
 from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.replication.journal import Journal
-from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodeRetired
 from mapweave.hybridmap.node import NodeId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.store import Store
@@ -26,7 +26,7 @@ class Account:
         sent: changes that the robot's journal had committed, by the robot's own log.
         stored: of these, those in the store; of several stores the least.
         undone: of these, those that a store lacks since the robot's journal no longer has them, either: a
-            later change puts the same node or edge again or retires it.
+            later change puts the same node or edge again or retires it, or it was a retirement.
         lost: the others.
         duplicated: changes that a store has more than once.
         out_of_order: changes that are not where they were in the robot's log, or were never sent.
@@ -91,7 +91,7 @@ def account(sent: Sequence[Change], journal: Journal, stores: Sequence[Store]) -
     """Compare what a robot has sent with what its journal and the stores have."""
     map_id = sent[0].map
     position = {encode_change(change): change.sequence for change in sent}
-    newest: dict[NodeId, int] = {element_of(change.body): change.sequence for change in sent}
+    superfluous = _superfluous(sent)
     kept = {encode_change(c) for c in journal.changes(map_id, 1, len(sent))}
     maps = {_hash([change.body for change in sent]), _hash(list(journal.replay(map_id)))}
     result = Account(sent=len(sent), stored=len(sent))
@@ -99,9 +99,7 @@ def account(sent: Sequence[Change], journal: Journal, stores: Sequence[Store]) -
         rows = list(store.replay(map_id))
         have = [encode_change(row) for row in rows]
         missing = {data: k for data, k in position.items() if data not in set(have)}
-        undone = sum(
-            data not in kept and newest[element_of(sent[k - 1].body)] > k for data, k in missing.items()
-        )
+        undone = sum(data not in kept and k in superfluous for data, k in missing.items())
         in_order = [position.get(data) == row.sequence for data, row in zip(have, rows, strict=True)]
         rising = all(a.sequence < b.sequence for a, b in pairwise(rows))
         maps.add(_hash([row.body for row in rows]))
@@ -112,11 +110,25 @@ def account(sent: Sequence[Change], journal: Journal, stores: Sequence[Store]) -
             result.out_of_order + in_order.count(False) + (not rising),
         )  # fmt: skip
     # A journal that has lost what was committed has lost it, whatever the servers have.
-    gone = sum(data not in kept and newest[element_of(sent[k - 1].body)] == k for data, k in position.items())
+    gone = sum(data not in kept and k not in superfluous for data, k in position.items())
     return Account(
         result.sent, result.stored, result.undone, max(result.lost, gone), result.duplicated,
         result.out_of_order, len(maps) == 1,
     )  # fmt: skip
+
+
+def _superfluous(sent: Sequence[Change]) -> set[int]:
+    """Changes that later ones undo, and retirements: whether the map is the same without them is compared."""
+    newest: dict[NodeId, int] = {element_of(change.body): change.sequence for change in sent}
+    retired = {change.body.id: change.sequence for change in sent if isinstance(change.body, NodeRetired)}
+    out = {change.sequence for change in sent if newest[element_of(change.body)] > change.sequence}
+    for change in sent[:-1]:
+        match change.body:
+            case EdgePut(edge) if change.sequence < max(retired.get(edge.a, 0), retired.get(edge.b, 0)):
+                out.add(change.sequence)
+            case NodeRetired() | EdgeRetired():
+                out.add(change.sequence)
+    return out
 
 
 def _hash(bodies: Sequence[object]) -> str:

@@ -34,7 +34,10 @@ AT_ONCE = 300
 """Nodes of one component that leave at once, near each other; the others on the days after. The merge waits
 for it: for 300 about two seconds."""
 PART = "pruned {}"
-"""Among the results of a store, with a number: what was pruned at one time."""
+"""Among the results of a store, with a number: what is left of some nodes."""
+PART_NODES = 500
+"""A part with as many is full, and is not written again. A row for each day would leave much of its page
+empty."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,9 @@ class Pruning:
         self._since: dict[NodeId, int] = {}
         self._linked_since: dict[Pair, int] = {}
         self._looked_ns = 0
+        # The parts that are full, and what is in the next one.
         self._parts = 0
+        self._part: dict[NodeId, PrunedNode] = {}
 
     def due(self, merged: MergedMap, now_ns: int, keep_days: float) -> tuple[set[NodeId], set[Pair]] | None:
         """Nodes that are superseded, and pairs that are linked, for long enough.
@@ -106,20 +111,27 @@ class Pruning:
         if plan.nodes:
             self.marginals, self.standing = plan.marginals, plan.standing
             self.pruned = PrunedNodes({**self.pruned.nodes, **plan.nodes})
-            self._parts += 1
-        for node in plan.nodes:
-            del self._since[node]
+            self._part |= plan.nodes
+            if len(self._part) >= PART_NODES:
+                self._parts, self._part = self._parts + 1, {}
+        self._since = {node: stamp for node, stamp in self._since.items() if node not in plan.nodes}
+        self._linked_since = {
+            pair: stamp for pair, stamp in self._linked_since.items() if plan.nodes.keys().isdisjoint(pair)
+        }
 
     def records(self, plan: PrunePlan) -> dict[str, bytes]:
         """Results of the store that say what this will be when a plan is done; see `restore`."""
         links = tuple(Linked.of(link.a, link.b, link.a_from_b) for link in plan.marginals)
         since = tuple((node, stamp) for node, stamp in self._since.items() if node not in plan.nodes)
-        linked_since = tuple((*pair, stamp) for pair, stamp in self._linked_since.items())
-        parts = self._parts + bool(plan.nodes)
+        linked_since = tuple(
+            (*pair, stamp) for pair, stamp in self._linked_since.items() if plan.nodes.keys().isdisjoint(pair)
+        )
+        part = {**self._part, **plan.nodes}
+        parts = self._parts + bool(part)
         state = encode(KeptPruning(links, tuple(plan.standing), since, linked_since, self._looked_ns, parts))
         if not plan.nodes:
             return {PRUNING: state}
-        return {PRUNING: state, PART.format(self._parts): encode(KeptPruned(tuple(plan.nodes.items())))}
+        return {PRUNING: state, PART.format(self._parts): encode(KeptPruned(tuple(part.items())))}
 
     def restore(self, result: Callable[[str], bytes | None]) -> None:
         """Read it again.
@@ -135,14 +147,18 @@ class Pruning:
             return
         kept = decode(state, KeptPruning)
         nodes: dict[NodeId, PrunedNode] = {}
+        self._parts, self._part = kept.parts, {}
         for number in range(kept.parts):
-            part = result(PART.format(number))
-            nodes.update(decode(part, KeptPruned).nodes if part else ())
+            value = result(PART.format(number))
+            part = dict(decode(value, KeptPruned).nodes if value else ())
+            nodes |= part
+            if number == kept.parts - 1 and len(part) < PART_NODES:
+                self._parts, self._part = number, part
         self.pruned, self._since = PrunedNodes(nodes), dict(kept.since)
         self.marginals = tuple(marginal_of(link) for link in kept.links)
         self.standing = frozenset(kept.standing)
         self._linked_since = {(a, b): stamp for a, b, stamp in kept.linked_since}
-        self._looked_ns, self._parts = kept.looked_ns, kept.parts
+        self._looked_ns = kept.looked_ns
 
 
 def marginal_of(kept: Linked) -> Link:

@@ -195,12 +195,17 @@ class Agent:
                 stored = newest_on_server(self._bus, self._keys, options.server, options.name, patience)
             epoch = next_epoch(taken, stored)
         map_id = self.journal.open_map(epoch)
-        pipeline = Pipeline(map_id, self._description, self._settings, calibration=calibration)
+        pipeline = Pipeline(
+            map_id, self._description, self._settings, calibration=calibration, released=self._released
+        )
         self._start(map_id, pipeline)
 
     def _resume(self, map_id: MapId) -> None:
         kept = RetainedMap.of(self.journal, map_id)
-        pipeline = Pipeline(map_id, self._description, self._settings, kept.contents, kept.next_number)
+        pipeline = Pipeline(
+            map_id, self._description, self._settings, kept.contents, kept.next_number,
+            released=self._released,
+        )  # fmt: skip
         self.journal.open_map(map_id.epoch)
         nodes = len(pipeline.map.nodes)
         self._say(f"takes up map {map_id} with {nodes} nodes")
@@ -235,6 +240,17 @@ class Agent:
             pipeline, self._fleet, self.replicator, self.missions, MappingMonitor(self._description),
             options.synchronization, self._stepped, self._say,
         )  # fmt: skip
+
+    def _released(self, node: NodeId, successor: NodeId) -> bool:
+        """Whether a superseded node may leave the own map: no server knows it, or its server has pruned it.
+
+        A server keeps a node that people have named, and it marginalises a node before it lets it go.
+        """
+        report = self.missions.report
+        if report is not None and node in (report.order.node, *report.order.via):
+            return False
+        poses = self.merged_poses
+        return not self.replicator.shared or (poses.of(node) is None and poses.of(successor) is not None)
 
     def _say(self, line: str) -> None:
         self._print(f"{self._options.name}: {line}")

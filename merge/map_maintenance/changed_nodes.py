@@ -54,6 +54,8 @@ class ChangedNodes:
         """Nodes that are in none of these components any more; they are forgotten."""
         out = set(self._rows).difference(*components)
         for node in out:
-            # Its row stays: there are no more of them than there ever were nodes.
             del self._nodes[node], self._rows[node]
+        if out:
+            self._means = self._means[list(self._rows.values())]
+            self._rows = {node: row for row, node in enumerate(self._rows)}
         return out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.verification import verify
@@ -33,6 +35,14 @@ class Comparisons:
                 self._cache = {}
             entry = self._cache[a.id, b.id] = a, b, self._verified(a, b, least)
         return entry[2]
+
+    def forget(self, nodes: Container[NodeId]) -> None:
+        """Drop what was found of some nodes: they are gone, and their landmarks with them."""
+        self._cache = {
+            pair: entry
+            for pair, entry in self._cache.items()
+            if pair[0] not in nodes and pair[1] not in nodes
+        }
 
     def _verified(self, a: Node, b: Node, least: int) -> Link | None:
         alike = match(a.landmarks.codes, b.landmarks.codes)

@@ -25,9 +25,20 @@ import numpy as np
 
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.hybridmap.reachability import FARTHEST, STOPS, WIDEST, least_in_view
+from mapweave.hybridmap.reachability import FARTHEST, WIDEST
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.superseded import Superseded
+from mapweave.hybridmap.superseding import (
+    CROWD,
+    DETOUR,
+    FOUND,
+    LATER,
+    SECOND,
+    WAY,
+    is_candidate,
+    same_visit,
+    superseded_by,
+)
 from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.map_maintenance.comparisons import Comparisons
 from mapweave.merge.map_maintenance.node_age import is_older
@@ -38,9 +49,6 @@ from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 NEAR = 0.5
 """Nodes nearer than this to each other stand in one place, as for routes, m."""
-
-
-SECOND = 1_000_000_000
 
 
 class NodeSuperseder:
@@ -105,13 +113,19 @@ class NodeSuperseder:
         """Nodes of components that were solved again; removed nodes are forgotten."""
         solved = {id(graph) for graph in self._graphs}
         remaining = {id(graph) for graph in merged.graphs}
-        for graph in self._graphs:
-            if id(graph) not in remaining:
-                for node in graph.nodes:
-                    # Known still, if it is in another component now.
-                    if merged.component_of(node) is None:
-                        self._nodes_seen.pop(node, None)
-                        self._blocking.pop(node, None)
+        gone = {
+            node
+            for graph in self._graphs
+            if id(graph) not in remaining
+            for node in graph.nodes
+            # Known still, if it is in another component now.
+            if merged.component_of(node) is None
+        }
+        for node in gone:
+            self._nodes_seen.pop(node, None)
+            self._blocking.pop(node, None)
+        if gone:
+            self._comparisons.forget(gone)
         self._graphs = merged.graphs
         return {
             node: merged.maps[node.map].nodes[node]
@@ -121,24 +135,6 @@ class NodeSuperseder:
         }
 
 
-FOUND = 20
-"""Landmarks that both show and that stay in view between them."""
-DETOUR = 1.5
-"""A way between neighbours may become longer by this, m."""
-DEPTHS = 0.7
-"""A successor has at least this share of the superseded node's number of depths,"""
-ENOUGH = 60
-"""or at least this many."""
-AGAIN = 120.0
-"""Nodes of one map supersede each other only if this much time is between them, s: views of one visit
-complete each other."""
-LATER = 14 * 86_400.0
-"""s after which a view is of another time,"""
-CROWD = 6
-"""and so many of it within the basin of a node supersede it, whatever they show: what none of them recognises
-is seen from next to there alone, or is gone. So there are no more nodes than there is room."""
-WAY = 1.5
-"""They are no further off by the way than so many times the basin's reach: no wall is between."""
 GATE = 16.3
 """Chi-square with 3 degrees of freedom within which a comparison of two nodes bears out the merged map."""
 FLOOR = (0.05, 0.05, 0.03)
@@ -214,9 +210,7 @@ class _Round:
             self._nodes[node],
             (self._nodes[neighbour] for neighbour, _ in self._neighbours(node)),
         )
-        return sum(
-            is_older(this, neighbour) and not self._same_visit(this, neighbour) for neighbour in neighbours
-        )
+        return sum(is_older(this, neighbour) and not same_visit(this, neighbour) for neighbour in neighbours)
 
     def _try_removing(self, node: NodeId) -> None:
         """Supersede a node if others cover it, and all nodes that it covers."""
@@ -282,9 +276,7 @@ class _Round:
     def _covers(self, covered: NodeId, successor: NodeId, between: Pose2) -> Superseded | None:
         """Whether a node within the basin can supersede another."""
         a, b = self._nodes[covered], self._nodes[successor]
-        if self._same_visit(a, b):
-            return None
-        if b.landmarks.has_depth.sum() < min(DEPTHS * a.landmarks.has_depth.sum(), ENOUGH):
+        if not is_candidate(a, b):
             return None
         link = self._links.between(covered, successor)
         # A link may be of poses alone: by a person, or left of nodes that are gone.
@@ -292,10 +284,7 @@ class _Round:
         if link is None:
             return None
         link = link if link.a == covered else link.turned()
-        in_view = least_in_view(link.shared, a, b, between, STOPS)
-        if in_view < FOUND:
-            return None
-        return Superseded(successor, in_view, between.distance(Pose2()), abs(between.heading))
+        return superseded_by(a, b, link.shared, between)
 
     def _compare(self, a: Node, b: Node) -> Link | None:
         """A link between two nodes that the merge had no need to compare; one that it refused is none."""
@@ -313,9 +302,6 @@ class _Round:
             assert relative is not None, "nodes of one component"
             return verdict if _distance2(off, spread + relative.covariance) < GATE else None
         return verdict
-
-    def _same_visit(self, a: Node, b: Node) -> bool:
-        return a.id.map == b.id.map and abs(a.stamp_ns - b.stamp_ns) < AGAIN * SECOND
 
     def _between(self, a: NodeId, b: NodeId) -> Pose2:
         return self._merged.pose(a).inverse() @ self._merged.pose(b)

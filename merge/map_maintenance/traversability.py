@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -13,6 +12,7 @@ from mapweave.hybridmap.node import Edge, MapId, NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.hybridmap.superseding import reaches, within
 from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
@@ -107,39 +107,19 @@ class Traversability:
             for neighbour, length in own.items()
             if neighbour != successor and neighbour not in self._removed
         }
-        return not limits or self._reaches(successor, node, limits)
+        return not limits or reaches(successor, node, limits, self._open_ways)
 
     def within(self, node: NodeId, reach: float) -> set[NodeId]:
         """Nodes that are left and that are reached from a node by ways of some length at most, m."""
-        lengths, heap = {node: 0.0}, [(0.0, node)]
-        while heap:
-            length, here = heapq.heappop(heap)
-            if length > lengths[here]:
-                continue
-            for neighbour, step in self._ways_of(here).items():
-                farther = length + step
-                if neighbour not in self._removed and farther < min(lengths.get(neighbour, reach), reach):
-                    lengths[neighbour] = farther
-                    heapq.heappush(heap, (farther, neighbour))
-        return {*lengths} - {node}
+        return within(node, reach, self._open_ways)
 
-    def _reaches(self, start: NodeId, without: NodeId, limits: dict[NodeId, float]) -> bool:
-        """Whether all nodes are reached within their limits, m; by Dijkstra's algorithm."""
-        left, farthest = dict(limits), max(limits.values())
-        settled: set[NodeId] = set()
-        heap = [(0.0, start)]
-        while heap and left:
-            length, node = heapq.heappop(heap)
-            if node in settled:
-                continue
-            settled.add(node)
-            if left.pop(node, length) < length:
-                return False
-            for neighbour, step in self._ways_of(node).items():
-                barred = neighbour == without or neighbour in self._removed or neighbour in settled
-                if not barred and length + step <= farthest:
-                    heapq.heappush(heap, (length + step, neighbour))
-        return not left
+    def _open_ways(self, node: NodeId) -> dict[NodeId, float]:
+        """Neighbours that are left, with the distance, m."""
+        return {
+            neighbour: step
+            for neighbour, step in self._ways_of(node).items()
+            if neighbour not in self._removed
+        }
 
     def _ways_of(self, node: NodeId) -> dict[NodeId, float]:
         """Neighbours, also those that were left out, with the distance, m."""

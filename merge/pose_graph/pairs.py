@@ -71,6 +71,8 @@ class PairTable:
             ways[second] -= 1
             if not ways[second]:
                 del ways[second]
+            if not ways:
+                del self._ways[first]
 
     def of(self, node: NodeId) -> list[Pair]:
         """The chosen pairs of one node, in the order of ids."""

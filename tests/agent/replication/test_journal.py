@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
@@ -144,6 +145,34 @@ def test_pruning_waits_for_every_required_server(journal: Journal) -> None:
     assert journal.head(map_id) == 5
 
 
+def test_of_what_is_retired_nothing_stays_once_all_have_it(journal: Journal) -> None:
+    map_id = journal.open_map(None)
+    retired = [NodeRetired(NodeId(*MAP, 2)), EdgeRetired(NodeId(*MAP, 13))]
+    nodes, edges = map(node_put, (1, 2, 3)), [edge_put(11, 1, 2), edge_put(12, 2, 3), edge_put(13, 1, 3)]
+    log = [*nodes, *edges, *retired, node_put(20)]
+    journal.append(map_id, log, 0)
+    before = state(journal.replay(map_id))
+    journal.acknowledge("s0", map_id, 9)
+    journal.acknowledge("s1", map_id, 7)
+    # Another server that has had the log lacks a retirement; the node's is on its disk.
+    assert journal.prune(map_id, ["s0"]) == 5
+    assert [change.sequence for change in journal.changes(map_id, 1, 9)] == [1, 3, 8, 9]
+    journal.acknowledge("s1", map_id, 9)
+    assert journal.prune(map_id, ["s0"]) == 1
+    assert [change.sequence for change in journal.changes(map_id, 1, 9)] == [1, 3, 9]
+    assert state(journal.replay(map_id)) == before and RetainedMap.of(journal, map_id).next_number == 21
+
+
+def test_the_greatest_number_stays_and_what_takes_it_away(journal: Journal) -> None:
+    map_id = journal.open_map(None)
+    journal.append(map_id, [node_put(1), node_put(2), edge_put(11, 1, 2), NodeRetired(NodeId(*MAP, 2))], 0)
+    journal.append(map_id, [node_put(1, 3.0)], 0)
+    before = state(journal.replay(map_id))
+    journal.acknowledge("s0", map_id, 5)
+    assert journal.prune(map_id, ["s0"]) == 2
+    assert state(journal.replay(map_id)) == before and RetainedMap.of(journal, map_id).next_number == 12
+
+
 def state(contents: Iterator[ChangeBody]) -> tuple[dict[NodeId, bytes], dict[NodeId, bytes], set[object]]:
     """What a replay makes, without the order of nodes."""
     hybrid = HybridMap(contents)
@@ -173,10 +202,11 @@ def test_pruning_never_changes_the_map(
     with closing(Journal(tmp_path_factory.mktemp("prune") / "j", "r0")) as journal:
         map_id = journal.open_map(None)
         journal.append(map_id, log, 0)
-        before = state(journal.replay(map_id))
+        before, number = state(journal.replay(map_id)), RetainedMap.of(journal, map_id).next_number
         journal.acknowledge("s0", map_id, acknowledged)
         dropped = journal.prune(map_id, ["s0"])
         assert state(journal.replay(map_id)) == before
+        assert RetainedMap.of(journal, map_id).next_number == number
         assert journal.head(map_id) == len(log)
         kept = {change.sequence for change in journal.changes(map_id, 1, len(log))}
         assert len(kept) == len(log) - dropped

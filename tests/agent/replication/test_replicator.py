@@ -374,5 +374,19 @@ def test_a_restarted_agent_goes_on_and_prunes_what_all_have(
     assert agent.replicator.status().unacknowledged == 0
     agent.replicator.submit(bodies(3, 3), 0)
     eventually(lambda: Mark.decode(server.changes[-1].attachment) == Mark(4, agent.log_id))
-    assert len(agent.journal.changes(MAP, 1, 9)) == 4, "retirements are kept"
+    assert [change.sequence for change in agent.journal.changes(MAP, 1, 9)] == [3, 4]
     agent.close()
+
+
+def test_what_later_changes_undo_leaves_the_disk_while_the_agent_runs(
+    agent: Agent, server: HandServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mapweave.agent.replication.replicator.COMPACTED", 4)
+    assert not agent.replicator.shared
+    agent.replicator.submit([*bodies(1, 2), *bodies(1, 2), *bodies(9, 9)], 0)
+    eventually(lambda: len(server.changes) == 5)
+    server.acknowledge(agent.log_id, 3)
+    eventually(lambda: agent.replicator.unacknowledged() == 2)
+    assert len(agent.journal.changes(MAP, 1, 9)) == 5 and agent.replicator.shared
+    server.acknowledge(agent.log_id, 5)
+    eventually(lambda: [change.sequence for change in agent.journal.changes(MAP, 1, 9)] == [5])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.merging.pruning import DAY_NS
+from mapweave.mapserver.merging.pruning import DAY_NS, PrunePlan, Pruning
 from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
@@ -204,3 +205,56 @@ def test_a_line_of_successors_is_followed() -> None:
     assert found[1].vector == pytest.approx([1.0, 1.0, -math.pi])
     assert nodes.successor(b, {b}) == (b, Pose2()) and nodes.successor(a, set()) is None
     assert nodes.successor(d, set()) is None, "it was sent again, and pruned again"
+
+
+def test_nothing_is_remembered_of_a_node_that_has_left(logs: Logs, tmp_path: Path) -> None:
+    with serving(tmp_path / "s0.sqlite") as server:
+        for map_id in MAPS:
+            server.take(logs.changes[map_id])
+        server.prune(0.0)
+        assert server.prune(DAYS + 1.0)
+        merged = server.merged()
+        gone = set(merged.pruned.nodes)
+        # What the last merge has changed, the next one forgets.
+        stays = server.merger.node(min(node for node in merged.poses if node.map == NEW))
+        assert stays is not None
+        server.take([Change(NEW, len(logs.changes[NEW]) + 1, BEGIN, NodePut(replace(stays, stamp_ns=7)))])
+        server.merged()
+        # All but the lines that say what replaces them.
+        server.merger.pruning.pruned, server.merger.pruning._part = PrunedNodes(), {}
+        server.merger._merged = MergedMap.empty()
+        left = [some for some in reachable(server.merger) if isinstance(some, NodeId) and some in gone]
+        assert gone and not left
+
+
+def reachable(root: object) -> Iterator[object]:
+    """All values that something of this project holds, itself among them."""
+    seen, stack = set[int](), [root]
+    while stack:
+        value = stack.pop()
+        own = type(value).__module__.startswith(("mapweave.", "networkx."))
+        if id(value) not in seen and (own or isinstance(value, dict | list | tuple | set | frozenset)):
+            seen.add(id(value))
+            yield value
+            stack.extend(gc.get_referents(value))
+
+
+def test_what_is_left_of_many_nodes_takes_few_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapweave.mapserver.merging.pruning.PART_NODES", 4)
+    results: dict[str, bytes] = {}
+    pruning = Pruning()
+    left = {
+        NodeId("r0", 1, k): PrunedNode(NodeId("r0", 2, k), Pose2(0.5, 0.0, 0.1), BEGIN) for k in range(11)
+    }
+    for day in range(11):
+        node = NodeId("r0", 1, day)
+        plan = PrunePlan({node: left[node]}, (), (), frozenset())
+        results |= pruning.records(plan)
+        pruning.take(plan)
+        if day % 3 == 2:
+            pruning = Pruning()
+            pruning.restore(results.get)
+    again = Pruning()
+    again.restore(results.get)
+    assert again.pruned == pruning.pruned == PrunedNodes(left)
+    assert len(results) == 1 + 3, "a state, and three records of four nodes at most"

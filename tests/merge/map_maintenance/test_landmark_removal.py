@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapweave.hybridmap import superseding
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
@@ -17,7 +18,6 @@ from mapweave.mapserver.active_nodes import without_faded
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.map_maintenance import landmark_observations as observations
 from mapweave.merge.map_maintenance import landmark_removal as removal
-from mapweave.merge.map_maintenance import node_superseding
 from mapweave.merge.map_maintenance.landmark_observations import LandmarkObservations, expected
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover, detection_rate, presence, things
 from mapweave.merge.pose_graph.links import Link
@@ -142,7 +142,7 @@ def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.Monkey
     other = replace(world, vectors=world.vectors.copy())
     other.vectors[thing] = random_vectors(len(thing), rng)
     # Nothing is superseded: what has been is linked with no later view.
-    monkeypatch.setattr(node_superseding, "FOUND", 10_000)
+    monkeypatch.setattr(superseding, "FOUND", 10_000)
     merger = Merger()
     epochs = [world, *[other] * 8, *[world] * 3]
     collected: dict[int, np.ndarray] = {}
@@ -173,7 +173,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     other = replace(world, vectors=world.vectors.copy())
     other.vectors[wall] = random_vectors(len(wall), rng)
     monkeypatch.setattr(removal, "USUAL", 0.5)
-    monkeypatch.setattr(node_superseding, "FOUND", 10_000)
+    monkeypatch.setattr(superseding, "FOUND", 10_000)
     merger = Merger()
     shares = []
     for epoch, now in enumerate([world, *[other] * 4], start=1):

@@ -17,6 +17,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty
 from mapweave.hybridmap.reachability import FARTHEST, WIDEST, least_in_view
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.hybridmap.superseding import DEPTHS, ENOUGH, FOUND
 from mapweave.mapserver.active_nodes import ActiveNodes
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.merging.merger import Merger
@@ -244,8 +245,8 @@ def covers(merged: MergedMap, first: NodeId, second: NodeId) -> bool:
     if first.map == second.map or not isinstance(link, Link) or abs(between.heading) > WIDEST:
         return False
     shared = link.shared if link.a == first else link.shared[:, ::-1]
-    depths = b.landmarks.has_depth.sum() >= min(rules.DEPTHS * a.landmarks.has_depth.sum(), rules.ENOUGH)
-    return bool(depths and least_in_view(shared, a, b, between) >= rules.FOUND)
+    depths = b.landmarks.has_depth.sum() >= min(DEPTHS * a.landmarks.has_depth.sum(), ENOUGH)
+    return bool(depths and least_in_view(shared, a, b, between) >= FOUND)
 
 
 @pytest.mark.slow

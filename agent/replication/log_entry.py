@@ -1,0 +1,17 @@
+"""One change of a log as a journal has kept it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.node import NodeId
+
+
+class Entry(NamedTuple):
+    """One change of a log: the node or edge that it writes or retires; body None if damaged."""
+
+    sequence: int
+    element: NodeId
+    put: bool
+    body: ChangeBody | None
