@@ -41,7 +41,6 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.life.house import House
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
@@ -57,6 +56,7 @@ from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.codec import encode_change
+from synthetic.maps import changes_of, numbered
 from synthetic.world import take_map, take_view
 
 CLOSE, CLOSE_TURN = 0.25, math.radians(8.0)
@@ -147,9 +147,8 @@ def run(
         now_ns = round(epoch * APART * DAY_NS)
         nodes = [replace(node, stamp_ns=now_ns + node.stamp_ns) for node in nodes]
         truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
-        bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
         map_id = MapId("r0", epoch)
-        changes = [Change(map_id, number, now_ns, body) for number, body in enumerate(bodies, start=1)]
+        changes = numbered(map_id, changes_of(nodes, edges), stamp_ns=now_ns)
         entries = [Entry.read(map_id, one.sequence, encode_change(one)) for one in changes]
         began = time.process_time()
         for change in changes:
