@@ -94,8 +94,8 @@ class MapMaking:
         if self._explorer is None and (not self._by_camera or self._settings.exploration.without_rangers):
             self._explorer = self._new_explorer()
 
-    def look_anew(self) -> None:
-        """A search on the own map that goes on begins from the start."""
+    def end_search(self) -> None:
+        """End the search for a place of the own map; if it is needed still, it begins from the start."""
         self._resumption = None
 
     def go_on(self) -> None:

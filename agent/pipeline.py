@@ -180,7 +180,7 @@ class Pipeline:
         """
         self._mission = mission
         self._put_elsewhere = False
-        self._map_making.look_anew()
+        self._map_making.end_search()
         match mission:
             case Explore():
                 self._map_making.explore()
@@ -292,7 +292,7 @@ class Pipeline:
         if isinstance(self._mission, GoTo):
             self.set_mission(self._mission)
             return
-        self._map_making.look_anew()
+        self._map_making.end_search()
         self._map_making.lose_pose()
 
     def _in_the_air(self, observation: Observation) -> bool:
@@ -313,7 +313,7 @@ class Pipeline:
         changed = (driven is None) != (self._driven is None)
         self._driven = driven
         if changed:
-            self._map_making.look_anew()
+            self._map_making.end_search()
         if changed and driven is None:
             self._map_making.go_on()
 
