@@ -32,6 +32,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
@@ -239,16 +240,13 @@ def figures(total: Tally, routes: list[float], took: float) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    about = (__doc__ or "").splitlines()[0]
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.relocalize_load", description=about)
+    parser = command_line("relocalize_load", __doc__)
     parser.add_argument("--robots", type=int, default=50, help="that ask at once")
     parser.add_argument("--seconds", type=float, default=10.0, help="of asking")
     parser.add_argument("--nodes", type=int, default=400, help="in the map")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args()
-    if options.robots < 1 or options.seconds <= 0.0 or options.nodes < 1 or options.seed < 0:
-        parser.error("--robots, --seconds and --nodes must be positive, --seed not negative")
+    if options.robots < 1 or options.seconds <= 0.0 or options.nodes < 1:
+        parser.error("--robots, --seconds and --nodes must be positive")
     options.nodes = ROOM_NODES * math.ceil(options.nodes / ROOM_NODES)
     console = Console(stderr=True)
     report: dict[str, object] = {
