@@ -117,7 +117,7 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         assert (poses[LAST].inverse() @ poses[FIRST]).distance(TRUE) < 0.05
         (made,) = fleet.constraints()
         assert (made.who, made.because) == ("anna", "both see the red door")
-        assert isinstance(made.about, Linked) and made.about.by_images
+        assert isinstance(made.about, Linked) and made.about.evidence
 
         status, answer = asking.http("POST", {"retire": ["b.1.5"], "by": "bob", "because": "repainted"})
         assert status == 200 and "1 node of b.1" in answer["said"], answer
