@@ -49,11 +49,11 @@ def check_epoch(epoch: int) -> int:
 def _of_servers(what: str) -> tuple[Callable[[Keys, str], str], Callable[[Keys], str]]:
     """Two methods of Keys: the key of one server's `what`, and the pattern of any server's."""
 
-    def of_one(keys: Keys, server: str) -> str:
-        return f"{keys.root}/server/{check_name(server)}/{what}"
+    def of_one(self: Keys, server: str) -> str:
+        return f"{self.root}/server/{check_name(server)}/{what}"
 
-    def of_any(keys: Keys) -> str:
-        return f"{keys.root}/server/*/{what}"
+    def of_any(self: Keys) -> str:
+        return f"{self.root}/server/*/{what}"
 
     return of_one, of_any
 
