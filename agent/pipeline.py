@@ -18,15 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.calibration.online import OnlineCalibration
-from mapweave.agent.camera_occupancy import CameraOccupancyGrid
 from mapweave.agent.cautious_driving import CautiousDriving, lacks_rangers
 from mapweave.agent.command_guard import CommandGuard
-from mapweave.agent.exploration.carried_mapping import CarriedMapping
-from mapweave.agent.exploration.explorer import Explorer
-from mapweave.agent.exploration.new_explorer import new_explorer
-from mapweave.agent.global_localization.resumption import Resumption
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.mapping.episode import EpisodeRequest
+from mapweave.agent.map_making import MapMaking
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.node_retirement import Released, alone
 from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
@@ -34,18 +29,16 @@ from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
-from mapweave.agent.ranger_monitor import not_exploring
 from mapweave.agent.robots_in_view import RobotsInView, nodes_around
 from mapweave.agent.sensor_health.sensor_monitor import Fault, SensorMonitor
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
-from mapweave.hybridmap.change import ChangeBody, NodePut
+from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
-from mapweave.vision.sift import Sift
 
 
 @dataclass(frozen=True)
@@ -99,25 +92,16 @@ class Pipeline:
             description = replace(description, distortion=NO_DISTORTION)
         self._map_id = map_id
         self._settings = settings or AgentSettings()
-        self.calibration = calibration or OnlineCalibration(description)
-        self.calibration.switched()
-        description, lens = self.calibration.description, self.calibration.lens
-        self._description = description
-        self._lens = lens
-        self._sift = Sift(lens, self._settings.sift)
-        self._mapper = Mapper(map_id, description, self._settings, contents, next_number, lens, released)
+        calibration = calibration or OnlineCalibration(description)
+        self._map_making = MapMaking(map_id, calibration, self._settings, contents, next_number, released)
+        description = self._map_making.description
         self._caution = CautiousDriving(description) if lacks_rangers(description) else None
-        self._floor = self._new_floor()
-        self._changes: list[ChangeBody] = []
         self._driven: Driven | None = None
         self._sensors = SensorMonitor(description)
         self._others = RobotsInView(description)
         self._command: Command | None = None
         self._mission: Mission = Idle()
-        self._explorer: Explorer | None = None
-        self._passenger = CarriedMapping(self._mapper)
         self._navigator: Navigator | None = None
-        self._resumption: Resumption | None = None
         self._guard = CommandGuard(self._caution)
         self._lifted = self._put_elsewhere = False
         self._image: NDArray[np.uint8] | None = None
@@ -125,15 +109,15 @@ class Pipeline:
     @property
     def map(self) -> HybridMap:
         """The robot's own map so far."""
-        return self._mapper.map
+        return self.mapper.map
 
     @property
     def map_from_robot(self) -> PoseGaussian | None:
         """Where the robot is on its own map; None if it does not know."""
         fix = self.fix
         match self._mission:
-            case Explore() | Carried() if self._located:
-                return self._mapper.map_from_robot
+            case Explore() | Carried() if self._map_making.located:
+                return self.mapper.map_from_robot
             case GoTo() if fix is not None and fix.node in self.map.nodes:
                 return self.map.nodes[fix.node].map_from_robot @ fix.node_from_robot
         return None
@@ -148,12 +132,17 @@ class Pipeline:
     @property
     def lens(self) -> Lens:
         """Of that image."""
-        return self._lens
+        return self._map_making.lens
 
     @property
     def mapper(self) -> Mapper:
-        """Maps; only the pipeline changes it."""
-        return self._mapper
+        """Makes the map; only `map_making.py` and the pipeline change it."""
+        return self._map_making.mapper
+
+    @property
+    def calibration(self) -> OnlineCalibration:
+        """Of the drive, while it maps."""
+        return self._map_making.calibration
 
     @property
     def fix(self) -> Fix | None:
@@ -164,12 +153,7 @@ class Pipeline:
     @property
     def floor(self) -> OccupancyGrid:
         """The floor around the robot."""
-        return self._floor
-
-    @property
-    def _located(self) -> bool:
-        """Whether the mapper knows where the robot is."""
-        return self._mapper.started and not (self._mapper.astray or self._mapper.doubtful)
+        return self._map_making.floor
 
     @property
     def mission(self) -> Mission:
@@ -184,7 +168,7 @@ class Pipeline:
         It stands still then. The caller may begin a new map, in a new pipeline; another `set_mission`
         lets it try again.
         """
-        return self._put_elsewhere or (self._resumption is not None and self._resumption.lost)
+        return self._put_elsewhere or self._map_making.lost
 
     @property
     def put_elsewhere(self) -> bool:
@@ -198,20 +182,21 @@ class Pipeline:
         place of its own map.
         """
         self._mission = mission
-        self._resumption, self._put_elsewhere = None, False
+        self._put_elsewhere = False
+        self._map_making.end_search()
         match mission:
-            case Explore() if self._explorer is None and self._explores:
-                self._explorer = self._new_explorer()
+            case Explore():
+                self._map_making.explore()
             case GoTo(goal, via, passed, portal):
                 fix = None if self._navigator is None else self._navigator.fix
                 near = None if fix is None else fix.node
-                near = min(self.map.nodes, default=near) if self._located else near
-                self._mapper.lose()
-                self._restart()
+                near = min(self.map.nodes, default=near) if self._map_making.located else near
+                self._map_making.lose_pose()
                 crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)
                 self._navigator = Navigator(
-                    self._description, self._lens, self._sift, self.map, goal, self._settings,
-                    self._settings.seed, via[passed:], crossing, near, lambda: self._others.beside,
+                    self._map_making.description, self.lens, self._map_making.sift, self.map, goal,
+                    self._settings, self._settings.seed, via[passed:], crossing, near,
+                    lambda: self._others.beside,
                 )  # fmt: skip
 
     def taken_through(self) -> None:
@@ -237,33 +222,33 @@ class Pipeline:
         observation = self.calibration.correct(observation)
         observation = self._sensors.see(observation, self._command)
         if self._sensors.clock_jumped:
-            self._mapper.forget_clock()
+            self.mapper.forget_clock()
         if self._sensors.pose_lost:
             self._lose_pose()
         self._take_over(driven)
         self._feel(observation)
-        observation = self._others.mark(observation, answers, lambda: self._mapper.landmarks)
+        observation = self._others.mark(observation, answers, lambda: self.mapper.landmarks)
         match self._mission:
             case _ if self._in_the_air(observation) or self._put_elsewhere:
                 pass
-            case Idle() if self._mapper.started:
+            case Idle() if self.mapper.started:
                 # Mapping that goes on later needs the motion of the wheels until then.
-                self._keep_up(observation)
-            case Explore() | Carried() if self._mapper.astray:
-                command = self._resume(observation)
+                self._map_making.keep_up(observation)
             case Explore() | Carried():
-                command, questions = self._map(observation, answers)
+                command, questions = self._map_making.step(
+                    observation, answers, self._exploring, bool(self._blind), self._held
+                )
+                self._others.description = self._map_making.description
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers, self._held)
-                self._mapper.drove(self._navigator.traverse, self._navigator.refined)
+                self.mapper.drove(self._navigator.traverse, self._navigator.refined)
         questions = [*questions, *self._who_is_near()]
         if self._blind and not self._lifted:
             command = self._sensors.trial
         if not isinstance(self._mission, GoTo):
-            self._mapper.retire_superseded(observation.stamp_ns)
+            self.mapper.retire_superseded(observation.stamp_ns)
         safe, warning = self._safe(command if driven is None or self._lifted else driven.command, observation)
-        self._see_changes()
-        changes, self._changes = tuple(self._changes), []
+        changes = self._map_making.take_changes()
         own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
         self._command = safe if own else None
         return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
@@ -274,18 +259,18 @@ class Pipeline:
             return []
         fix = self.fix
         match self._mission:
-            case Explore() | Carried() if self._located and self.map.nodes:
-                starts = nodes_around(self.map, self._mapper.map_from_robot.mean)
-                return [self._others.question(starts, self._mapper.since_anchor)]
+            case Explore() | Carried() if self._map_making.located and self.map.nodes:
+                starts = nodes_around(self.map, self.mapper.map_from_robot.mean)
+                return [self._others.question(starts, self.mapper.since_anchor)]
             case GoTo() if fix is not None:
                 starts = ((fix.node, fix.node_from_robot.mean),)
                 return [self._others.question(starts, fix.node_from_robot)]
         return []
 
     @property
-    def _explores(self) -> bool:
-        """Whether it may explore by itself."""
-        return self._caution is None or self._settings.exploration.without_rangers
+    def _exploring(self) -> bool:
+        """Whether the robot decides itself what to map."""
+        return isinstance(self._mission, Explore) and self._driven is None
 
     @property
     def _held(self) -> bool:
@@ -312,165 +297,55 @@ class Pipeline:
         if isinstance(self._mission, GoTo):
             self.set_mission(self._mission)
             return
-        self._resumption = None
-        self._mapper.lose()
-        self._restart()
+        self._map_making.end_search()
+        self._map_making.lose_pose()
 
     def _in_the_air(self, observation: Observation) -> bool:
         """Whether the base says that it is lifted. Put down again, the robot is at an unknown place."""
         if observation.kidnapped and not self._lifted:
-            self._mapper.lose()
+            self.mapper.lose()
         elif self._lifted and not observation.kidnapped:
             if isinstance(self._mission, GoTo):
                 self.set_mission(self.mission)
             else:
                 self._put_elsewhere = bool(self.map.nodes) and not isinstance(self._mission, Idle)
-                self._restart()
+                self._map_making.restart()
         self._lifted = observation.kidnapped
         return self._lifted
-
-    def _new_floor(self) -> OccupancyGrid:
-        settings = self._settings.occupancy_grid
-        if self._caution is None:
-            return OccupancyGrid(self._description, settings)
-        floor = CameraOccupancyGrid(self._description, settings)
-        for node in self.map.nodes.values():
-            floor.see_node(node)
-        return floor
-
-    def _new_explorer(self) -> Explorer:
-        return new_explorer(self._map_id, self._description, self._mapper, self._floor, self._settings)
 
     def _take_over(self, driven: Driven | None) -> None:
         """A person takes the wheels, or gives them back: the mission goes on from where the robot is then."""
         changed = (driven is None) != (self._driven is None)
         self._driven = driven
         if changed:
-            self._resumption = None
-        if changed and driven is None and self._explorer is not None:
-            self._explorer.restart()
+            self._map_making.end_search()
+        if changed and driven is None:
+            self._map_making.go_on()
 
     def _feel(self, observation: Observation) -> None:
         """Whether a robot without rangers has touched something: it is entered, and a route is given up."""
         if self._caution is None:
             return
-        mapping = isinstance(self._mission, Explore | Carried) and self._mapper.started
-        pose = self._mapper.map_from_robot.mean
-        self._caution.see(observation, pose if mapping else None)
+        mapping = isinstance(self._mission, Explore | Carried) and self.mapper.started
+        self._caution.see(observation, self.mapper.map_from_robot.mean if mapping else None)
         if not self._caution.touched:
             return
-        if mapping and isinstance(self._floor, CameraOccupancyGrid):
-            self._floor.touch(pose, self._caution.heading)
+        if mapping:
+            self._map_making.touch(self._caution.heading)
         if self._navigator is not None:
             self._navigator.touch(self._caution.touched)
 
     def _safe(self, command: Command, observation: Observation) -> tuple[Command, str]:
         """The command as far as it is safe, and why it is not the one that was wanted."""
-        floor = self._floor if isinstance(self._mission, Explore) else None
-        pose, driven = self._mapper.map_from_robot.mean, self._driven is not None
-        return self._guard.safe(command, observation, self._description, driven, floor, pose)
-
-    def _see_changes(self) -> None:
-        """Take what was changed in the map; nodes show a robot without rangers where the floor is free."""
-        new = self._mapper.take_changes()
-        self._changes += new
-        if isinstance(self._floor, CameraOccupancyGrid):
-            for change in new:
-                if isinstance(change, NodePut):
-                    self._floor.see_node(change.node)
-
-    def _keep_up(self, observation: Observation) -> None:
-        """Pass the observation to the mapper; it may detect that the robot was carried off."""
-        started = self._mapper.started
-        self._mapper.step(observation)
-        if started and not self._mapper.started:
-            self._restart()
-
-    def _map(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
-        self._keep_up(observation)
-        if self._mapper.doubtful or self._mapper.astray or self._blind:
-            self.calibration.pause()
-            return Command(), []
-        if observation.image is not None and self._mapper.started:
-            self._calibrate(observation.image)
-        pose = self._mapper.map_from_robot.mean
-        if isinstance(self._floor, CameraOccupancyGrid):
-            self._floor.drive(pose)
-            self._floor.see_landmarks(pose, self._mapper.landmarks)
-            observation = replace(observation, proximity=self._floor.readings(pose))
-        else:
-            self._floor.see(pose, observation.proximity)
-        if self._explorer is None or isinstance(self._mission, Carried) or self._driven:
-            return self._act(self._passenger, observation), []
-        if self._held:
-            return Command(), []
-        self._explorer.see(observation, answers)
-        return self._act(self._explorer, observation), self._explorer.questions
-
-    def _act(self, behaviour: Explorer | CarriedMapping, observation: Observation) -> Command:
-        """The behaviour's command for this tick; what it asks of the mapper before that is done at once.
-
-        Only here do the views of an episode become nodes. They leave with the step's changes.
-        """
-        while isinstance(move := behaviour.next_move(), EpisodeRequest):
-            self._mapper.meet(move, observation)
-            self._see_changes()
-        return move
-
-    def _calibrate(self, image: NDArray[np.uint8]) -> None:
-        """Hold the tracks against the wheels; what they show is used from the next node on."""
-        calibration = self.calibration
-        if calibration.pending is not None and self._mapper.description is calibration.pending[0]:
-            calibration.switched()
-            self._description, self._lens = calibration.description, calibration.lens
-            self._sift = Sift(self._lens, self._settings.sift)
-            self._others.description = self._description
-        calibration.watch(image, *self._mapper.tracks)
-        if calibration.pending is not None:
-            self._mapper.recalibrate(*calibration.pending)
-
-    def _resume(self, observation: Observation) -> Command:
-        """Find the robot on its own map; then map on from there."""
-        if self._resumption is None:
-            drives, settings = isinstance(self._mission, Explore) and not self._driven, self._settings
-            self._resumption = Resumption(self._description, self._sift, self.map, drives, settings.seed)
-        command = self._resumption.step(observation, bool(self._blind))
-        recognized, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot
-        if recognized is None:
-            return command
-        self._mapper.resume(observation, recognized.features, recognized.node, recognized.recognition)
-        map_from_odom = self._mapper.map_from_robot.mean @ odom_from_robot.inverse()
-        for odom_from_then, proximity in self._resumption.seen:
-            self._floor.see(map_from_odom @ odom_from_then, proximity)
-        self._resumption = None
-        return Command()
-
-    def _restart(self) -> None:
-        """The mapper has lost the robot's pose."""
-        if self.map.nodes:
-            if self._explorer is not None:
-                self._explorer.restart()
-            return
-        # The map may begin anywhere, and all that was found out on the way to it is void.
-        self._floor = self._new_floor()
-        if self._explorer is not None:
-            self._explorer = self._new_explorer()
+        floor = self.floor if isinstance(self._mission, Explore) else None
+        pose, driven = self.mapper.map_from_robot.mean, self._driven is not None
+        return self._guard.safe(command, observation, self._map_making.description, driven, floor, pose)
 
     def _status(self, warning: str) -> Status:
         doing, detail, finished, given_up, progress = "idle", "no mission", False, False, 0.0
         match self._mission:
-            case Explore() | Carried() if self._mapper.astray:
-                doing = "lost" if self.lost else "looking for a place of its own map"
-                detail = "" if self._resumption is None else self._resumption.detail
-            case Explore() | Carried() if self._mapper.doubtful:
-                doing, detail = "standing still", self._mapper.doubt
-            case Explore() if self._explorer is not None and not self._driven:
-                doing, detail = str(self._explorer.phase), self._explorer.detail
-                finished = self._explorer.finished
-            case Explore() if not self._driven:
-                doing, detail = "standing still", not_exploring(self._map_id.agent)
-            case Carried() | Explore():
-                doing, detail = "mapping while carried", self._passenger.detail
+            case Explore() | Carried():
+                doing, detail, finished = self._map_making.account(self._exploring)
             case GoTo() if self._navigator is not None:
                 doing, detail = str(self._navigator.stage), self._navigator.detail
                 finished, given_up = self._navigator.arrived, self._navigator.given_up
@@ -482,33 +357,33 @@ class Pipeline:
             doing = "driven by a person" if not silence else "standing: nothing is heard of who drives it"
         if self._lifted or self._put_elsewhere:
             doing, detail = "lifted", "the robot begins a new map once it is on the floor"
-        mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
+        mapping = isinstance(self._mission, Explore | Carried) and not self.mapper.doubtful
         if self._fault is not None and not self._blind:
             warning = "; ".join(part for part in (self._fault.words, warning) if part)
-        for more in (self._mapper.health if mapping else "", warning):
+        for more in (self.mapper.health if mapping else "", warning):
             detail = "; ".join(part for part in (detail, more) if part)
         nodes = len(self.map.nodes)
         if not nodes and isinstance(self._mission, Explore | Carried):
-            detail = f"no nodes yet: {detail or self._mapper.track_report}"
+            detail = f"no nodes yet: {detail or self.mapper.track_report}"
         fix = self._navigator.fix if self._navigator is not None else None
         drive = mission if isinstance(mission := self.mission, GoTo) else None
-        c = (self._mapper.map_from_robot if fix is None else fix.node_from_robot).covariance
+        c = (self.mapper.map_from_robot if fix is None else fix.node_from_robot).covariance
         return Status(
             doing=doing,
             detail=detail,
             nodes=nodes,
-            tracked=self._mapper.tracked,
-            map_from_robot=self._mapper.map_from_robot.mean,
+            tracked=self.mapper.tracked,
+            map_from_robot=self.mapper.map_from_robot.mean,
             finished=finished,
             mission=type(self._mission).__name__.lower(),
             fix_node=None if fix is None else fix.node,
             node_from_robot=IDENTITY if fix is None else fix.node_from_robot.mean,
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
-            astray=self._resumption is not None,
+            astray=self._map_making.resuming,
             given_up=given_up,
             progress=progress,
-            located=mapping and self._located,
+            located=mapping and self._map_making.located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
             passed=0 if drive is None else drive.passed,
             portal=None if drive is None else drive.portal,

@@ -116,11 +116,6 @@ class AgentStatus:
     skipped: Number = 0
 
     @property
-    def fix_node(self) -> NodeId | None:
-        """The node that the robot knows itself by, if it navigates and knows."""
-        return self.status.fix_node
-
-    @property
     def map(self) -> MapId:
         """The map that it makes."""
         return MapId(self.robot, self.epoch)

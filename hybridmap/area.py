@@ -20,7 +20,6 @@ FARTHEST = 1e4
 ROUND = 16
 """Corners of the polygon around a circle; it reaches 2 % beyond the circle at its corners."""
 
-Corners = tuple[tuple[float, float], ...]
 Floats = NDArray[np.float64]
 
 

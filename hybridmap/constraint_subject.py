@@ -125,11 +125,6 @@ class Linked:
         return Linked(a, b, a_from_b.mean, _upper(a_from_b.covariance), pairs, numbers)
 
     @property
-    def by_images(self) -> bool:
-        """Whether the images of the two nodes give the pose, and not a person."""
-        return bool(self.evidence)
-
-    @property
     def a_from_b(self) -> PoseGaussian:
         """The pose; raises InvalidValue if there is none."""
         if self.pose is None or not self.covariance:

@@ -10,21 +10,15 @@ from collections.abc import Iterator
 from mapweave.connection import ANSWERED
 from mapweave.fleet_events import FleetEvent, FleetEvents
 from mapweave.fleet_questions import FleetQuestions
-from mapweave.hybridmap.explanation import (
-    Explanation,
-    FleetExplanation,
-    PairExplanation,
-    RouteExplanation,
-)
+from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.map_event import History, MapEvent
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.map import Map
 from mapweave.map_reading import MapReading
 from mapweave.storage.map_file import MapFile, unpack_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
-from mapweave.wire.messages import decode, encode, encode_view
+from mapweave.wire.messages import decode, decode_explanation, encode, encode_view
 
 PACKING = 120.0
 """How long a server may take to pack a large map, s."""
@@ -116,8 +110,4 @@ class FleetMap(FleetQuestions, Map):
 
     def _explained(self, request: ExplainRequest) -> Explanation:
         payload = self._question(self._keys.any_explain(), encode(request), THINKING)
-        if request.route:
-            return decode(payload, RouteExplanation)
-        if request.ends is not None and isinstance(request.ends[0], NodeId):
-            return decode(payload, PairExplanation)
-        return decode(payload, FleetExplanation)
+        return decode_explanation(payload, request)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import mapweave
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.mapserver.server import MapServer
 from mapweave.photographs import send_map
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
+from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 from tests.waiting import eventually, free_port
 
@@ -34,8 +34,7 @@ def test_every_block_runs(
     tour = [mapweave.Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
     changes = {}
     for name in ("r0", "r1"):
-        nodes, edges = take_map(world, mapweave.MapId(name, 1), tour, rng)
-        changes[name] = (*map(NodePut, nodes), *map(EdgePut, edges))
+        changes[name] = tuple(changes_of(*take_map(world, mapweave.MapId(name, 1), tour, rng)))
         mapweave.write_map_file(Path(f"{name}.mapweave"), mapweave.MapFile("agent", name, changes[name]))
     mapweave.FileMap(mapweave.merge_map_files([Path("r0.mapweave"), Path("r1.mapweave")])).save(
         "office.mapweave"

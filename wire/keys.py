@@ -29,6 +29,7 @@ The identity is a chunk at a fixed place before the class of the message, so tha
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
@@ -43,6 +44,18 @@ def check_epoch(epoch: int) -> int:
     if not 0 <= epoch <= MAX_EPOCH:
         raise InvalidValue(f"epoch {epoch} is out of range 0..{MAX_EPOCH}")
     return epoch
+
+
+def _of_servers(what: str) -> tuple[Callable[[Keys, str], str], Callable[[Keys], str]]:
+    """Two methods of Keys: the key of one server's `what`, and the pattern of any server's."""
+
+    def of_one(self: Keys, server: str) -> str:
+        return f"{self.root}/server/{check_name(server)}/{what}"
+
+    def of_any(self: Keys) -> str:
+        return f"{self.root}/server/*/{what}"
+
+    return of_one, of_any
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,173 +153,50 @@ class Keys:
         """Pattern: a server's merged poses for all agents."""
         return f"{self.root}/server/{check_name(server)}/poses/*"
 
-    def relocalize(self, server: str) -> str:
-        """Relocalization by a server."""
-        return self._of_server("relocalize", server)
+    # Of each pair the first takes the name of a server, and the second gives the pattern of any server.
 
-    def any_relocalize(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/relocalize"
-
-    def route(self, server: str) -> str:
-        """Where a server gives a way from node to node."""
-        return self._of_server("route", server)
-
-    def any_route(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/route"
-
-    def known(self, server: str) -> str:
-        """Fleet coverage by a server."""
-        return self._of_server("known", server)
-
-    def any_known(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/known"
-
-    def server_map(self, server: str) -> str:
-        """Where a server hands out the merged map as the bytes of a map file."""
-        return self._of_server("map", server)
-
-    def any_server_map(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/map"
-
-    def server_mission(self, server: str) -> str:
-        """Where a server takes missions, and hands them on."""
-        return self._of_server("mission", server)
-
-    def any_mission(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/mission"
-
-    def missions(self, server: str) -> str:
-        """The missions that a server knows of."""
-        return self._of_server("missions", server)
-
-    def any_missions(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/missions"
-
-    def robots(self, server: str) -> str:
-        """The robots as a server sees them."""
-        return self._of_server("robots", server)
-
-    def any_robots(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/robots"
-
-    def reserve(self, server: str) -> str:
-        """Reservations of edges by a server."""
-        return self._of_server("reserve", server)
-
-    def any_reserve(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/reserve"
-
-    def nearby(self, server: str) -> str:
-        """Where a server says which robots are around a robot."""
-        return self._of_server("nearby", server)
-
-    def any_nearby(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/nearby"
-
-    def explain(self, server: str) -> str:
-        """Explanations by a server."""
-        return self._of_server("explain", server)
-
-    def any_explain(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/explain"
-
-    def constrain(self, server: str) -> str:
-        """Manual constraints to a server."""
-        return self._of_server("constrain", server)
-
-    def any_constrain(self) -> str:
-        """Pattern: every server of the fleet."""
-        return f"{self.root}/server/*/constrain"
-
-    def annotate(self, server: str) -> str:
-        """Annotations to a server."""
-        return self._of_server("annotate", server)
-
-    def any_annotate(self) -> str:
-        """Pattern: every server of the fleet."""
-        return f"{self.root}/server/*/annotate"
-
-    def annotations(self, server: str) -> str:
-        """The record of annotations, from a server."""
-        return self._of_server("annotations", server)
-
-    def any_annotations(self) -> str:
-        """Pattern: every server of the fleet."""
-        return f"{self.root}/server/*/annotations"
-
-    def resolve(self, server: str) -> str:
-        """Which nodes names and positions are, by a server."""
-        return self._of_server("resolve", server)
-
-    def any_resolve(self) -> str:
-        """Pattern: every server of the fleet."""
-        return f"{self.root}/server/*/resolve"
-
-    def plans(self, server: str) -> str:
-        """Floor plans under the merged map, from a server."""
-        return self._of_server("plans", server)
-
-    def any_plans(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/plans"
-
-    def plan_image(self, server: str) -> str:
-        """Images of floor plans, from a server."""
-        return self._of_server("plan_image", server)
-
-    def any_plan_image(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/plan_image"
-
-    def put_plan_image(self, server: str) -> str:
-        """Images of floor plans to a server."""
-        return self._of_server("put_plan_image", server)
-
-    def any_put_plan_image(self) -> str:
-        """Pattern: every server of the fleet."""
-        return f"{self.root}/server/*/put_plan_image"
-
-    def constraints(self, server: str) -> str:
-        """The record of manual constraints of a server."""
-        return self._of_server("constraints", server)
-
-    def any_constraints(self) -> str:
-        """Pattern: any server."""
-        return f"{self.root}/server/*/constraints"
-
-    def history(self, server: str) -> str:
-        """The history of the maps, from a server."""
-        return self._of_server("history", server)
-
-    def any_history(self) -> str:
-        """Pattern: every server of the fleet."""
-        return f"{self.root}/server/*/history"
-
-    def server_status(self, server: str) -> str:
-        """Where a server publishes what it is doing."""
-        return self._of_server("status", server)
-
-    def server_statuses(self) -> str:
-        """Pattern: what every server is doing."""
-        return f"{self.root}/server/*/status"
-
-    def server_alive(self, server: str) -> str:
-        """Under which a server is alive."""
-        return self._of_server("alive", server)
-
-    def servers_alive(self) -> str:
-        """Likewise of every server."""
-        return f"{self.root}/server/*/alive"
+    relocalize, any_relocalize = _of_servers("relocalize")
+    """Relocalization by a server."""
+    route, any_route = _of_servers("route")
+    """Where a server gives a way from node to node."""
+    known, any_known = _of_servers("known")
+    """Fleet coverage by a server."""
+    server_map, any_server_map = _of_servers("map")
+    """Where a server hands out the merged map as the bytes of a map file."""
+    server_mission, any_mission = _of_servers("mission")
+    """Where a server takes missions, and hands them on."""
+    missions, any_missions = _of_servers("missions")
+    """The missions that a server knows of."""
+    robots, any_robots = _of_servers("robots")
+    """The robots as a server sees them."""
+    reserve, any_reserve = _of_servers("reserve")
+    """Reservations of edges by a server."""
+    nearby, any_nearby = _of_servers("nearby")
+    """Where a server says which robots are around a robot."""
+    explain, any_explain = _of_servers("explain")
+    """Explanations by a server."""
+    constrain, any_constrain = _of_servers("constrain")
+    """Manual constraints to a server."""
+    annotate, any_annotate = _of_servers("annotate")
+    """Annotations to a server."""
+    annotations, any_annotations = _of_servers("annotations")
+    """The record of annotations, from a server."""
+    resolve, any_resolve = _of_servers("resolve")
+    """Which nodes names and positions are, by a server."""
+    plans, any_plans = _of_servers("plans")
+    """Floor plans under the merged map, from a server."""
+    plan_image, any_plan_image = _of_servers("plan_image")
+    """Images of floor plans, from a server."""
+    put_plan_image, any_put_plan_image = _of_servers("put_plan_image")
+    """Images of floor plans to a server."""
+    constraints, any_constraints = _of_servers("constraints")
+    """The record of manual constraints of a server."""
+    history, any_history = _of_servers("history")
+    """The history of the maps, from a server."""
+    server_status, server_statuses = _of_servers("status")
+    """Where a server publishes what it is doing."""
+    server_alive, servers_alive = _of_servers("alive")
+    """Under which a server is alive."""
 
     # Keys of a robot base.
 
@@ -369,9 +259,6 @@ class Keys:
 
     def _of_map(self, what: str, map_id: MapId) -> str:
         return f"{self.root}/agent/{check_name(map_id.agent)}/{what}/{check_epoch(map_id.epoch)}"
-
-    def _of_server(self, what: str, server: str) -> str:
-        return f"{self.root}/server/{check_name(server)}/{what}"
 
     def _parse_map(self, what: str, key: str) -> MapId:
         agent, epoch = self._chunks(f"agent/*/{what}/*", key)

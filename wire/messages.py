@@ -16,7 +16,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation, RouteExplanation
+from mapweave.hybridmap.explanation import Explanation, FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanPiece, PlanReceived
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
@@ -158,6 +158,15 @@ def encode(message: Any) -> bytes:
 def decode(data: bytes, kind: type[Value]) -> Value:
     """Decode a message; raises InvalidMessage."""
     return typed.decode(data, kind, LIMITS[kind])
+
+
+def decode_explanation(data: bytes, request: ExplainRequest) -> Explanation:
+    """Decode what answers a request for an explanation; raises InvalidMessage."""
+    if request.route:
+        return decode(data, RouteExplanation)
+    if request.ends is not None and isinstance(request.ends[0], NodeId):
+        return decode(data, PairExplanation)
+    return decode(data, FleetExplanation)
 
 
 class _View(msgspec.Struct):

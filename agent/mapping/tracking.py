@@ -144,9 +144,7 @@ class Tracking:
     def report(self) -> TrackQuality:
         """Quality of the tracks after the last accepted image."""
         tracker = self._tracker
-        return TrackQuality.of(
-            self._camera, tracker.pixels, tracker.ages, tracker.held, self._correction.misses_px
-        )
+        return TrackQuality.of(self._camera, tracker.pixels, tracker.ages, self._correction.misses_px)
 
     @property
     def pose(self) -> PoseGaussian:

@@ -51,8 +51,6 @@ class ReplicationStatus:
         newest: sequence number of the newest committed change of the map that is being made.
         waiting: changes that are not yet on the own disk.
         unacknowledged: committed changes, of all maps, that are not on every required server's disk.
-        bytes_sent: of changes, published or pulled.
-        since_ack: seconds since a server last acknowledged something; infinite if none has.
         refused: changes that a server has refused for good.
         failure: why nothing is committed or taken at present; empty if all is well.
     """
@@ -60,8 +58,6 @@ class ReplicationStatus:
     newest: int
     waiting: int
     unacknowledged: int
-    bytes_sent: int
-    since_ack: float
     refused: int
     failure: str
 
@@ -113,8 +109,6 @@ class Replicator:
         self._logs = {m: LogState.of(journal, m) for m in journal.maps()} | {map_id: self._current}
         self._submitted = 0
         self._committed = 0
-        self._bytes_sent = 0
-        self._last_ack: float | None = None
         self._disk_failure = ""
         # Only the thread touches these.
         self._pending: list[Draft] = []
@@ -181,13 +175,10 @@ class Replicator:
     def status(self) -> ReplicationStatus:
         """Where things stand."""
         with self._changed:
-            since = float("inf") if self._last_ack is None else time.monotonic() - self._last_ack
             return ReplicationStatus(
                 newest=self._current.newest,
                 waiting=self._submitted - self._committed,
                 unacknowledged=self._unacknowledged(),
-                bytes_sent=self._bytes_sent,
-                since_ack=since,
                 refused=sum(len(state.refusals) for state in self._logs.values()),
                 failure=self._disk_failure or self._current.failure,
             )
@@ -275,7 +266,6 @@ class Replicator:
         with self._changed:
             self._current.newest = first + len(drafts) - 1
             self._committed += len(drafts)
-            self._bytes_sent += sum(len(change) for _, change in encoded)
             self._disk_failure = ""
             self._changed.notify_all()
         for sequence, change in encoded:
@@ -335,7 +325,6 @@ class Replicator:
                 for name in servers
                 if name == server or ack.watermark > state.acknowledged.get(name, 0)
             }
-            self._last_ack = time.monotonic()
             self._changed.notify_all()
         if state is self._current and state.settled(self._servers) - self._compacted >= COMPACTED:
             self._compact(state)
@@ -384,6 +373,4 @@ class Replicator:
                 rows, last = rows[:count], rows[count - 1][0]
                 break
         answer = LogAnswer(state.log_id, asked.first, max(last, asked.first - 1), tuple(rows))
-        with self._changed:
-            self._bytes_sent += sum(len(change) for _, change in rows)
         question.reply(answer.encode())

@@ -21,46 +21,30 @@ class TrackQuality:
     Attributes:
         alive: how many there are.
         age_median: images over which they were followed, median; 0 without tracks.
-        age_longest: and the most; 0 without tracks.
-        held: share of them that was found by the patch in which it was first seen, not only from frame to
-            frame; NaN without tracks.
         error_px_median: distance of the accepted tracks from their prediction, px, median; NaN without any.
-        error_px_p95: likewise, 95th percentile.
         coverage: share of the image's cells in which there is a track.
     """
 
     alive: int
     age_median: float
-    age_longest: int
-    held: float
     error_px_median: float
-    error_px_p95: float
     coverage: float
 
     @staticmethod
-    def of(
-        camera: Camera, pixels: Array, ages: NDArray[np.int64], held: NDArray[np.bool_], misses_px: Array
-    ) -> TrackQuality:
+    def of(camera: Camera, pixels: Array, ages: NDArray[np.int64], misses_px: Array) -> TrackQuality:
         """Sum up.
 
         Args:
             camera: whose image it is.
             pixels: (N, 2) px in the ideal image, of the tracks.
             ages: (N,) images over which they were followed.
-            held: (N,) whether they were found by their first patch.
             misses_px: (K, 2) px, of the tracks that the filter accepted: measured minus predicted.
         """
-        n = len(pixels)
-        median, worst = float("nan"), float("nan")
-        if len(misses_px):
-            median, worst = (float(q) for q in np.percentile(np.linalg.norm(misses_px, axis=1), (50, 95)))
+        n, errors_px = len(pixels), np.linalg.norm(misses_px, axis=1)
         return TrackQuality(
             alive=n,
             age_median=float(np.median(ages)) if n else 0.0,
-            age_longest=int(ages.max()) if n else 0,
-            held=float(held.mean()) if n else float("nan"),
-            error_px_median=median,
-            error_px_p95=worst,
+            error_px_median=float(np.median(errors_px)) if len(errors_px) else float("nan"),
             coverage=coverage(camera, pixels),
         )
 

@@ -14,7 +14,6 @@ downloads besides Mapweave itself.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -27,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.agent.drive import render
+from benchmarks.command_line import command_line
 from mapweave.extras import MODULES
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.scenarios.children import Children, free_port
@@ -123,13 +123,9 @@ def measure(seed: int, seconds: float) -> dict[str, float | Figures]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.agent", description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
+    parser = command_line("agent", __doc__)
     parser.add_argument("--seconds", type=float, default=180.0, help="of the drive (default: 180)")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if arguments.seed < 0:
-        parser.error("--seed must be at least 0")
     if not 10.0 <= arguments.seconds <= 3600.0:
         parser.error("--seconds must be between 10 and 3600")
     console = Console(stderr=arguments.json)

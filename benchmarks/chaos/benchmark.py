@@ -20,7 +20,6 @@ place. `frozen_router_gap_s` is the same with the robot's router stopped, which 
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import sys
@@ -42,6 +41,7 @@ from benchmarks.chaos.questions import LostRobot
 from benchmarks.chaos.recovery import RobotTimes, recoveries
 from benchmarks.chaos.schedule import KILLS, LINKS, Disturbance, Kind, draw_schedule
 from benchmarks.chaos.scripted_robot import ScriptedRobot
+from benchmarks.command_line import command_line
 from mapweave.agent.replication.journal import Journal
 from mapweave.mapserver.log.opening import open_store
 from mapweave.scenarios.children import ChildFailed
@@ -213,21 +213,18 @@ def good(report: dict[str, object]) -> bool:
 
 def main() -> None:
     """Run once, print, and exit with 1 if anything is lost."""
-    about = (__doc__ or "").splitlines()[0]
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.chaos", description=about)
+    parser = command_line("chaos", __doc__)
     parser.add_argument("--agents", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=60.0, help="of mapping and disturbances")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--store", default=SQLITE,
         help="sqlite: a file a server; postgresql: one database for both, which is started here and killed; "
         "or the URL of one",
     )  # fmt: skip
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep journals, stores and logs here")
-    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     options = parser.parse_args()
-    if options.agents < 1 or options.seconds < LEAST_SECONDS or options.seed < 0:
-        parser.error(f"--agents must be positive, --seconds at least {LEAST_SECONDS:g}, --seed not negative")
+    if options.agents < 1 or options.seconds < LEAST_SECONDS:
+        parser.error(f"--agents must be positive, --seconds at least {LEAST_SECONDS:g}")
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with (
         tempfile.TemporaryDirectory() as place,

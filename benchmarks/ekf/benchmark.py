@@ -13,7 +13,6 @@ FilterPy's (benchmarks.ekf_speed).
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
+from benchmarks.command_line import command_line
 from benchmarks.ekf_speed.benchmark import measure, one_thread
 from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
 from synthetic.localization_run import FEW, Place, Start, try_drives, try_start
@@ -117,14 +117,12 @@ def _by_drive(figures: list[list[float]]) -> list[float]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.ekf", description=__doc__.splitlines()[0])
+    parser = command_line("ekf", __doc__)
     parser.add_argument("--runs", type=int, default=100, help="mapping runs (default 100)")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if min(arguments.runs, arguments.jobs) < 1 or arguments.seed < 0:
-        parser.error("--runs and --jobs must be at least 1, --seed at least 0")
+    if min(arguments.runs, arguments.jobs) < 1:
+        parser.error("--runs and --jobs must be at least 1")
     console = Console(stderr=arguments.json)
     one_thread()
     with console.status("timing ..."):

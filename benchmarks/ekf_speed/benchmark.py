@@ -9,7 +9,6 @@ refuse nothing); and FilterPy's on the same model. Each pays for its own model. 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import time
@@ -22,6 +21,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
@@ -185,14 +185,8 @@ def measure(seed: int) -> dict[str, float]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.ekf_speed", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
+    parser = command_line("ekf_speed", __doc__)
     arguments = parser.parse_args()
-    if arguments.seed < 0:
-        parser.error("--seed must be at least 0")
     console = Console(stderr=arguments.json)
     with console.status("three filters take turns ..."):
         figures = measure(arguments.seed)

@@ -18,7 +18,6 @@ nothing solid between. `overlap` is the share of it which nodes of more than one
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from collections.abc import Callable
@@ -32,6 +31,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.explore.area import Look, MappedFloor, mapped_floor
 from benchmarks.explore.start import office
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
@@ -207,16 +207,12 @@ def _short(value: float | None, digits: int) -> str:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line("explore", __doc__, whole=True)
     parser.add_argument("--robots", type=int, nargs="+", default=[1, 2, 3], help="how many; 1 to 16")
     parser.add_argument("--minutes", type=float, default=5.0, help="simulated (default: 5)")
     parser.add_argument("--rooms", type=int, default=6, help="of the office, 3 to 12 (default: 6)")
     parser.add_argument("--spread", action="store_true", help="each robot begins in a room of its own")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/explore"), help="folder for the picture")
-    parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     if arguments.minutes <= 0.0 or min(arguments.robots) < 1:
         parser.error("--minutes and --robots must be positive")

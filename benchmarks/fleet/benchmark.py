@@ -42,6 +42,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.fleet import floor_process
 from benchmarks.fleet.agents_process import FLEET, INTERVAL, PATIENCE, Orders
 from benchmarks.fleet.disturbance import KINDS, THAW_BEFORE, Freeze
@@ -270,19 +271,14 @@ def measure_floor(folder: Path, questions: int = 300) -> Figures:
 
 def main() -> None:
     """Measure and print."""
-    about = (__doc__ or "").splitlines()[0]
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.fleet", description=about)
+    parser = command_line("fleet", __doc__)
     parser.add_argument("--agents", type=int, nargs="+", default=[10, 50, 200, 1000], help="fleets")
     parser.add_argument("--seconds", type=float, default=20.0, help="of mapping")
     parser.add_argument("--burst", type=int, default=1000, help="changes within a second, behind that")
     parser.add_argument("--disturb", action="store_true", help="with a slow, a frozen and a flooding agent")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args()
-    if min(options.agents) < 1 or options.seconds < INTERVAL or options.burst < 0 or options.seed < 0:
-        parser.error(
-            f"--agents must be positive, --seconds at least {INTERVAL:g}, --burst and --seed not negative"
-        )
+    if min(options.agents) < 1 or options.seconds < INTERVAL or options.burst < 0:
+        parser.error(f"--agents must be positive, --seconds at least {INTERVAL:g}, --burst not negative")
     rows: dict[str, Figures] = {}
     report: dict[str, Any] = {
         "seed": options.seed, "disturbed": options.disturb, "cores": os.cpu_count(),

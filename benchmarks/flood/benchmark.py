@@ -16,7 +16,6 @@ memory; `nodes` in the merged map, of which the honest robots have 80.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import multiprocessing
@@ -32,6 +31,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.flood.fleet import FLEET, NODES, PATIENCE, HonestRobot, Waits
 from benchmarks.flood.flooder import KINDS, flood
 from mapweave.scenarios.children import Children, free_port
@@ -140,15 +140,12 @@ def measure(seconds: float, rate: float, seed: int, folder: Path) -> dict[str, d
 
 def main() -> None:
     """Measure and print."""
-    about = (__doc__ or "").splitlines()[0]
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.flood", description=about)
+    parser = command_line("flood", __doc__)
     parser.add_argument("--seconds", type=float, default=15.0, help="of each part")
     parser.add_argument("--rate", type=float, default=500.0, help="changes or beacons a second")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args()
-    if not (0.0 < options.seconds < math.inf and 0.0 < options.rate < math.inf) or options.seed < 0:
-        parser.error("--seconds and --rate must be positive, --seed not negative")
+    if not (0.0 < options.seconds < math.inf and 0.0 < options.rate < math.inf):
+        parser.error("--seconds and --rate must be positive")
     report = {"seed": options.seed, "cores": os.cpu_count(), "load_before": round(os.getloadavg()[0], 1)}
     with tempfile.TemporaryDirectory() as folder:
         parts = measure(options.seconds, options.rate, options.seed, Path(folder))

@@ -12,7 +12,7 @@ import numpy as np
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
-from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
@@ -21,6 +21,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.messages import encode_view
 from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
+from synthetic.maps import changes_of
 from synthetic.world import room, take_map, take_view
 
 FLEET = "flood"
@@ -56,7 +57,7 @@ class Room:
             for _ in range(NODES)
         ]
         self.nodes, edges = take_map(self._world, MapId(robot, 1), self._stops, rng)
-        self.changes: list[ChangeBody] = [*map(NodePut, self.nodes), *map(EdgePut, edges)]
+        self.changes = changes_of(self.nodes, edges)
 
     def view(self, rng: np.random.Generator) -> tuple[View, NodeId]:
         """A view a little beside a node."""

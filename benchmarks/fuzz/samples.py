@@ -16,7 +16,7 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.mcap_writer import McapWriter
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.ros_messages import making
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.change import Change, EdgePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -45,6 +45,7 @@ from mapweave.wire.messages import encode, encode_view
 from mapweave.wire.ros2.attachment import Attachment, encode_attachment
 from mapweave.wire.ros2.messages import encode as encode_ros2
 from mapweave.wire.ros2.messages import make
+from synthetic.maps import changes_of
 from synthetic.world import CAMERA, room, take_map, take_view
 
 
@@ -59,11 +60,11 @@ class Samples:
         self.map_id = MapId("r0", 1)
         nodes, edges = take_map(world, self.map_id, stops, rng)
         others, other_edges = take_map(world, MapId("r1", 1), stops, rng)
-        self.bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+        self.bodies = changes_of(nodes, edges)
         self.changes = [Change(self.map_id, k + 1, 10**18 + k, body) for k, body in enumerate(self.bodies)]
-        more: list[ChangeBody] = [*map(NodePut, others), *map(EdgePut, other_edges)]
         merged = merge_parts(
-            {self.map_id: HybridMap(self.bodies), MapId("r1", 1): HybridMap(more)}, ManualConstraints()
+            {self.map_id: HybridMap(self.bodies), MapId("r1", 1): HybridMap(changes_of(others, other_edges))},
+            ManualConstraints(),
         )
         self.map_files = [
             pack_map_file(MapFile("agent", "r0.1", tuple(self.bodies))), pack_map_file(map_file_of(merged))

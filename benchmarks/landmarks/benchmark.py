@@ -36,6 +36,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.landmarks.curve import LABELS, draw, recall_curve
 from benchmarks.landmarks.pairs import Pair, folder_pairs, known_pairs
 from benchmarks.landmarks.rivals import MOST, Packed, features, keep_all, matched, pack
@@ -188,19 +189,13 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.landmarks",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_line("landmarks", __doc__, "changes pairs and places", whole=True)
     parser.add_argument("--images", type=Path, metavar="DIR", help="photographs of one scene")
     parser.add_argument("--pairs", type=int, default=60, help="of views, at most (default 60)")
     parser.add_argument("--places", type=int, default=40, help="simulated, for the curve (default 40)")
-    parser.add_argument("--seed", type=int, default=0, help="not negative; changes pairs and places")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the picture of the curve")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if arguments.pairs < 2 or arguments.places < 0 or arguments.seed < 0:
+    if arguments.pairs < 2 or arguments.places < 0:
         parser.error("at least 2 pairs, 0 places and seed 0 are needed")
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json)

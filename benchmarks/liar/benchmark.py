@@ -14,7 +14,6 @@ cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
 
 from __future__ import annotations
 
-import argparse
 import json
 import logging
 import resource
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
+from benchmarks.command_line import command_line
 from benchmarks.liar.lies import UNDECIDABLE, WAYS, Lie, Map, Setting, bodies, honest, messages
 from benchmarks.liar.server import Answer, Seen, Served, difference
 from benchmarks.rules.switches import Switch, switched_off
@@ -201,15 +201,13 @@ def totals(outcomes: Mapping[str, Outcome]) -> dict[str, object]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.liar", description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0, help="of the fleet (default 0)")
+    parser = command_line("liar", __doc__, "of the fleet")
     parser.add_argument("--queries", type=int, default=12, help="of lost robots (default 12)")
     parser.add_argument("--ways", nargs="+", default=list(EVERY), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--without", choices=list(RULES), metavar="RULE", help="switch a rule off: see RULES")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if arguments.seed < 0 or arguments.queries < 1:
-        parser.error("--seed must be at least 0, --queries at least 1")
+    if arguments.queries < 1:
+        parser.error("--queries must be at least 1")
     logging.disable(logging.WARNING)
     console = Console(stderr=arguments.json)
     outcomes: dict[str, Outcome] = {}

@@ -21,7 +21,6 @@ Memory is that of the process, less what it was before the first drive.
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import gc
 import json
@@ -40,8 +39,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.life.house import House
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
@@ -57,6 +56,7 @@ from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.codec import encode_change
+from synthetic.maps import changes_of, numbered
 from synthetic.world import take_map, take_view
 
 CLOSE, CLOSE_TURN = 0.25, math.radians(8.0)
@@ -99,17 +99,15 @@ class Drive:
 
 def main() -> None:
     """Drive, count, ask, print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.life", description=__doc__.splitlines()[0])
+    parser = command_line("life", __doc__, "of rooms, stops and noise")
     parser.add_argument("--drives", type=int, default=10, help="through the same rooms (default 10)")
-    parser.add_argument("--seed", type=int, default=0, help="of rooms, stops and noise (default 0)")
     parser.add_argument("--stops", type=int, default=5, help="in a room on every drive (default 5)")
     parser.add_argument("--moved", type=float, default=0.0, help="share of landmarks moved after each drive")
     parser.add_argument("--queries", type=int, default=200, help="views that are asked about (default 200)")
     parser.add_argument("--keep-days", type=float, default=14.0, help="superseded nodes are kept")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     a = parser.parse_args()
-    if a.drives < 1 or a.stops < 1 or a.queries < 1 or a.seed < 0 or not 0.0 <= a.moved <= 1.0:
-        print("life: at least one drive, stop and query; seed 0 or more; a share of 0 to 1", file=sys.stderr)
+    if a.drives < 1 or a.stops < 1 or a.queries < 1 or not 0.0 <= a.moved <= 1.0:
+        print("life: at least one drive, stop and query; a share of 0 to 1", file=sys.stderr)
         raise SystemExit(2)
     console = Console(stderr=a.json)
     figures, drives = run(a.drives, a.seed, a.stops, a.moved, a.queries, a.keep_days, console)
@@ -147,9 +145,8 @@ def run(
         now_ns = round(epoch * APART * DAY_NS)
         nodes = [replace(node, stamp_ns=now_ns + node.stamp_ns) for node in nodes]
         truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
-        bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
         map_id = MapId("r0", epoch)
-        changes = [Change(map_id, number, now_ns, body) for number, body in enumerate(bodies, start=1)]
+        changes = numbered(map_id, changes_of(nodes, edges), stamp_ns=now_ns)
         entries = [Entry.read(map_id, one.sequence, encode_change(one)) for one in changes]
         began = time.process_time()
         for change in changes:

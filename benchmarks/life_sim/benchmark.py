@@ -14,7 +14,6 @@ degrees) in the end, with fading and without. Truth is for scoring alone. Takes 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import sys
@@ -26,6 +25,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.images.surface_points import Surfaces
 from benchmarks.life.benchmark import answered
 from benchmarks.relocalize.pictures import Photographer, Wish
@@ -211,18 +211,14 @@ def _alike(points: Array, a: Array, b: Array) -> NDArray[np.bool_]:
 
 def main() -> None:
     """Drive, move, drive, ask, print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.life_sim", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of office, stops and noise (default 0)")
+    parser = command_line("life_sim", __doc__, "of office, stops and noise")
     parser.add_argument("--drives", type=int, default=4, help="after the furniture was moved (default 4)")
     parser.add_argument("--rooms", type=int, default=2, help="of the office (default 2)")
     parser.add_argument("--stops", type=int, default=10, help="on every drive (default 10)")
     parser.add_argument("--queries", type=int, default=40, help="views of either kind (default 40)")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     a = parser.parse_args()
-    if min(a.drives, a.rooms, a.stops, a.queries) < 1 or a.seed < 0:
-        print("life_sim: at least one drive, room, stop and query; seed 0 or more", file=sys.stderr)
+    if min(a.drives, a.rooms, a.stops, a.queries) < 1:
+        print("life_sim: at least one drive, room, stop and query", file=sys.stderr)
         raise SystemExit(2)
     console = Console(stderr=a.json)
     fleet = Fleet(a.seed, a.rooms, a.stops)

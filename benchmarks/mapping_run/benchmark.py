@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.mapping_run.figures import draw
 from benchmarks.mapping_run.scene import drive
 from benchmarks.mapping_run.score import Figures, figures
@@ -62,17 +63,13 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.mapping_run", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of world, start, wheels and camera (default 0)")
+    parser = command_line("mapping_run", __doc__, "of world, start, wheels and camera")
     parser.add_argument("--out", type=Path, default=Path("out/mapping_run"), help="folder of the pictures")
     parser.add_argument("--world", choices=("arena", "office"), default="arena")
     parser.add_argument("--steps", type=int, default=500, help="ticks of 0.1 s a run (default 500)")
     parser.add_argument(
         "--runs", nargs="+", choices=tuple(RUNS), default=tuple(RUNS), help="which (default all)"
     )
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     return parser.parse_args()
 
 

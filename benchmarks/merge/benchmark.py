@@ -44,6 +44,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.merge.robots import kept_links
 from benchmarks.merge.scale import scale
 from mapweave.formats.g2o import G2oGraph, read_g2o
@@ -70,8 +71,8 @@ def main() -> None:
     arguments = _arguments()
     console = Console(stderr=arguments.json)
     try:
-        if arguments.runs < 1 or arguments.seed < 0 or arguments.split < 2:
-            raise InvalidValue("--runs is at least 1, --seed at least 0, --split at least 2")
+        if arguments.runs < 1 or arguments.split < 2:
+            raise InvalidValue("--runs is at least 1, --split at least 2")
         if arguments.scale is not None and (arguments.g2o or arguments.robots):
             raise InvalidValue("--scale runs by itself: leave out --g2o and --robots")
         if arguments.scale is not None:
@@ -201,8 +202,7 @@ def _table(figure: str, found: dict[str, Figures], of_what: str = "") -> Table:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.merge", description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0, help="of the fleets (default 0)")
+    parser = command_line("merge", __doc__, "of the fleets")
     parser.add_argument("--runs", type=int, default=5, help="fleets of each share (default 5)")
     parser.add_argument(
         "--g2o", type=Path, nargs="*", default=[], help="planar pose graphs to split and merge"
@@ -215,5 +215,4 @@ def _arguments() -> argparse.Namespace:
         nargs="*",
         help="nodes of fleets at scale, in hundreds (300 1000); by itself",
     )
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     return parser.parse_args()

@@ -46,6 +46,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.merge_sim.run import Run
 
 SCENARIOS: dict[str, tuple[str, ...]] = {
@@ -241,20 +242,14 @@ def _share(parts: Sequence[int], wholes: Sequence[int]) -> float | None:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.merge_sim",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_line("merge_sim", __doc__, "run k has the seed 1000 * SEED + k", whole=True)
     parser.add_argument("--runs", type=int, default=10, help="of each scenario (default 10)")
-    parser.add_argument("--seed", type=int, default=0, help="run k has the seed 1000 * SEED + k (default 0)")
     parser.add_argument("--workers", type=int, default=2, help="runs at a time, some 500 MB each (default 2)")
     parser.add_argument(
         "--scenarios", nargs="+", choices=list(SCENARIOS), default=list(SCENARIOS), help="(default: all)"
     )
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if not 1 <= arguments.runs <= SEEDS_APART or arguments.seed < 0 or arguments.workers < 1:
-        parser.error(f"--runs is 1 to {SEEDS_APART}, --seed at least 0, --workers at least 1")
+    if not 1 <= arguments.runs <= SEEDS_APART or arguments.workers < 1:
+        parser.error(f"--runs is 1 to {SEEDS_APART}, --workers at least 1")
     arguments.scenarios = list(dict.fromkeys(arguments.scenarios))
     return arguments

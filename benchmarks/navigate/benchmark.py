@@ -31,6 +31,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.navigate.drives import Outcome, drive
 from benchmarks.navigate.floor import Floor
 from benchmarks.navigate.map import Figures, map_figures
@@ -93,25 +94,19 @@ def summary(outcomes: Sequence[Outcome]) -> Figures:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.navigate", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of office, robot, starts and goals (default 0)")
+    parser = command_line("navigate", __doc__, "of office, robot, starts and goals")
     parser.add_argument("--out", type=Path, default=Path("out/navigate"), help="folder of map and pictures")
     parser.add_argument("--runs", type=int, default=20, help="drives (default 20)")
     parser.add_argument("--rooms", type=int, default=2, help="of the office (default 2)")
     parser.add_argument(
         "--map-time", type=float, default=420.0, help="exploration ends after this, simulated s (default 420)"
     )
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     return parser.parse_args()
 
 
 def _run(arguments: argparse.Namespace, console: Console) -> tuple[list[Outcome], Mapped, FloorPlan, Figures]:
     if arguments.runs < 1:
         raise InvalidValue(f"--runs {arguments.runs}: at least one drive")
-    if arguments.seed < 0:
-        raise InvalidValue(f"--seed {arguments.seed}: a whole number, 0 or more")
     folder = arguments.out / f"map-{arguments.seed}-{arguments.rooms}-{arguments.map_time:g}"
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[doing]}"))
     with Progress(*columns, TimeElapsedColumn(), console=console) as progress:

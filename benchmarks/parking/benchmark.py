@@ -16,7 +16,6 @@ With --out the paper's Figures 12, 13 and 14 are drawn, of the parking with the 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -28,6 +27,7 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.parking.figures import draw_figures
 from benchmarks.parking.run import Outcome, park
 from benchmarks.parking.scene import Scene
@@ -142,16 +142,14 @@ def main() -> None:
     Raises:
         SystemExit: an option that cannot be.
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.parking", description=__doc__.splitlines()[0])
+    parser = command_line("parking", __doc__)
     parser.add_argument("--starts", type=int, default=20, help="starts with a path (default 20)")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--goals", type=int, default=5, help="goals, each in another arena (default 5)")
     parser.add_argument("--one-view", action="store_true", help="map the goal's view alone")
     parser.add_argument("--out", type=Path, help="folder for the pictures; it is made")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if arguments.starts < 1 or arguments.goals < 1 or arguments.seed < 0:
-        parser.error("--starts and --goals must be at least 1, --seed at least 0")
+    if arguments.starts < 1 or arguments.goals < 1:
+        parser.error("--starts and --goals must be at least 1")
     if arguments.out is not None:
         try:
             arguments.out.mkdir(parents=True, exist_ok=True)

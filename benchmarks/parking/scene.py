@@ -22,13 +22,13 @@ from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, Node
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.routes import Router
 from mapweave.sim.floorplan import FloorPlan
 from mapweave.sim.placement import is_clear
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
+from synthetic.maps import merger_of
 
 ROBOT = "r0"
 NEAREST_VIEW, FARTHEST_VIEW = 1.5, 5.0
@@ -82,9 +82,7 @@ class Scene:
             self.own_map, self.goal = self._map(simulation, one_view)
             self.mapping_s = simulation.stamp_ns / 1e9
             self.world_from_goal = simulation.truth_at(ROBOT, self.goal.stamp_ns)
-        merger = Merger()
-        for change in self.own_map.contents():
-            merger.apply(self.goal.id.map, change)
+        merger = merger_of({self.goal.id.map: self.own_map.contents()})
         merged = merger.merged()
         self._relocalizer = Relocalizer(merger.places, merger.node, merged)
         self._router = Router(merged)

@@ -20,7 +20,6 @@ time for that is not counted, neither in an answer's nor in the index's.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import ctypes
 import gc
@@ -41,6 +40,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.peer import WordIndex
 from benchmarks.relocalize.queries import KINDS
@@ -143,22 +143,16 @@ def table(sizes: dict[str, dict[str, Any]]) -> Table:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.relocalize",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_line("relocalize", __doc__, whole=True)
     parser.add_argument(
         "--nodes", type=int, nargs="+", default=[1000, 10_000], help="sizes of the fleet's map"
     )
     parser.add_argument("--queries", type=int, default=200, help="of each kind (default 200)")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--ceilings", nargs="*", default=["near"], choices=list(KINDS), help="kinds of views")
     parser.add_argument("--no-peer", action="store_true", help="without the bag of words")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if min(arguments.nodes) < 100 or arguments.queries < 4 or arguments.seed < 0:
-        parser.error("at least 100 nodes, 4 queries and a seed that is not negative are needed")
+    if min(arguments.nodes) < 100 or arguments.queries < 4:
+        parser.error("at least 100 nodes and 4 queries are needed")
     console = Console(stderr=arguments.json)
     sizes, real = sorted(set(arguments.nodes)), min(REAL, min(arguments.nodes))
     with Progress(console=console) as bar:

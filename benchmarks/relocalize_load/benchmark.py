@@ -32,19 +32,18 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from benchmarks.command_line import command_line
+from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.hybridmap.query import RelocalizeAnswer, RouteRequest, View
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode, encode_view
 from mapweave.wire.zenoh_bus import ZenohBus
+from synthetic.maps import changes_of, write_store
 from synthetic.world import World, room, take_map, take_view
 
 FLEET = "load"
@@ -71,8 +70,7 @@ class Building:
     @classmethod
     def make(cls, nodes: int, store: Path, rng: np.random.Generator) -> Building:
         """Map so many nodes and write them to a store."""
-        building = cls({}, {})
-        database = SqliteStore(store)
+        building, logs = cls({}, {}), dict[MapId, list[ChangeBody]]()
         for number in range(math.ceil(nodes / ROOM_NODES)):
             x, map_id = 20.0 * number, MapId(f"r{number}", 1)
             world = room(x, 0, 5, 4, 700, rng)
@@ -83,13 +81,8 @@ class Building:
             made, edges = take_map(world, map_id, stops, rng)
             building.rooms[map_id] = world
             building.truth.update(zip((node.id for node in made), stops, strict=True))
-            bodies: list[ChangeBody] = [*map(NodePut, made), *map(EdgePut, edges)]
-            entries = [
-                Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
-                for k, body in enumerate(bodies)
-            ]
-            database.apply(map_id, 1, entries, len(entries))
-        database.close()
+            logs[map_id] = changes_of(made, edges)
+        write_store(store, logs)
         return building
 
     def query(self, rng: np.random.Generator) -> tuple[View, MapId, Pose2]:
@@ -247,16 +240,13 @@ def figures(total: Tally, routes: list[float], took: float) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    about = (__doc__ or "").splitlines()[0]
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.relocalize_load", description=about)
+    parser = command_line("relocalize_load", __doc__)
     parser.add_argument("--robots", type=int, default=50, help="that ask at once")
     parser.add_argument("--seconds", type=float, default=10.0, help="of asking")
     parser.add_argument("--nodes", type=int, default=400, help="in the map")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args()
-    if options.robots < 1 or options.seconds <= 0.0 or options.nodes < 1 or options.seed < 0:
-        parser.error("--robots, --seconds and --nodes must be positive, --seed not negative")
+    if options.robots < 1 or options.seconds <= 0.0 or options.nodes < 1:
+        parser.error("--robots, --seconds and --nodes must be positive")
     options.nodes = ROOM_NODES * math.ceil(options.nodes / ROOM_NODES)
     console = Console(stderr=True)
     report: dict[str, object] = {

@@ -13,7 +13,6 @@ Filling takes about 3 ms of processor a node, and 4.5 kB of disk; with --store i
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -28,6 +27,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.relocalize.distractors import gather
 from benchmarks.relocalize.places import Place, mapped, mapped_sites
 from benchmarks.relocalize.queries import Query, known
@@ -124,16 +124,12 @@ def _peak_mb(pid: int) -> float:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.relocalize_start", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = command_line("relocalize_start", __doc__)
     parser.add_argument("--nodes", type=int, default=10_000, help="in the store (default 10000)")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--store", type=Path, help="folder for the store, which is kept there and used again")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if arguments.nodes < REAL or arguments.seed < 0:
-        parser.error(f"at least {REAL} nodes and a seed that is not negative are needed")
+    if arguments.nodes < REAL:
+        parser.error(f"at least {REAL} nodes are needed")
     console, seed = Console(stderr=arguments.json), arguments.seed
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="mapweave-start") as temporary, Progress(console=console) as bar:

@@ -17,7 +17,6 @@ that are answered with a place.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -29,6 +28,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from rich.console import Console
 from rich.progress import Progress
 
+from benchmarks.command_line import command_line
 from benchmarks.merge_sim.benchmark import SCENARIOS, SEEDS_APART
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.score import figures, wrong_by_kind
@@ -64,18 +64,16 @@ def places(seed: int, count: int, progress: Progress) -> dict[str, dict[str, Any
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.rules", description=__doc__.splitlines()[0])
+    parser = command_line("rules", __doc__)
     parser.add_argument("--fleets", type=int, default=0, metavar="N", help="of each share of false links")
     parser.add_argument("--twins", type=int, default=0, metavar="N", help="pairs of robots")
     parser.add_argument("--g2o", type=Path, nargs="*", default=[], metavar="FILE", help="planar pose graphs")
     parser.add_argument("--trials", nargs="+", default=[], choices=list(SCENARIOS), metavar="SCENARIO")
     parser.add_argument("--runs", type=int, default=1, help="of each scenario (default 1)")
     parser.add_argument("--places", type=int, default=0, metavar="N", help="real ones on the map")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if min(arguments.fleets, arguments.twins, arguments.places, arguments.seed) < 0 or arguments.runs < 1:
-        parser.error("--fleets, --twins, --places and --seed must be at least 0, --runs at least 1")
+    if min(arguments.fleets, arguments.twins, arguments.places) < 0 or arguments.runs < 1:
+        parser.error("--fleets, --twins and --places must be at least 0, --runs at least 1")
     console = Console(stderr=True)
     found: dict[str, Any] = {"seed": arguments.seed}
     try:

@@ -12,7 +12,6 @@ the same trials.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import time
@@ -25,6 +24,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.servo.planner import shortest_length
 from benchmarks.servo.rivals import CONTROLLERS
 from benchmarks.servo.world import LEAST_VISIBLE, ROBOT, PoseFilter, Task, Unicycle, draw_task
@@ -121,14 +121,12 @@ def summary(outcomes: list[Outcome]) -> dict[str, float]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.servo", description=__doc__.splitlines()[0])
+    parser = command_line("servo", __doc__)
     parser.add_argument("--trials", type=int, default=200, help="starts drawn (default 200)")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, help="processes; more than cores spoils tick_ms")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if min(arguments.trials, arguments.jobs) < 1 or arguments.seed < 0:
-        parser.error("--trials and --jobs must be at least 1, --seed at least 0")
+    if min(arguments.trials, arguments.jobs) < 1:
+        parser.error("--trials and --jobs must be at least 1")
     console = Console(stderr=arguments.json)
     with ProcessPoolExecutor(arguments.jobs) as pool:
         results = pool.map(

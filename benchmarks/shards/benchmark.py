@@ -34,6 +34,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.shards.askers import ASK_WITHIN, PATIENCE, Askers
 from benchmarks.shards.fleet import FLEET, BuildingFleet, MappingRobot
 from benchmarks.shards.ray_nodes import RayNodes, descendants
@@ -272,10 +273,7 @@ def table(rows: dict[str, dict[str, Any]]) -> Table:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.shards", description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    parser = command_line("shards", __doc__, whole=True)
     parser.add_argument("--shards", type=int, nargs="+", default=[1, 2, 4], metavar="N")
     parser.add_argument("--robots", type=int, default=12, help="that have mapped the building")
     parser.add_argument("--nodes", type=int, default=24, help="of each")
@@ -283,13 +281,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="of asking")
     parser.add_argument("--ray-nodes", type=int, default=3, help="of the cluster")
     parser.add_argument("--kills", nargs="*", choices=KILLS, default=list(KILLS))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     o = parser.parse_args()
     if min(*o.shards, o.robots - LATE, o.nodes, o.askers, o.ray_nodes) < 1 or o.seconds <= 0.0:
         parser.error(f"numbers must be positive, and there must be more than {LATE} robots")
-    if o.seed < 0:
-        parser.error("--seed must not be negative")
     fleet = BuildingFleet(o.robots, o.nodes, o.seed)
     rows: dict[str, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as name, Progress(console=Console(stderr=True)) as progress:

@@ -10,18 +10,16 @@ import numpy as np
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
-from mapweave.hybridmap.change import Change, ChangeBody, NodePut
+from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import encode_view
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.building import Building
+from synthetic.maps import write_store
 
 FLEET = "shards"
 WRONG_M = 0.5
@@ -55,16 +53,8 @@ class BuildingFleet:
     def write(self, store: Path, robots: Sequence[int]) -> None:
         """Write the logs of some robots to a store."""
         store.parent.mkdir(parents=True, exist_ok=True)
-        database = SqliteStore(store)
-        for robot in robots:
-            log = self.logs[robot]
-            map_id = log[0][0]
-            entries = [
-                Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
-                for k, (_, body) in enumerate(log)
-            ]
-            database.apply(map_id, robot + 1, entries, len(entries))
-        database.close()
+        logs = [self.logs[robot] for robot in robots]
+        write_store(store, {log[0][0]: [body for _, body in log] for log in logs})
 
     def questions(self, count: int) -> list[tuple[bytes, Pose2]]:
         """Views a little beside nodes, as messages, and where each was taken."""

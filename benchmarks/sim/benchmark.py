@@ -11,7 +11,6 @@ same views, without any texture: the floor that a simulator on PyBullet pays at 
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
@@ -26,6 +25,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.sim.bare_view import BareView
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.fleet_client import FleetClient
@@ -142,17 +142,13 @@ def renderers(seed: int) -> dict[str, float]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line("sim", __doc__, whole=True)
     parser.add_argument("--robots", type=int, nargs="+", default=[1, 2, 3, 4, 8], help="how many; 1 to 16")
     parser.add_argument("--seconds", type=float, default=40.0, help="simulated, for each fleet (default: 40)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     robots = arguments.robots
-    if not 1 <= min(robots) <= max(robots) <= 16 or not arguments.seconds > 0 or arguments.seed < 0:
-        parser.error("--robots are 1 to 16, --seconds more than 0, --seed at least 0")
+    if not 1 <= min(robots) <= max(robots) <= 16 or not arguments.seconds > 0:
+        parser.error("--robots are 1 to 16, --seconds more than 0")
     cv2.setNumThreads(1)
     result = measure(arguments.robots, arguments.seconds, arguments.seed, quiet=arguments.json)
     if arguments.json:

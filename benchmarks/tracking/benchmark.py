@@ -12,7 +12,6 @@ and are not tracked at the end; `ms` a frame, median, with `points` tracked on a
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -30,6 +29,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.tracking.scenes import Drive, drives
 from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.tracker import BORDER_PX, LEVELS, Tracker
@@ -188,17 +188,11 @@ def table(scene: str, result: dict[str, Any]) -> Table:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.tracking",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_line("tracking", __doc__, "changes scenes and ways", whole=True)
     parser.add_argument("--drives", type=int, default=8, help="of each kind of scene (default 8)")
     parser.add_argument("--frames", type=int, default=160, help="of a drive (default 160)")
-    parser.add_argument("--seed", type=int, default=0, help="not negative; changes scenes and ways")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if arguments.drives < 1 or arguments.frames < LEAST_FRAMES or arguments.seed < 0:
+    if arguments.drives < 1 or arguments.frames < LEAST_FRAMES:
         print(f"tracking: at least 1 drive, {LEAST_FRAMES} frames and seed 0 are needed", file=sys.stderr)
         raise SystemExit(1)
     cv2.setNumThreads(1)

@@ -12,7 +12,6 @@ promises of the way.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -27,6 +26,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.trust.building import Building, mapped_office
 from benchmarks.trust.lying_server import LIES, LyingServer
 from mapweave.agent.navigation.answer_trial import LONGEST_ROUTE, MORE_WAY, ROUTES
@@ -204,19 +204,17 @@ def summary(outcomes: list[Outcome]) -> dict[str, object]:
 
 def main() -> None:
     """Lie, drive and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.trust", description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0, help="of office, starts, goals and lies (default 0)")
+    parser = command_line("trust", __doc__, "of office, starts, goals and lies")
     parser.add_argument("--rooms", type=int, default=1, help="of the office (default 1)")
     parser.add_argument("--lies", nargs="*", choices=list(LIES), default=list(LIES), help="default all")
     parser.add_argument(
         "--lying", type=float, default=330.0, help="lies last so long, simulated s (default 330)"
     )
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json, width=180)
     try:
-        if arguments.seed < 0 or not arguments.lying > 0.0:
+        if not arguments.lying > 0.0:
             raise InvalidValue("a seed of 0 or more, and lies that last longer than 0 s")
         building = mapped_office(arguments.seed, arguments.rooms)
         outcomes = []

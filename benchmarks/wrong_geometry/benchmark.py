@@ -10,7 +10,6 @@ that look the same: answers there must not become more certain.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections import Counter
 from itertools import product
@@ -19,6 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.rules.switches import Switch, switched_off
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from synthetic.wrong_geometry import ODD, SCENES, AnswerOutcome, Fault, draw_fleet, lost_views, outcome
@@ -50,19 +50,15 @@ def measured(
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.wrong_geometry", description=__doc__.splitlines()[0]
-    )
+    parser = command_line("wrong_geometry", __doc__, "of the first fleet")
     faults = [str(one) for one in Fault if one is not Fault.NONE]
-    parser.add_argument("--seed", type=int, default=0, help="of the first fleet (default 0)")
     parser.add_argument("--runs", type=int, default=3, help="fleets of each kind and scene (default 3)")
     parser.add_argument("--kinds", nargs="+", default=faults, choices=faults)
     parser.add_argument("--scenes", nargs="+", default=["room", "house"], choices=list(SCENES))
     parser.add_argument("--queries", type=int, default=24, help="of lost robots, each fleet (default 24)")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if min(arguments.runs, arguments.queries) < 1 or arguments.seed < 0:
-        parser.error("--runs and --queries must be at least 1, --seed at least 0")
+    if min(arguments.runs, arguments.queries) < 1:
+        parser.error("--runs and --queries must be at least 1")
     console = Console(stderr=arguments.json)
     with Progress(console=console) as progress:
         found = measured(

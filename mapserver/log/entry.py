@@ -126,8 +126,3 @@ class Traffic:
     def payload_bytes(self) -> int:
         """In all of these."""
         return self.node_bytes + self.edge_bytes
-
-    @property
-    def bytes_per_node(self) -> float:
-        """Mean size of a message that puts a node; NaN without any."""
-        return self.node_bytes / self.node_puts if self.node_puts else float("nan")

@@ -105,7 +105,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.mission_order import MissionKind
     from mapweave.hybridmap.node import check_name
-    from mapweave.processes.agent import AgentOptions, run_agent
+    from mapweave.processes.agent import AgentOptions
+    from mapweave.processes.agent_process import run_agent
     from mapweave.terminal import log_with_time
     from mapweave.wire.keys import check_epoch
 

@@ -11,13 +11,14 @@ from mapweave.commands.network import key_holder, network_of, reach, settings_of
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.hybridmap.query import ExplainRequest, ResolveAnswer, ResolveRequest
 from mapweave.wire.bus import Reply
 from mapweave.wire.keys import Keys
-from mapweave.wire.messages import decode, encode
+from mapweave.wire.messages import decode, decode_explanation, encode
 from mapweave.wire.patience import ask_patiently
 
 if TYPE_CHECKING:
+    from mapweave.hybridmap.explanation import Explanation
     from mapweave.mapserver.routes import Router
 
 
@@ -60,6 +61,27 @@ def resolved(arguments: argparse.Namespace, words: list[str], router: Router | N
             print(f"mapweave: {word}: {one.note}", file=sys.stderr)
     nodes = {word: str(one.node) for word, one in zip(asked, answer.found, strict=True)}
     return [nodes.get(word, word) for word in words]
+
+
+def explanation_of(
+    arguments: argparse.Namespace, request: ExplainRequest, router: Router | None = None
+) -> Explanation:
+    """The explanation that is asked for.
+
+    Args:
+        arguments: of the command line; with `map`, of this file, else of what a running server has.
+        request: what is asked.
+        router: of the map of `map`, if it is there already.
+
+    Raises:
+        MapweaveError: what it is about is not there, or no server answers.
+    """
+    if arguments.map is None:
+        return decode_explanation(ask(arguments, Keys.any_explain, encode(request))[0].payload, request)
+    from mapweave.commands.map_input import router_of
+    from mapweave.mapserver.explanations import explained
+
+    return explained(request, router or router_of(arguments), settings_of(arguments).merge.consistency)
 
 
 def _is_end(word: str) -> bool:

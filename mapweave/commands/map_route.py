@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
     if arguments.via:
         return _run_via(arguments, router, nodes[: len(stops)], blocked)
-    explanation = explained_route(arguments, router, start, goal, blocked)
+    explanation = _explained(arguments, router, start, goal, blocked)
     values, lines = json_values(explanation), route_words(explanation)
     if arguments.draw is not None and explanation.found:
         draw_route(arguments, None if router is None else router.merged, explanation)
@@ -89,7 +89,7 @@ def _run_via(
 
     if arguments.draw is not None:
         raise InvalidValue("--draw and --via do not go together: draw the way from one place to the next")
-    legs = [explained_route(arguments, router, a, b, blocked) for a, b in pairwise(stops)]
+    legs = [_explained(arguments, router, a, b, blocked) for a, b in pairwise(stops)]
     found = all(leg.found for leg in legs)
     if arguments.json:
         print(json.dumps({"found": found, "legs": [json_values(leg) for leg in legs]}))
@@ -127,24 +127,17 @@ def draw_route(
     draw_map(MapPicture(title, poses, edges, drives=[drive]), arguments.draw)
 
 
-def explained_route(
+def _explained(
     arguments: argparse.Namespace,
     router: Router | None,
     start: NodeId,
     goal: NodeId,
     blocked: tuple[tuple[NodeId, NodeId], ...],
 ) -> RouteExplanation:
-    """A route through an opened map, or through what a server has."""
-    from mapweave.commands.map_ends import ask
+    from mapweave.commands.map_ends import explanation_of
     from mapweave.hybridmap.explanation import RouteExplanation
     from mapweave.hybridmap.query import ExplainRequest
-    from mapweave.wire.keys import Keys
-    from mapweave.wire.messages import decode, encode
 
-    if router is None:
-        request = ExplainRequest((start, goal), True, blocked)
-        replies = ask(arguments, Keys.any_explain, encode(request))
-        return decode(replies[0].payload, RouteExplanation)
-    from mapweave.mapserver.route_explaining import explain_route
-
-    return explain_route(router, start, goal, blocked)
+    explanation = explanation_of(arguments, ExplainRequest((start, goal), True, blocked), router)
+    assert isinstance(explanation, RouteExplanation), "a route was asked about"
+    return explanation

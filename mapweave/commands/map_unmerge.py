@@ -25,11 +25,12 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Set the constraint, and print its effect."""
-    from mapweave.commands.map_ends import ends_of, resolved
-    from mapweave.commands.map_explain import explained_maps
+    from mapweave.commands.map_ends import ends_of, explanation_of, resolved
     from mapweave.hybridmap.constraint_subject import Apart
     from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.explanation import FleetExplanation
     from mapweave.hybridmap.node import MapId
+    from mapweave.hybridmap.query import ExplainRequest
 
     ends = ends_of(resolved(arguments, arguments.ends))
     first, second = (MapId(end[0], end[1]) for end in ends)
@@ -37,6 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidValue(f"{ends[0]} twice: give two different nodes or two different maps")
     constrain(arguments, Apart(ends))
     if first != second:
-        for explanation in explained_maps(arguments, (first, second)).maps:
+        found = explanation_of(arguments, ExplainRequest((first, second)))
+        assert isinstance(found, FleetExplanation), "maps were asked about"
+        for explanation in found.maps:
             print(explanation.reason)
     return 0

@@ -80,7 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.drivers.replay import Replay
     from mapweave.agent.recordings.recording import NoOdometry
     from mapweave.hybridmap.mission_order import MissionKind
-    from mapweave.processes.agent import AgentOptions, run_agent
+    from mapweave.processes.agent import AgentOptions
+    from mapweave.processes.agent_process import run_agent
 
     try:
         robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))

@@ -1,16 +1,12 @@
-"""One robot as a process: driver, pipeline, disk and link put together."""
+"""One agent: pipeline, disk and link to the fleet put together."""
 
 from __future__ import annotations
 
-import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import cv2
 
 from mapweave.agent.calibration.correction import declaring, geometry_of
 from mapweave.agent.calibration.online import OnlineCalibration
@@ -32,32 +28,23 @@ from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.agent.teleoperation import Teleoperation
-from mapweave.extras import need
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path
-from mapweave.processes.agent_progress import AgentProgress
 from mapweave.processes.portal_command import PortalCommand
-from mapweave.processes.ros2_publisher import Ros2Publisher
 from mapweave.processes.server_watch import ServerWatch
-from mapweave.processes.service_manager import ServiceManager
 from mapweave.storage.map_file import MapFile, write_map_file
-from mapweave.terminal import EventLog, plain_or_terminal
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 from mapweave.wire.ros2.settings import Ros2Link
 from mapweave.wire.traffic_meter import TrafficMeter
-from mapweave.wire.zenoh_bus import ZenohBus
 
 if TYPE_CHECKING:
-    from mapweave.processes.rerun_log import RerunLog
+    pass
 
 FIRST_PATIENCE = 3.0
 """How long a robot that remembers no map asks the server for the number of its next one, s."""
-
-SILENCE = 2.0
-"""s; a longer wait for the robot is reported."""
 
 
 @dataclass(frozen=True)
@@ -344,97 +331,3 @@ class Agent:
         self._leave()
         self.missions.save()
         self.journal.close()
-
-
-def run_agent(
-    robot: Robot,
-    bus: ZenohBus,
-    keys: Keys,
-    settings: AgentSettings,
-    options: AgentOptions,
-    stop: threading.Event,
-) -> None:
-    """Run a robot until its driver ends or `stop` is set, then write its map file.
-
-    Raises:
-        MapweaveError: the driver cannot be read, or the disk cannot be written; one line gives the reason.
-    """
-    # One core a robot: OpenCV's own threads would only fight over it.
-    cv2.setNumThreads(1)
-    console = plain_or_terminal()
-    say = EventLog(console)
-    show, manager = AgentProgress(console, options.name, options.total), ServiceManager()
-    describe = partial(_describe, robot, say, options.name)
-    publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
-    rerun = None if options.rerun is None else rerun_log(options.rerun, options.name)
-
-    def stepped(observation: Observation, step: Step) -> None:
-        manager.alive()
-        show(observation, step)
-        if publisher is not None:
-            publisher.step(observation, bool(step.changes), agent.pipeline, agent.merged_poses)
-        if rerun is not None:
-            rerun.step(observation, step, agent.pipeline)
-
-    with contextlib.ExitStack() as closing:
-        if publisher is not None:
-            closing.callback(publisher.close)
-        if rerun is not None:
-            closing.callback(_end_log, rerun, say, options.name)
-        agent = Agent(describe, bus, keys, settings, options, stepped, say)
-        manager.ready()
-        closing.enter_context(show)
-        try:
-            agent.run(robot, stop)
-        finally:
-            robot.close()
-            path = agent.write_map()
-            nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
-            say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
-            agent.replicator.flush(10.0)
-            _hand_over(say, agent.replicator, bus, options)
-            agent.close()
-
-
-def rerun_log(target: str, robot: str) -> RerunLog:
-    """A log for the Rerun viewer; see RerunLog.
-
-    Raises:
-        MissingExtra: rerun-sdk is not installed.
-        SettingsError: the target cannot be one.
-    """
-    need("rerun")
-    # It takes a second to import, and is an extra: so it is imported here.
-    from mapweave.processes.rerun_log import RerunLog
-
-    return RerunLog(target, robot)
-
-
-def _end_log(rerun: RerunLog, say: Callable[[str], None], name: str) -> None:
-    if missing := rerun.close():
-        say(f"{name}: not in the Rerun log: {missing}")
-
-
-def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> RobotDescription:
-    """Description of the robot; a long wait for it is reported."""
-    patience = threading.Timer(SILENCE, print_line, [f"{name}: waits for its robot"])
-    patience.daemon = True
-    patience.start()
-    try:
-        return robot.describe()
-    finally:
-        patience.cancel()
-
-
-def _hand_over(
-    say: Callable[[str], None], replicator: Replicator, bus: ZenohBus, options: AgentOptions
-) -> None:
-    if options.patience <= 0:
-        line = "offline: the map stays in the journal and is sent when a server can be reached"
-    elif not bus.wait_connected(min(2.0, options.patience)):
-        line = "no server in reach: the map stays in the journal and is sent when one can be reached"
-    elif replicator.wait_acknowledged(options.patience):
-        line = f"server {options.server} has it all"
-    else:
-        line = f"server {options.server} has not acknowledged everything: the rest stays in the journal"
-    say(f"{options.name}: {line}")

@@ -15,7 +15,8 @@ from mapweave.agent.synchronization import Lockstep
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
-from mapweave.processes.agent import Agent, AgentOptions, rerun_log
+from mapweave.processes.agent import Agent, AgentOptions
+from mapweave.processes.agent_process import rerun_log
 from mapweave.scenarios.actions import MISSION_KINDS
 from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
 from mapweave.settings import load_settings

@@ -12,13 +12,13 @@ from mapweave.agent.mission import Answer, MayIDrive, Question
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteLeg, Whereabouts
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
+from synthetic.maps import changes_of
 from synthetic.world import CAMERA, World, room, take_map, take_view
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
@@ -38,8 +38,9 @@ def home_world() -> World:
 
 def home_map(home: World) -> HybridMap:
     """Three nodes in a row, 1.2 m apart."""
-    nodes, edges = take_map(home, MapId("r0", 1), TOUR, np.random.default_rng(2), sigma_xy=0.002)
-    return HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    return HybridMap(
+        changes_of(*take_map(home, MapId("r0", 1), TOUR, np.random.default_rng(2), sigma_xy=0.002))
+    )
 
 
 class Eyes:

@@ -17,8 +17,6 @@ from mapweave.agent.mission import Answer, MayIDrive, Question, WhatIsKnown, Whe
 from mapweave.agent.mission_control import MissionControl
 from mapweave.hybridmap.agent_status import MAX_STATUS_WORDS, AgentStatus, Status
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.drive_statistics import DriveStatistics
-from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.node import MapId, NodeId
@@ -49,87 +47,6 @@ VIEW = View(
     np.arange(64, dtype=np.uint8).reshape(2, 32),
     Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3),
 )
-
-# Messages
-
-names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,31}", fullmatch=True)
-node_ids = st.builds(NodeId, names, st.integers(0, 2**53), st.integers(0, 2**40))
-stamps = st.integers(0, 2**63 - 1)
-orders = st.one_of(
-    st.builds(
-        MissionOrder,
-        names,
-        names,
-        st.sampled_from(sorted(set(MissionKind) - {MissionKind.GO})),
-        stamps,
-        names,
-    ),
-    st.builds(MissionOrder, names, names, st.just(MissionKind.GO), stamps, names, node_ids),
-)
-reports = st.builds(MissionReport, orders, st.sampled_from(sorted(MissionState)), st.floats(0.0, 1.0))
-finite = st.floats(-1e6, 1e6)
-words = st.text(st.characters(categories=["L", "N", "P", "Zs"]).filter(str.isprintable), max_size=200)
-counts = st.integers(0, 10**4)
-statuses = st.builds(
-    Status,
-    doing=words, detail=words, nodes=st.integers(0, 10**6), tracked=st.integers(0, 500),
-    map_from_robot=st.builds(Pose2, finite, finite, finite), finished=st.booleans(), mission=words,
-    fix_node=st.none() | node_ids, node_from_robot=st.builds(Pose2, finite, finite, finite),
-    legs=st.integers(0, 1000), tally=st.builds(DriveStatistics, counts, counts, counts, counts),
-)  # fmt: skip
-
-
-@given(orders, reports)
-def test_missions_come_back_as_they_were(order: MissionOrder, report: MissionReport) -> None:
-    assert decode(encode(order), MissionOrder) == order
-    assert decode(encode(report), MissionReport) == report
-
-
-@given(statuses, stamps, st.none() | reports)
-def test_statuses_come_back_as_they_were(
-    status: Status, stamp_ns: int, mission: MissionReport | None
-) -> None:
-    sent = AgentStatus(status, stamp_ns, "r0", mission=mission)
-    assert decode(encode(sent), AgentStatus) == sent
-
-
-odd_texts = ["goto", "r0.1.2", "r0.².1", "r0.1.٣", "r0.-1.2", "r0.1." + "9" * 400, "nan", "inf", "..", ""]
-scalars = st.one_of(
-    st.sampled_from(odd_texts), st.text(max_size=30), st.integers(-(2**63), 2**63 - 1), st.floats(),
-    st.booleans(), st.none(), st.binary(max_size=9),
-)  # fmt: skip
-
-
-@given(st.binary(max_size=200))
-def test_garbage_is_no_mission_and_no_status(data: bytes) -> None:
-    for kind in (MissionOrder, MissionReport, AgentStatus):
-        with pytest.raises(InvalidMessage):
-            decode(data, kind)
-
-
-@given(st.sampled_from([MissionOrder, AgentStatus]), orders, statuses, st.data())
-def test_a_message_with_a_strange_field_is_read_or_refused(
-    kind: type, order: MissionOrder, status: Status, data: st.DataObject
-) -> None:
-    fields = msgpack.unpackb(encode(order if kind is MissionOrder else AgentStatus(status, 5)))
-    within = data.draw(st.sampled_from([fields, fields.get("status", fields)]))
-    within[data.draw(st.sampled_from(sorted(within)))] = data.draw(scalars)
-    try:
-        value = decode(msgpack.packb(fields), kind)
-    except InvalidMessage:
-        return
-    assert decode(encode(value), kind) == value
-
-
-@pytest.mark.parametrize("name", ["doing", "detail", "nodes", "tracked", "map_from_robot", "finished"])
-def test_a_status_without_a_field_is_refused(name: str) -> None:
-    fields = msgpack.unpackb(encode(AgentStatus(Status("turning", "", 0, 0, Pose2(), False), 5)))
-    del fields["status"][name]
-    with pytest.raises(InvalidMessage, match=name):
-        decode(msgpack.packb(fields), AgentStatus)
-
-
-# The link
 
 
 @pytest.fixture

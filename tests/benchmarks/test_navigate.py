@@ -16,7 +16,6 @@ from benchmarks.navigate.office import Mapped
 from benchmarks.navigate.plots import LEAST_EDGES, Plot, draw_plot
 from mapweave.evaluation.map_score import crossed
 from mapweave.hybridmap.agent_status import AgentStatus, Status
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -26,6 +25,7 @@ from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.floorplan import FloorPlan, Rectangle
 from mapweave.sim.ground_truth_messages import RobotStatus, SimStatus
 from mapweave.sim.snapshot import Snapshot
+from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 
 RADIUS = 0.17
@@ -45,7 +45,7 @@ def mapped() -> Mapped:
     rng = np.random.default_rng(1)
     truth = [Pose2(0.5 + 0.2 * k, 0.6 + 0.25 * k, 0.7 * k) for k in range(10)]
     nodes, edges = take_map(room(0, 0, 2.9, 4, 900, rng), MapId("r0", 1), truth, rng)
-    contents = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    contents = HybridMap(changes_of(nodes, edges))
     return Mapped(contents, {node.id: pose for node, pose in zip(nodes, truth, strict=True)})
 
 

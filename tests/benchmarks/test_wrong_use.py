@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,11 @@ import benchmarks
 
 FOLDER = Path(benchmarks.__file__).parent
 NAMES = sorted(path.parent.name for path in FOLDER.glob("*/benchmark.py"))
-SEEDED = [name for name in NAMES if 'add_argument("--seed"' in (FOLDER / name / "benchmark.py").read_text()]
+SEEDED = [
+    name
+    for name in NAMES
+    if re.search(r'command_line\(|add_argument\("--seed"', (FOLDER / name / "benchmark.py").read_text())
+]
 """Those that people start, with a seed."""
 WRONG = [
     *((name, "--seed -1", "seed") for name in SEEDED),

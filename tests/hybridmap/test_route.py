@@ -11,6 +11,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.route import RouteSettings, edge_cost, find_route
+from synthetic.maps import changes_of
 from synthetic.world import CAMERA
 
 
@@ -31,7 +32,7 @@ def random_map(seed: int, n: int = 14, m: int = 22) -> HybridMap:
     for k in range(m):
         a, b = rng.choice(n, 2, replace=False)
         edges.append(edge(k, nodes[a], nodes[b], EdgeKind.TURNED if k % 5 == 0 else EdgeKind.MAPPED))
-    return HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    return HybridMap(changes_of(nodes, edges))
 
 
 @settings(max_examples=60, deadline=None)
@@ -62,7 +63,7 @@ def test_costs_no_more_than_dijkstra(seed: int, optimised: bool) -> None:
 def chain(*poses: Pose2) -> tuple[list[Node], HybridMap]:
     nodes = [node(k, pose) for k, pose in enumerate(poses)]
     edges = [edge(100 + k, nodes[k], nodes[k + 1]) for k in range(len(nodes) - 1)]
-    return nodes, HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    return nodes, HybridMap(changes_of(nodes, edges))
 
 
 def test_blocked_pairs_are_gone_around_in_either_order() -> None:
@@ -99,7 +100,7 @@ def test_a_driven_link_costs_its_length() -> None:
         edge(2, nodes[0], nodes[2]),
         edge(3, nodes[2], nodes[1]),
     ]
-    hybrid_map = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    hybrid_map = HybridMap(changes_of(nodes, edges))
     around = find_route(hybrid_map, nodes[0].id, nodes[1].id)
     assert around.edges == (edges[1].id, edges[2].id)
     hybrid_map.apply(EdgePut(edge(4, nodes[0], nodes[1], EdgeKind.DRIVEN)))

@@ -9,14 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import MemoryHub
+from synthetic.maps import changes_of, write_store
 from synthetic.world import World, room, take_map, take_view
 from tests.mapserver.played import HandAgent, Server
 
@@ -51,18 +48,10 @@ def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Mapped
     stops = [Pose2(2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for k in range(7)]
     nodes, edges = take_map(world, ROBOT, stops, rng)
     truth = {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
-    changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    entries = [
-        Entry.read(ROBOT, k + 1, encode_change(Change(ROBOT, k + 1, 0, body)))
-        for k, body in enumerate(changes)
-    ]
+    log = {ROBOT: changes_of(nodes, edges)}
 
     def make() -> MappedRoom:
-        path = tmp_path_factory.mktemp("store") / "s0.sqlite"
-        store = SqliteStore(path)
-        store.apply(ROBOT, 7, entries, len(entries))
-        store.close()
-        return MappedRoom(path, world, truth)
+        return MappedRoom(write_store(tmp_path_factory.mktemp("store") / "s0.sqlite", log), world, truth)
 
     return make
 

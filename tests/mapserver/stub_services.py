@@ -11,21 +11,20 @@ import numpy as np
 
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotations
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.explanation import Explanation, FleetExplanation
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, ExplainRequest, RelocalizeAnswer, View, Whereabouts
-from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.log_messages import Scalar
-from synthetic.world import room, take_map
+from synthetic.maps import looking_around, map_tours, merger_of
+from synthetic.world import room
 
 HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.1), 0.02, 0.01)
 ANSWER = RelocalizeAnswer(
@@ -112,14 +111,8 @@ def _explained(request: ExplainRequest) -> Explanation:
 def two_maps() -> MergedMap:
     """Two robots have looked around in one room."""
     rng = np.random.default_rng(6)
-    world = room(0, 0, 5, 4, 700, rng)
-    merger = Merger()
-    for map_id in (MapId("r0", 1), MapId("r1", 1)):
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
-    return merger.merged()
+    tours = dict.fromkeys((MapId("r0", 1), MapId("r1", 1)), looking_around(4))
+    return merger_of(map_tours(room(0, 0, 5, 4, 700, rng), tours, rng)).merged()
 
 
 def picture(width: int = 160, height: int = 120, kind: str = ".png") -> bytes:

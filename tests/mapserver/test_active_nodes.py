@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
@@ -18,6 +18,7 @@ from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.active_nodes import ActiveNodes, without_faded
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
+from synthetic.maps import changes_of, numbered
 from synthetic.world import World, room, take_map, take_view
 
 HERE, THERE = MapId("a", 1), MapId("b", 1)
@@ -35,9 +36,8 @@ class Two:
             tour = [Pose2(1.5 + 0.7 * k, 2.0, 0.2 * k) for k in range(3)]
             nodes, edges = take_map(self.worlds[map_id], map_id, tour, rng)
             self.truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
-            changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-            for number, body in enumerate(changes, start=1):
-                self.merger.on_change(Change(map_id, number, 0, body))
+            for change in numbered(map_id, changes_of(nodes, edges)):
+                self.merger.on_change(change)
 
     def answers(self) -> Answers:
         return Answers.of(self.merger, self.merger.merged(), self.merger.node)
@@ -85,9 +85,7 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     logs: dict[MapId, list[Change]] = {}
     for map_id in maps:
         tour = [Pose2(*rng.uniform([1.2, 1.0], [3.8, 3.0]), 1.26 * k) for k in range(10)]
-        nodes, edges = take_map(world, map_id, tour, rng)
-        changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-        logs[map_id] = [Change(map_id, number, 0, body) for number, body in enumerate(changes, start=1)]
+        logs[map_id] = numbered(map_id, changes_of(*take_map(world, map_id, tour, rng)))
     views = [take_view(world, Pose2(2.5, 2.0, 0.5 * k), rng)[0] for k in range(12)]
     merger, retired = Merger(), ManualConstraint(RetiredMap(maps[2]), True, "anna", 1, "moved")
     for map_id in maps[:2]:

@@ -14,14 +14,13 @@ from mapweave.agent.replication.epochs import newest_on_server
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.annotation import Annotation, Annotations, Place
-from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.change import ChangeBody, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveRequest
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.map_files import map_file_of
@@ -30,7 +29,8 @@ from mapweave.offline_merge import merge_parts
 from mapweave.wire.codec import encode_body
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from synthetic.world import room, take_map
+from synthetic.maps import looking_around, map_tours
+from synthetic.world import room
 from tests.waiting import eventually
 
 KEYS = Keys("base")
@@ -41,13 +41,7 @@ JOINED = MapEvent(7, MapEventKind.JOINED, "r0.4 and r1.1 are one map now")
 def logs() -> dict[MapId, list[ChangeBody]]:
     """Three robots in one room."""
     rng = np.random.default_rng(8)
-    world = room(0, 0, 5, 4, 700, rng)
-    out: dict[MapId, list[ChangeBody]] = {}
-    for map_id in (R0, R1, R2):
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    return out
+    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys((R0, R1, R2), looking_around(4)), rng)
 
 
 LOGS = logs()

@@ -8,12 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.blockages import Blockages
-from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.routes import Router
+from synthetic.maps import changes_of, merger_of
 from synthetic.world import room, take_map
 
 A, B, C = (NodeId("a", 1, number) for number in (1, 3, 5))
@@ -43,10 +42,7 @@ def ring() -> tuple[Router, list[NodeId]]:
     angles = np.linspace(0.0, 1.95 * math.pi, 9)
     tour = [Pose2(3 + 0.8 * math.cos(a), 3 + 0.8 * math.sin(a), a) for a in angles]
     nodes, edges = take_map(room(0, 0, 6, 6, 900, rng), ME, tour, rng, sigma_xy=0.005, sigma_heading=0.005)
-    merger = Merger()
-    for number, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
-        merger.on_change(Change(ME, number, 0, body))
-    return Router(merger.merged()), [node.id for node in nodes]
+    return Router(merger_of({ME: changes_of(nodes, edges)}).merged()), [node.id for node in nodes]
 
 
 def test_others_are_led_around_a_blockage_and_through_it_where_there_is_no_other_way(

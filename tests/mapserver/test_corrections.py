@@ -15,19 +15,18 @@ import pytest
 from mapweave import Fleet
 from mapweave.cli import main
 from mapweave.hybridmap.area import Area
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.constraint_subject import Linked, RetiredArea, RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
-from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import MapFile
-from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
-from synthetic.world import room, take_map
+from synthetic.maps import LOG_ID, entries_of, map_tours, write_store
+from synthetic.world import room
 from tests.waiting import eventually
 from tests.wire.fleets import ZenohFleet
 
@@ -39,20 +38,11 @@ TRUE = Pose2(2.5, 2.5, 2.0).inverse() @ Pose2(2.7, 2.4, 2.05)
 def logs(stops: int = 3) -> dict[MapId, list[ChangeBody]]:
     """Two robots turn on the spot in one hall; one pair of views shows the same, too little to join them."""
     world, rng = room(0, 0, 6, 5, 300, np.random.default_rng(1)), np.random.default_rng(3)
-    begins = {A: (2.5, 2.5, 0.0), B: (2.7, 2.4, 2.05)}
-    out: dict[MapId, list[ChangeBody]] = {}
-    for map_id, (x, y, turn) in begins.items():
-        poses = [Pose2(x, y, turn + 1.0 * k) for k in range(stops)]
-        nodes, edges = take_map(world, map_id, poses, rng, None, 0.01, 0.01)
-        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    return out
-
-
-def entries(map_id: MapId, changes: list[ChangeBody], first: int = 1) -> list[Entry]:
-    return [
-        Entry.read(map_id, first + k, encode_change(Change(map_id, first + k, 0, body)))
-        for k, body in enumerate(changes)
-    ]
+    tours = {
+        map_id: [Pose2(x, y, turn + 1.0 * k) for k in range(stops)]
+        for map_id, (x, y, turn) in {A: (2.5, 2.5, 0.0), B: (2.7, 2.4, 2.05)}.items()
+    }
+    return map_tours(world, tours, rng, 0.01, 0.01)
 
 
 class Asking:
@@ -102,12 +92,7 @@ def serving(path: Path) -> Iterator[Asking]:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    path = tmp_path / "s0.sqlite"
-    store = SqliteStore(path)
-    for map_id, changes in logs().items():
-        store.apply(map_id, 7, entries(map_id, changes), len(changes))
-    store.close()
-    return path
+    return write_store(tmp_path / "s0.sqlite", logs())
 
 
 def components(content: MapFile) -> int:
@@ -132,7 +117,7 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         assert (poses[LAST].inverse() @ poses[FIRST]).distance(TRUE) < 0.05
         (made,) = fleet.constraints()
         assert (made.who, made.because) == ("anna", "both see the red door")
-        assert isinstance(made.about, Linked) and made.about.by_images
+        assert isinstance(made.about, Linked) and made.about.evidence
 
         status, answer = asking.http("POST", {"retire": ["b.1.5"], "by": "bob", "because": "repainted"})
         assert status == 200 and "1 node of b.1" in answer["said"], answer
@@ -149,7 +134,7 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
     store = SqliteStore(path)
     more = logs(4)[B]
     later = [change for change in more if change not in more[:3]][:1] + more[-1:]
-    store.apply(B, 7, entries(B, later, 6), 7)
+    store.apply(B, LOG_ID, entries_of(B, later, 6), 7)
     store.close()
     with serving(path) as asking:
         content = asking.merged()
@@ -199,10 +184,5 @@ def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: st
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Asking]:
-    path = tmp_path_factory.mktemp("small") / "s0.sqlite"
-    store = SqliteStore(path)
-    for map_id, changes in logs().items():
-        store.apply(map_id, 7, entries(map_id, changes), len(changes))
-    store.close()
-    with serving(path) as asking:
+    with serving(write_store(tmp_path_factory.mktemp("small") / "s0.sqlite", logs())) as asking:
         yield asking

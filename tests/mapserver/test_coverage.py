@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
@@ -21,6 +21,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
+from synthetic.maps import changes_of, numbered
 from synthetic.world import room, take_map
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
@@ -41,9 +42,8 @@ class Scene:
             nodes, edges = take_map(where, map_id, stops, rng)
             self.truth |= {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
             self.begin[map_id] = stops[0]
-            changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-            for k, body in enumerate(changes):
-                self.merger.on_change(Change(map_id, k + 1, 0, body))
+            for change in numbered(map_id, changes_of(nodes, edges)):
+                self.merger.on_change(change)
         self.merged = self.merger.merged()
 
 

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Apart, Ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import (
@@ -24,11 +24,9 @@ from mapweave.hybridmap.explanation import (
 )
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ExplainRequest, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
-from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.merging.merger import Merger
@@ -40,12 +38,12 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ConsistencySettings, MergeSettings
 from mapweave.storage.map_file import MapFile, pack_map_file, unpack_map_file
 from mapweave.wire.bus import Reply
-from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
-from synthetic.world import room, take_map
+from synthetic.maps import looking_around, map_tours, write_store
+from synthetic.world import room
 
 A, B = MapId("a", 1), MapId("b", 1)
 KEYS = Keys("fleet")
@@ -54,28 +52,13 @@ KEYS = Keys("fleet")
 def logs() -> dict[MapId, list[ChangeBody]]:
     """Two robots have looked around in one room."""
     rng = np.random.default_rng(6)
-    world = room(0, 0, 5, 4, 700, rng)
-    out: dict[MapId, list[ChangeBody]] = {}
-    for map_id in (A, B):
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(6)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    return out
+    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys((A, B), looking_around(6)), rng)
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The bytes of a server's store."""
-    path = tmp_path_factory.mktemp("store") / "s0.sqlite"
-    store = SqliteStore(path)
-    for map_id, changes in logs().items():
-        entries = [
-            Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
-            for k, body in enumerate(changes)
-        ]
-        store.apply(map_id, 7, entries, len(entries))
-    store.close()
-    return path.read_bytes()
+    return write_store(tmp_path_factory.mktemp("store") / "s0.sqlite", logs()).read_bytes()
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import IDENTITY, FloorPlan, PlanImage, PlanPair
 from mapweave.hybridmap.node import MapId, NodeId
@@ -19,7 +18,8 @@ from mapweave.mapserver.floor_plans import CLICK, check_plan, placed_plan
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.similarity import Similarity
-from synthetic.world import room, take_map
+from synthetic.maps import map_tours, merger_of
+from synthetic.world import room
 
 A = MapId("a", 1)
 IMAGE = PlanImage("0" * 64, 800, 500, "office.png")
@@ -32,11 +32,7 @@ MERGED_FROM_PIXELS = Similarity(-3.0, -9.0, 0.6, 0.05)
 def merger() -> Merger:
     rng = np.random.default_rng(4)
     stops = [Pose2(1.0 + 1.5 * k, 1.0 + 2.0 * (k % 2) + 3.0 * (k % 3), 0.4 * k) for k in range(8)]
-    nodes, edges = take_map(room(0, 0, 14, 12, 600, rng), A, stops, rng)
-    merger = Merger()
-    for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-        merger.apply(A, change)
-    return merger
+    return merger_of(map_tours(room(0, 0, 14, 12, 600, rng), {A: stops}, rng))
 
 
 @pytest.fixture(scope="module")

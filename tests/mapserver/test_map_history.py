@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -28,7 +28,8 @@ from mapweave.merge.pose_graph.links import refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.messages import KeptHistory, decode, encode
 from mapweave.wire.packing import pack
-from synthetic.world import room, take_map
+from synthetic.maps import looking_around, map_tours, merger_of
+from synthetic.world import room
 
 A, B = MapId("a", 1), MapId("b", 1)
 APART = ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 10**18, "two kitchens")])
@@ -38,14 +39,8 @@ APART = ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 10**18,
 def merger() -> Merger:
     """Two robots have looked around in one room."""
     rng = np.random.default_rng(6)
-    world = room(0, 0, 5, 4, 700, rng)
-    merger = Merger()
-    for map_id in (A, B):
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
-    return merger
+    tours = dict.fromkeys((A, B), looking_around(4))
+    return merger_of(map_tours(room(0, 0, 5, 4, 700, rng), tours, rng))
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.change import Change, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, Node
+from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty
 from mapweave.mapserver.merge_worker import MergeWorker
@@ -21,6 +21,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from synthetic.maps import changes_of, map_tours, numbered
 from synthetic.world import World, room, take_map, take_view
 
 
@@ -61,8 +62,8 @@ def test_a_store_read_at_once_merges_as_change_by_change(
     for agent in ("a", "b"):
         tour = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
         nodes, edges = take_map(world, MapId(agent, 1), tour, rng)
-        contents = [*map(NodePut, nodes), *map(EdgePut, edges), NodePut(nodes[1]), NodeRetired(nodes[3].id)]
-        changes += [Change(MapId(agent, 1), k + 1, 0, body) for k, body in enumerate(contents)]
+        contents = [*changes_of(nodes, edges), NodePut(nodes[1]), NodeRetired(nodes[3].id)]
+        changes += numbered(MapId(agent, 1), contents)
     if broken:
 
         def fails(*_: object) -> None:
@@ -95,10 +96,8 @@ def mapped_room(agents: tuple[str, ...]) -> tuple[World, list[Pose2], list[Chang
     rng = np.random.default_rng(1)
     world = room(0, 0, 5, 4, 600, rng)
     tour, changes = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)], []
-    for agent in agents:
-        contents = [body for made in take_map(world, MapId(agent, 1), tour, rng) for body in made]
-        contents = [NodePut(entry) if isinstance(entry, Node) else EdgePut(entry) for entry in contents]
-        changes += [Change(MapId(agent, 1), k + 1, 0, body) for k, body in enumerate(contents)]
+    for map_id, log in map_tours(world, {MapId(agent, 1): tour for agent in agents}, rng).items():
+        changes += numbered(map_id, log)
     return world, tour, changes
 
 

@@ -17,7 +17,6 @@ from mapweave.cli import main
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.area import Area
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -28,18 +27,16 @@ from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, ResolveRequest
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.http.web import Web
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.map_file import MapFile, read_map_file, unpack_map_file, write_map_file
-from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode_view
-from synthetic.world import room, take_map, take_view
+from synthetic.maps import looking_around, map_tours, write_store
+from synthetic.world import room, take_view
 from tests.mapserver.conftest import MappedRoom
 from tests.mapserver.house import KEYS, House
 from tests.waiting import eventually
@@ -278,17 +275,7 @@ def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.C
     """Two robots in twin rooms, which a running server has merged, until people say that they are not one."""
     rng, path = np.random.default_rng(6), tmp_path / "s0.sqlite"
     world, maps = room(0, 0, 5, 4, 700, rng), [MapId("r0", 1), MapId("r1", 1)]
-    store = SqliteStore(path)
-    for map_id in maps:
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        bodies = [*map(NodePut, nodes), *map(EdgePut, edges)]
-        entries = [
-            Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
-            for k, body in enumerate(bodies)
-        ]
-        store.apply(map_id, 7, entries, len(entries))
-    store.close()
+    write_store(path, map_tours(world, dict.fromkeys(maps, looking_around(4)), rng))
     hub = MemoryHub()
     bus, mine = MemoryBus(hub), MemoryBus(hub)
     person, first = Fleet(fleet="fleet", by="anna", bus=mine), NodeId("r0", 1, 1)

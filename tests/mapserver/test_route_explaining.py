@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapweave.explanation_text import route_words
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.explanation import RouteExplanation
@@ -25,6 +25,7 @@ from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import NEAR, WARY_COST, Router
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.packing import pack
+from synthetic.maps import changes_of, numbered
 from synthetic.world import Sensing, room, take_map
 
 ME, OTHER, FAR = MapId("a", 1), MapId("b", 1), MapId("c", 1)
@@ -37,9 +38,9 @@ def fleet() -> Merger:
     world, elsewhere = room(0, 0, 9, 4, 1400, rng), room(0, 0, 5, 4, 700, np.random.default_rng(9))
     merger = Merger()
     for map_id, there, x in ((ME, world, 1.6), (OTHER, world, 5.0), (FAR, elsewhere, 2.0)):
-        nodes, edges = take_map(there, map_id, [Pose2(x + 0.3 * k, 2.0) for k in range(3)], rng, SHARP)
-        for number, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
-            merger.on_change(Change(map_id, number, 0, body))
+        made = take_map(there, map_id, [Pose2(x + 0.3 * k, 2.0) for k in range(3)], rng, SHARP)
+        for change in numbered(map_id, changes_of(*made)):
+            merger.on_change(change)
     return merger
 
 
@@ -145,8 +146,8 @@ def test_pieces_of_one_map_are_not_joined_as_maps() -> None:
     rng, merger = np.random.default_rng(3), Merger()
     for number, first in ((0, 1), (1, 101)):
         world = room(0, 0, 5, 4, 700, rng)
-        nodes, edges = take_map(world, ME, [Pose2(2.0 + 0.3 * k, 2.0) for k in range(3)], rng, SHARP)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+        made = take_map(world, ME, [Pose2(2.0 + 0.3 * k, 2.0) for k in range(3)], rng, SHARP)
+        for change in changes_of(*made):
             merger.apply(ME, renumbered(change, 100 * number))
         assert merger.maps[ME].nodes[NodeId(*ME, first)]
     router = Router(merger.merged())

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.change import Change, EdgePut
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_maps
 from mapweave.merge.explanation.node_explanation import explain_nodes
+from synthetic.maps import changes_of, merger_of
 from synthetic.world import Sensing, room, take_map
 
 ME = MapId("a", 1)
@@ -27,10 +27,7 @@ def row() -> tuple[Router, list[NodeId]]:
     rng = np.random.default_rng(0)
     tour = [Pose2(1.0 + STEP * k, 2.0) for k in range(5)]
     nodes, edges = take_map(room(0, 0, 6, 4, 900, rng), ME, tour, rng, sigma_xy=0.003, sigma_heading=0.003)
-    merger = Merger()
-    for number, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
-        merger.on_change(Change(ME, number, 0, body))
-    return Router(merger.merged()), [node.id for node in nodes]
+    return Router(merger_of({ME: changes_of(nodes, edges)}).merged()), [node.id for node in nodes]
 
 
 def begin(row: tuple[Router, list[NodeId]], x: float, y: float, goal: int, **arguments: object) -> int:
@@ -67,12 +64,12 @@ def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> 
     """Two robots see one wall from three metres apart; then a robot drives from one to the other."""
     rng = np.random.default_rng(1)
     world, other = room(0, 0, 9, 4, 1400, rng), MapId("b", 1)
-    merger, ends = Merger(), []
+    logs, ends = {}, []
     for map_id, x in ((ME, 1.6), (other, 4.6)):
         nodes, edges = take_map(world, map_id, [Pose2(x + 0.2 * k, 2.0) for k in range(2)], rng, SHARP)
-        for number, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
-            merger.on_change(Change(map_id, number, 0, body))
+        logs[map_id] = changes_of(nodes, edges)
         ends.append([node.id for node in nodes])
+    merger = merger_of(logs)
     merged = merger.merged()
     assert len(merged.components) == 1 and merged.links, "the poses are tied"
     answer = Router(merged).route(ends[0][0], ends[1][1])

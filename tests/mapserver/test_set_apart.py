@@ -16,7 +16,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
@@ -40,6 +40,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode, encode_view
+from synthetic.maps import map_tours, numbered
 from synthetic.world import World, room, take_map, take_view
 from tests.mapserver.contents import content
 from tests.waiting import eventually
@@ -60,15 +61,12 @@ def views() -> list[View]:
 
 def sound_logs() -> dict[MapId, list[bytes]]:
     """Two robots that have mapped one room, as messages."""
-    rng, out = np.random.default_rng(2), {}
-    for map_id in SOUND:
-        nodes, edges = take_map(WORLD, map_id, TOUR, rng)
-        out[map_id] = messages(map_id, [*map(NodePut, nodes), *map(EdgePut, edges)])
-    return out
+    logs = map_tours(WORLD, dict.fromkeys(SOUND, TOUR), np.random.default_rng(2))
+    return {map_id: messages(map_id, log) for map_id, log in logs.items()}
 
 
 def messages(map_id: MapId, changes: list[ChangeBody]) -> list[bytes]:
-    return [encode_change(Change(map_id, k + 1, 0, body)) for k, body in enumerate(changes)]
+    return [encode_change(change) for change in numbered(map_id, changes)]
 
 
 def stored(path: Path, logs: dict[MapId, list[bytes]]) -> Store:

@@ -12,9 +12,9 @@ from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, Whereabouts
 from mapweave.mapserver.answers import Answers
-from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.messages import decode, encode
+from synthetic.maps import changes_of, merger_of
 from synthetic.world import take_map
 from tests.mapserver.test_active_nodes import HERE, Two
 
@@ -72,12 +72,7 @@ def test_a_view_without_a_heading_is_not_published() -> None:
     two, rng = Two(), np.random.default_rng(2)
     tour = [Pose2(1.5 + 0.7 * k, 2.0, 0.2 * k) for k in range(4)]
     nodes, edges = take_map(two.worlds[HERE], C, tour, rng)
-    merger, own = Merger(), two.merger.maps[HERE].contents()
-    changes = [(HERE, change) for change in own] + [
-        (C, change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))
-    ]
-    for number, (map_id, change) in enumerate(changes, start=1):
-        merger.on_change(Change(map_id, number, 0, change))
+    merger = merger_of({HERE: two.merger.maps[HERE].contents(), C: changes_of(nodes, edges)})
     result = Answers.of(merger, merger.merged(), merger.node).known.answer(HERE, (0.0, 0.0), 50.0)
     assert len(result.views) == 4
     outside = replace(nodes[3], camera=replace(nodes[3].camera, cx=-40.0))

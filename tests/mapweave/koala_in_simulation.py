@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.server
 import threading
 import time
 from pathlib import Path
@@ -14,6 +13,7 @@ from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
 from tests.agent.drivers.emulators import Koala25, KoalaSilver, LineEmulator, TwoWheels
+from tests.mjpeg_stream import MjpegStream
 
 RANGERS = 72
 """Of the simulated robot, 5 degrees apart; a Koala has some of them."""
@@ -67,35 +67,10 @@ class InSimulation(LineEmulator):
         self._shown: list[tuple[int, Pose2]] = []
         self.late = 0
         self.ticks = 0
-        emulator = self
-
-        class Handler(http.server.BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                self.send_response(200)
-                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-                self.end_headers()
-                while not emulator._closing:
-                    with emulator._new:
-                        emulator._new.wait(1.0)
-                        jpeg = emulator._jpeg
-                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                    try:
-                        self.wfile.write(head.encode() + jpeg + b"\r\n")
-                    except OSError:
-                        return
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}/stream.mjpg"
-        self._threads = [
-            threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True),
-            threading.Thread(target=self._run, daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._stream = MjpegStream(self._next_frame)
+        self.url = self._stream.url
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
 
     def truth_at(self, stamp_ns: int) -> Pose2:
         """`world_from_robot` when a frame was shown."""
@@ -105,11 +80,16 @@ class InSimulation(LineEmulator):
 
     def close(self) -> None:
         self._closing = True
-        self._server.shutdown()
-        self._server.server_close()
-        for thread in self._threads:
-            thread.join()
+        self._stream.close()
+        self._thread.join()
         super().close()
+
+    def _next_frame(self) -> bytes | None:
+        if self._closing:
+            return None
+        with self._new:
+            self._new.wait(1.0)
+            return self._jpeg
 
     def _run(self) -> None:
         """A tick each tick; a frame is shown when the encoders, one tick late, have got to it."""

@@ -22,15 +22,14 @@ from mapweave.formats.export import FORMATS
 from mapweave.formats.g2o import G2oEdge, G2oGraph, read_g2o, write_g2o
 from mapweave.formats.g2o_optimum import optimum_of
 from mapweave.formats.map_part import MapPart
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.map_files import map_file_of
-from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.map_file import write_map_file
-from synthetic.world import room, take_map
+from synthetic.maps import map_tours, merger_of
+from synthetic.world import room
 
 
 @pytest.fixture(scope="module")
@@ -38,13 +37,11 @@ def merged() -> MergedMap:
     """Two robots that share a room, and a third elsewhere."""
     rng = np.random.default_rng(9)
     world = room(0, 0, 5, 4, 700, rng) + room(20, 0, 5, 4, 500, rng)
-    merger = Merger()
-    for agent, x in (("r0", 0), ("r1", 0), ("r2", 20)):
-        stops = [Pose2(x + 2.4 + 0.1 * k, 2.0, 0.7 * k) for k in range(6)]
-        nodes, edges = take_map(world, MapId(agent, 1), stops, rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(MapId(agent, 1), change)
-    return merger.merged()
+    tours = {
+        MapId(agent, 1): [Pose2(x + 2.4 + 0.1 * k, 2.0, 0.7 * k) for k in range(6)]
+        for agent, x in (("r0", 0), ("r1", 0), ("r2", 20))
+    }
+    return merger_of(map_tours(world, tours, rng)).merged()
 
 
 @pytest.fixture(scope="module")

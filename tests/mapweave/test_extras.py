@@ -17,16 +17,15 @@ import pytest
 from mapweave.cli import main
 from mapweave.exit_status import MISSING_EXTRA
 from mapweave.extras import MODULES
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import MapFile, write_map_file
-from synthetic.world import room, take_map
+from synthetic.maps import looking_around, map_tours
+from synthetic.world import room
 from tests.mapweave.command_line import commands
 from tests.simulator import needs_simulator
 
@@ -132,13 +131,9 @@ CASES: list[tuple[str, str, str]] = [
 def merged() -> MergedMap:
     """Two robots in one room."""
     rng = np.random.default_rng(8)
-    here = room(0, 0, 5, 4, 700, rng)
-    stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
-    maps = {}
-    for name in ("r0", "r1"):
-        nodes, edges = take_map(here, MapId(name, 1), stops, rng)
-        maps[MapId(name, 1)] = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
-    return merge_parts(maps, ManualConstraints())
+    tours = {MapId(name, 1): looking_around(4) for name in ("r0", "r1")}
+    logs = map_tours(room(0, 0, 5, 4, 700, rng), tours, rng)
+    return merge_parts({name: HybridMap(log) for name, log in logs.items()}, ManualConstraints())
 
 
 @pytest.fixture

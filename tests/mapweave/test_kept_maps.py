@@ -20,19 +20,18 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_files import epochs_of_files
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.codec import encode_body, encode_change
+from mapweave.wire.codec import encode_body
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode
 from mapweave.wire.zenoh_bus import ZenohBus
+from synthetic.maps import write_store
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.mapweave.command_line import complaint
 from tests.mapweave.test_cli_files import one_node
@@ -208,15 +207,8 @@ def test_other_files_and_files_in_use_are_named(tmp_path, capfd):
 def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, capfd):
     import sqlite3
 
-    from mapweave.hybridmap.change import Change
-
     path = tmp_path / "s0.sqlite"
-    store = SqliteStore(path)
-    for epoch in (1, 2):
-        map_id = MapId("r0", epoch)
-        encoded = encode_change(Change(map_id, 1, 0, renumbered(epoch)))
-        store.apply(map_id, 7, [Entry.read(map_id, 1, encoded)], 1)
-    store.close()
+    write_store(path, {MapId("r0", epoch): [renumbered(epoch)] for epoch in (1, 2)})
     with sqlite3.connect(path) as rows:
         rows.execute("UPDATE change SET crc = crc + 1 WHERE epoch = 1")
     rows.close()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import mapweave
-from mapweave.hybridmap.change import EdgePut, NodePut
+from synthetic.maps import changes_of
 from synthetic.world import room, take_map, take_view
 
 SOURCE = Path(mapweave.__file__)
@@ -108,8 +108,8 @@ def test_maps_are_written_read_merged_and_say_where_a_view_was_taken(tmp_path: P
     for path in paths:
         nodes, edges = take_map(WORLD, mapweave.MapId(path.stem, 1), TOUR, rng)
         places |= {node.id: place for node, place in zip(nodes, TOUR, strict=True)}
-        changes = (*map(NodePut, nodes), *map(EdgePut, edges))
-        mapweave.write_map_file(path, mapweave.MapFile("agent", path.stem, changes))
+        content = mapweave.MapFile("agent", path.stem, tuple(changes_of(nodes, edges)))
+        mapweave.write_map_file(path, content)
     own = mapweave.read_map_file(paths[0])
     assert mapweave.HybridMap(own.changes).nodes.keys() == {node for node in places if node.agent == "r0"}
 

@@ -17,16 +17,13 @@ import mapweave
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
 from mapweave.hybridmap.agent_status import Status
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.explanation import PairExplanation
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import unpack_map_file
-from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from synthetic.maps import changes_of, write_store
 from synthetic.world import room, take_map, take_view
 from tests.waiting import eventually
 
@@ -56,18 +53,15 @@ class Running:
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[Running]:
     rng = np.random.default_rng(2)
-    store = SqliteStore(tmp_path / "s.sqlite")
     places: dict[str, mapweave.Pose2] = {}
     made: dict[str, mapweave.Node] = {}
+    logs = {}
     for map_id in MAPS:
         nodes, edges = take_map(WORLD, map_id, TOUR, rng)
-        bodies = [*map(NodePut, nodes), *map(EdgePut, edges)]
-        changes = [Change(map_id, k, 0, body) for k, body in enumerate(bodies, 1)]
-        entries = [Entry.read(map_id, change.sequence, encode_change(change)) for change in changes]
-        store.apply(map_id, 7, entries, len(entries))
+        logs[map_id] = changes_of(nodes, edges)
         made |= {str(node.id): node for node in nodes}
         places |= {str(node.id): place for node, place in zip(nodes, TOUR, strict=True)}
-    store.close()
+    write_store(tmp_path / "s.sqlite", logs)
     hub = MemoryHub()
     served, person, other = MemoryBus(hub), MemoryBus(hub), MemoryBus(hub)
     with MapServer(served, KEYS, tmp_path / "s.sqlite", "s0") as server:
@@ -171,7 +165,7 @@ def test_a_robots_own_map_is_optimised_exported_and_drawn(
     monkeypatch.setenv("MPLBACKEND", "agg")
     own = [node for name, node in running.nodes.items() if name.startswith("r0")]
     edges = [edge for edge in map_of(running.fleet).edges.values() if edge.id.agent == "r0"]
-    content = mapweave.MapFile("agent", "r0.1", (*map(NodePut, own), *map(EdgePut, edges)))
+    content = mapweave.MapFile("agent", "r0.1", tuple(changes_of(own, edges)))
     mine = mapweave.FileMap(content)
     assert len(mine.nodes) == 4 and mine.hash != running.fleet.hash
     (written,) = mine.export(tmp_path / "mine.graphml")

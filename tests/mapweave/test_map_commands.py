@@ -17,18 +17,15 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.exit_status import NO
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import merged_of
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.codec import encode_change
 from mapweave.wire.zenoh_bus import ZenohBus
-from synthetic.world import room, take_map
+from synthetic.maps import looking_around, map_tours, write_store
+from synthetic.world import room
 
 R0, R1, R2 = MapId("r0", 1), MapId("r1", 1), MapId("r2", 1)
 
@@ -37,12 +34,8 @@ def logs() -> dict[MapId, list[ChangeBody]]:
     """Two robots in one room, a third elsewhere."""
     rng = np.random.default_rng(8)
     here, there = room(0, 0, 5, 4, 700, rng), room(0, 0, 5, 4, 700, rng)
-    out: dict[MapId, list[ChangeBody]] = {}
-    for map_id, world in ((R0, here), (R1, here), (R2, there)):
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    return out
+    tour = looking_around(4)
+    return map_tours(here, {R0: tour, R1: tour}, rng) | map_tours(there, {R2: tour}, rng)
 
 
 @pytest.fixture(scope="module")
@@ -349,14 +342,7 @@ def serving(folder: Path, port: int) -> Iterator[None]:
 
 @pytest.mark.slow
 def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path: Path) -> None:
-    store = SqliteStore(tmp_path / "s0.sqlite")
-    for map_id, changes in logs().items():
-        entries = [
-            Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
-            for k, body in enumerate(changes)
-        ]
-        store.apply(map_id, 7, entries, len(entries))
-    store.close()
+    write_store(tmp_path / "s0.sqlite", logs())
     port = free_port()
     at = ["--fleet", "why", "--connect", f"tcp/127.0.0.1:{port}", "--timeout", "60"]
     with serving(tmp_path, port):

@@ -20,6 +20,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.storage.map_file import MapFile, write_map_file
+from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 
 TOUR = [Pose2(2.5, 2.0, h) for h in np.arange(0, 2 * math.pi, math.pi / 3)]
@@ -28,8 +29,7 @@ TOUR = [Pose2(2.5, 2.0, h) for h in np.arange(0, 2 * math.pi, math.pi / 3)]
 def changes(agent: str) -> list[ChangeBody]:
     """A full turn in a room."""
     rng = np.random.default_rng(0)
-    nodes, edges = take_map(room(0, 0, 5, 4, 700, rng), MapId(agent, 1), TOUR, rng)
-    return [*map(NodePut, nodes), *map(EdgePut, edges)]
+    return changes_of(*take_map(room(0, 0, 5, 4, 700, rng), MapId(agent, 1), TOUR, rng))
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from websockets.sync.client import connect
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.hybridmap.annotation import Annotation, Place
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
@@ -34,14 +34,13 @@ from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.content_hash import content_hash
-from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.opened_map import MapSource, open_map
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, RefusedPair, pack_map_file, unpack_map_file, write_map_file
-from mapweave.wire.codec import encode_change
 from mapweave.wire.messages import KeptHistory, encode
-from synthetic.world import room, take_map
+from synthetic.maps import fill_store, looking_around, map_tours
+from synthetic.world import room
 from tests.mapweave.command_line import complaint
 from tests.waiting import eventually
 
@@ -54,26 +53,15 @@ EVENT = MapEvent(7, MapEventKind.JOINED, "r0.1 and r1.1 are one map now")
 def logs() -> dict[MapId, list[ChangeBody]]:
     """Two robots in one room."""
     rng = np.random.default_rng(8)
-    world = room(0, 0, 5, 4, 700, rng)
-    out: dict[MapId, list[ChangeBody]] = {}
-    for map_id in (R0, R1):
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    return out
+    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys((R0, R1), looking_around(4)), rng)
 
 
 LOGS = logs()
 
 
-def write_store(path: Path, maps: dict[MapId, list[ChangeBody]]) -> Path:
+def annotated_store(path: Path, maps: dict[MapId, list[ChangeBody]]) -> Path:
     store = SqliteStore(path)
-    for map_id, changes in maps.items():
-        entries = [
-            Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
-            for k, body in enumerate(changes)
-        ]
-        store.apply(map_id, 7, entries, len(entries))
+    fill_store(store, maps)
     store.add_constraint(encode(SAID))
     store.add_annotation(encode(KITCHEN))
     store.put_result("history", encode(KeptHistory((EVENT,))))
@@ -85,7 +73,7 @@ def write_store(path: Path, maps: dict[MapId, list[ChangeBody]]) -> Path:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A store, a journal and map files, with names that say nothing; no file can be written there."""
     made = tmp_path_factory.mktemp("maps")
-    write_store(made / "store", LOGS)
+    annotated_store(made / "store", LOGS)
     journal = Journal(made / "journal", "r0")
     journal.append(journal.open_map(1), LOGS[R0], 0)
     journal.open_map(2)
@@ -178,10 +166,10 @@ def test_a_store_whose_server_was_killed_is_read_with_its_last_commits(tmp_path:
     code = (
         "import os, sys; from pathlib import Path\n"
         "from mapweave.mapserver.log.sqlite_store import SqliteStore\n"
-        "from tests.mapweave.test_opened_map import LOGS, R0, write_store\n"
+        "from tests.mapweave.test_opened_map import LOGS, R0, annotated_store\n"
         "store = SqliteStore(Path(sys.argv[1])); store.put_result('history', b'x' * 9)\n"
         "SqliteStore.close = lambda self: os._exit(0)\n"
-        "store._database.close(); write_store(Path(sys.argv[1]), {R0: LOGS[R0]})\n"
+        "store._database.close(); annotated_store(Path(sys.argv[1]), {R0: LOGS[R0]})\n"
     )
     subprocess.run([sys.executable, "-c", code, str(path)], check=True, cwd=Path(__file__).parents[2])
     assert path.with_name("s0.sqlite-wal").stat().st_size > 0

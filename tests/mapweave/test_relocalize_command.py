@@ -19,22 +19,20 @@ from mapweave.cli import main
 from mapweave.drawing.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
 from mapweave.exit_status import NO
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import RelocalizeAnswer, View
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.mapserver.services import Services
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
+from synthetic.maps import write_store
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
@@ -82,11 +80,7 @@ def node() -> Node:
 @pytest.fixture(scope="module")
 def served(node: Node, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """An endpoint where a map server knows the place."""
-    path = tmp_path_factory.mktemp("server") / "s0.sqlite"
-    store = SqliteStore(path)
-    map_id = MapId("r0", 1)
-    store.apply(map_id, 7, [Entry.read(map_id, 1, encode_change(Change(map_id, 1, 0, NodePut(node))))], 1)
-    store.close()
+    path = write_store(tmp_path_factory.mktemp("server") / "s0.sqlite", {MapId("r0", 1): [NodePut(node)]})
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"

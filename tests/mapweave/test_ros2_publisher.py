@@ -20,7 +20,8 @@ from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes import ros2_publisher
-from mapweave.processes.agent import AgentOptions, run_agent
+from mapweave.processes.agent import AgentOptions
+from mapweave.processes.agent_process import run_agent
 from mapweave.processes.ros2_publisher import Ros2Publisher
 from mapweave.settings import load_settings
 from mapweave.wire.bus_settings import BusSettings

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
@@ -19,7 +18,8 @@ from mapweave.merge.floors import across_floors
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_merge import merge_parts
-from synthetic.world import room, take_map
+from synthetic.maps import looking_around, map_tours
+from synthetic.world import room
 
 NAMES = [MapId(name, 1) for name in "abcdef"]
 HERE = PoseGaussian(Pose2(), np.eye(3))
@@ -82,12 +82,8 @@ def twins() -> dict[MapId, HybridMap]:
     """Three robots in rooms that look the same: two on one floor, one above."""
     rng = np.random.default_rng(6)
     world = room(0, 0, 5, 4, 700, rng)
-    maps = {}
-    for map_id in NAMES[:3]:
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        maps[map_id] = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
-    return maps
+    logs = map_tours(world, dict.fromkeys(NAMES[:3], looking_around(4)), rng)
+    return {map_id: HybridMap(log) for map_id, log in logs.items()}
 
 
 def parts(merged: MergedMap) -> Counter[frozenset[MapId]]:

@@ -24,6 +24,7 @@ from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import MOST_SIGMA_XY
 from mapweave.storage.map_file import pack_map_file, unpack_map_file
+from synthetic.maps import changes_of, numbered
 from synthetic.world import World, room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -104,8 +105,8 @@ def test_a_link_that_the_merge_lacks_joins_two_maps_at_the_right_pose(seam: Scen
 def test_a_link_stays_when_the_robot_maps_on_and_an_undone_one_waits(seam: Scene) -> None:
     seam.ask(Linked(LAST, FIRST))
     nodes, edges = take_map(seam.world, B, [Pose2(2.7, 2.4, 2.05 + 1.0 * k) for k in range(5)], seam.rng)
-    for k, change in enumerate([*map(NodePut, nodes[3:]), *map(EdgePut, edges[2:])]):
-        seam.merger.on_change(Change(B, 90 + k, 0, change))
+    for change in numbered(B, changes_of(nodes[3:], edges[2:]), 90):
+        seam.merger.on_change(change)
     joined = seam.merger.merged()
     assert len(joined.components) == 1 and len(joined.poses) == 8
     seam.ask(Apart((LAST, FIRST)))

@@ -13,6 +13,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.explanation.map_explanation import explain_maps
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from synthetic.maps import changes_of, looking_around, map_tours, merger_of
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -24,14 +25,8 @@ NOON = 1_772_366_400_000_000_000
 def merger() -> Merger:
     """Two robots have looked around in one room."""
     rng = np.random.default_rng(3)
-    world = room(0, 0, 5, 4, 700, rng)
-    stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(6)]
-    merger = Merger()
-    for map_id in (A, B):
-        nodes, edges = take_map(world, map_id, stops, rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
-    return merger
+    tours = dict.fromkeys((A, B), looking_around(6))
+    return merger_of(map_tours(room(0, 0, 5, 4, 700, rng), tours, rng))
 
 
 def between(merged: MergedMap) -> set[tuple[NodeId, NodeId]]:
@@ -73,8 +68,8 @@ def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) 
 def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> None:
     world = room(0, 0, 5, 4, 700, np.random.default_rng(3))
     third, rng = MapId("c", 1), np.random.default_rng(4)
-    nodes, edges = take_map(world, third, [Pose2(2.45 + 0.05 * k, 2.05, 0.7 * k) for k in range(6)], rng)
-    for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+    stops = [Pose2(2.45 + 0.05 * k, 2.05, 0.7 * k) for k in range(6)]
+    for change in changes_of(*take_map(world, third, stops, rng)):
         merger.apply(third, change)
     assert "links join them" in explain_maps(merger.merged(), A, B).reason
     merger.constrain(ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", NOON)]))

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -14,6 +13,7 @@ from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import verify
+from synthetic.maps import changes_of
 from synthetic.world import World, room, take_map
 from tests.merge.pose_graph.all_pairs import choose_pairs, overlaps
 
@@ -38,7 +38,7 @@ class Fleet:
         self.truth: dict[NodeId, Pose2] = {}
         for map_id, stops in tours.items():
             nodes, edges = take_map(world, map_id, stops, rng)
-            self.maps[map_id] = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+            self.maps[map_id] = HybridMap(changes_of(nodes, edges))
             self.truth |= {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
 
     def merge(self, order: int = 1) -> MergedMap:
@@ -170,7 +170,7 @@ def chain(agent: str, n: int) -> HybridMap:
         rng,
         sigma_xy=0.01,
     )
-    return HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    return HybridMap(changes_of(nodes, edges))
 
 
 def test_links_that_contradict_a_better_supported_way_round_are_refused() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.area import Area
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredArea, RetiredNodes, RetiredWindow, Subject
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -26,6 +26,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.retired_nodes import without_nodes
 from mapweave.storage.map_file import pack_map_file, unpack_map_file
 from synthetic.fleet import FleetSettings, draw_fleet
+from synthetic.maps import changes_of, map_tours, merger_of, numbered
 from synthetic.world import room, take_map, take_view
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -82,13 +83,8 @@ def test_where_several_ways_meet_bridges_lead_from_one_node_to_all_others() -> N
 def merger() -> Merger:
     """Two robots go round one hall, both with the same twelve stops."""
     rng = np.random.default_rng(3)
-    world = room(0, 0, 7, 5, 900, rng)
-    merger = Merger()
-    for map_id in (A, B):
-        nodes, edges = take_map(world, map_id, stops(12), rng, None, 0.01, 0.01)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
-    return merger
+    tours = dict.fromkeys((A, B), stops(12))
+    return merger_of(map_tours(room(0, 0, 7, 5, 900, rng), tours, rng, 0.01, 0.01))
 
 
 def stops(count: int) -> list[Pose2]:
@@ -153,9 +149,8 @@ def test_an_area_holds_for_all_maps_and_for_nodes_that_come_later(merger: Merger
     rng = np.random.default_rng(9)
     world = room(0, 0, 7, 5, 900, np.random.default_rng(3))
     third = MapId("c", 1)
-    nodes, edges = take_map(world, third, stops(12), rng, None, 0.01, 0.01)
-    for k, change in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
-        merger.on_change(Change(third, k, 0, change))
+    for change in numbered(third, map_tours(world, {third: stops(12)}, rng, 0.01, 0.01)[third]):
+        merger.on_change(change)
     later = merger.merged()
     assert {node for node in later.constraints.nodes if node.map == third} == set(ids(third, 11, 13))
     assert later.joined(third, A)
@@ -173,7 +168,7 @@ def test_a_time_window_holds_for_nodes_that_come_later(merger: Merger) -> None:
     merger.places.announce(nodes[12])
     late = ActiveNodes(merger.places, {node.id: node for node in nodes}.get, merged)
     assert late.node(nodes[12].id) is None and late.node(nodes[16].id) is not None
-    for change in [*map(NodePut, nodes[12:]), *map(EdgePut, edges[11:])]:
+    for change in changes_of(nodes[12:], edges[11:]):
         merger.apply(A, change)
     assert merger.merged().constraints.nodes.keys() == set(ids(A, *range(15, 31, 2)))
 
@@ -187,9 +182,7 @@ def test_a_map_that_only_loops_hold_together_falls_apart_and_that_is_said_before
     true = fleet.truth[nodes[1]].inverse() @ fleet.truth[nodes[4]]
     loop = Edge(cut.id, nodes[1], nodes[4], PoseGaussian.from_sigmas(true, 0.02, 0.01), EdgeKind.LOOP)
     whole.apply(EdgePut(loop))
-    merger = Merger()
-    for change in whole.contents():
-        merger.apply(map_id, change)
+    merger = merger_of({map_id: whole.contents()})
     asked = constrained(RetiredNodes((nodes[1],))).made[0]
     said = check_manual_constraint(merger.merged(), ManualConstraints(), asked).effects
     assert f"map {map_id} falls into 2 pieces of 4, 3 nodes" in said

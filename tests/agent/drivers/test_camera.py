@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.server
 import threading
 import time
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ import pytest
 from mapweave.agent.drivers.camera import Capture
 from mapweave.agent.drivers.settings import CameraSettings
 from mapweave.hybridmap.errors import DeviceError
+from tests.mjpeg_stream import MjpegStream
 
 WIDTH, HEIGHT = 64, 48
 RATE = 20.0
@@ -85,45 +85,23 @@ def test_a_source_that_is_not_there(source: str, words: str) -> None:
         Capture(settings(source))
 
 
-class Stream:
-    """An MJPEG stream over HTTP, as network cameras and phones give it; frames say when they were made."""
+class Stream(MjpegStream):
+    """Frames say when they were made."""
 
     def __init__(self) -> None:
-        stream = self
         self.number = 0
         self.stop = threading.Event()
+        super().__init__(self._frame)
 
-        class Handler(http.server.BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                self.send_response(200)
-                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-                self.end_headers()
-                while not stop_of(stream).wait(1 / RATE):
-                    stream.number += 1
-                    image = np.full((HEIGHT, WIDTH, 3), shade(stream.number), np.uint8)
-                    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
-                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                    try:
-                        self.wfile.write(head.encode() + jpeg + b"\r\n")
-                    except OSError:
-                        return
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self.server.server_address[1]}/stream.mjpg"
-        threading.Thread(target=self.server.serve_forever, args=(0.02,), daemon=True).start()
+    def _frame(self) -> bytes | None:
+        if self.stop.wait(1 / RATE):
+            return None
+        self.number += 1
+        return cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), shade(self.number), np.uint8))[1].tobytes()
 
     def close(self) -> None:
         self.stop.set()
-        self.server.shutdown()
-        self.server.server_close()
-
-
-def stop_of(stream: Stream) -> threading.Event:
-    return stream.stop
+        super().close()
 
 
 @pytest.fixture

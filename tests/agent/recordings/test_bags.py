@@ -21,17 +21,13 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from mapweave.agent.drivers.recorded import RecordedRobot
 from mapweave.agent.drivers.replay import Replay
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.recordings import bag
-from mapweave.agent.recordings.mcap_writer import FLUSH_S, PART_S
+from mapweave.agent.recordings.mcap_writer import FLUSH_S
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
-from mapweave.vision.equidistant import Equidistant
-from mapweave.vision.lens import NO_DISTORTION, Distortion
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -277,68 +273,6 @@ def test_all_of_a_killed_recorder_but_the_last_seconds_is_there(drive: Drive, tm
         assert sum(1 for _ in reader.messages()) == reader.message_count
 
 
-LIFTED = (3, 4, 8)
-"""Images at which the robot below is lifted."""
-
-
-class Driven:
-    """A robot that senses a drive, and is lifted on it."""
-
-    def __init__(self, drive: Drive, lens: Distortion = (-0.1, 0.02, 0.001, 0.0, 0.0)) -> None:
-        self._drive, self._lens, self._at, self.closed = drive, lens, 0, False
-
-    def describe(self) -> RobotDescription:
-        return RobotDescription(
-            camera=self._drive.camera,
-            distortion=self._lens,
-            ranger_bearings=(0.0, 0.5),
-            ranger_reach=2.0,
-        )
-
-    def sense(self) -> Observation | None:
-        k, self._at = self._at, self._at + 1
-        if k == COUNT:
-            return None
-        forward, turn = self._drive.increments[k]
-        return Observation(
-            self._drive.stamps_ns[k], Odometry(forward, turn), self._drive.images[k], np.array([1.0, 2.0]),
-            kidnapped=k in LIFTED,
-        )  # fmt: skip
-
-    def act(self, command: Command) -> Command:
-        return Command(min(command.forward, 0.3), command.turn)
-
-    def close(self) -> None:
-        self.closed = True
-
-
-def record(drive: Drive, folder: Path, lossless: bool = True, *lens: Distortion) -> Driven:
-    robot = Driven(drive, *lens)
-    recorded = RecordedRobot(robot, folder, lossless)
-    recorded.describe()
-    while recorded.sense() is not None:
-        assert recorded.act(Command(0.5, 0.1)) == Command(0.3, 0.1)
-    recorded.close()
-    return robot
-
-
-def test_what_a_robot_recorded_is_replayed_as_it_sensed_it(drive: Drive, tmp_path: Path) -> None:
-    robot = record(drive, tmp_path / "walk")
-    assert robot.closed
-    replay = Replay(tmp_path / "walk")
-    assert replay.describe().camera == drive.camera
-    assert replay.describe().distortion == robot.describe().distortion
-    seen = list(iter(replay.sense, None))
-    assert [observation.stamp_ns for observation in seen] == drive.stamps_ns
-    assert [k for k, observation in enumerate(seen) if observation.kidnapped] == [*LIFTED]
-    assert "the robot was lifted 2 times" in replay.recording.notes
-    for observation, grey, increment in zip(seen, drive.images, drive.increments, strict=True):
-        assert np.array_equal(observation.image, grey)
-        assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx(
-            tuple(increment), abs=1e-9
-        )
-
-
 def test_a_robot_that_is_lifted_between_two_images_was_lifted_at_the_second(
     drive: Drive, tmp_path: Path
 ) -> None:
@@ -347,92 +281,6 @@ def test_a_robot_that_is_lifted_between_two_images_was_lifted_at_the_second(
     write_bag(tmp_path / "drive", drive, "bgra8", lifted=said)
     seen = list(iter(Replay(tmp_path / "drive", options=RecordingOptions(camera_height=0.3)).sense, None))
     assert [k for k, observation in enumerate(seen) if observation.kidnapped] == [3, 6, 7]
-
-
-def test_a_fisheyes_recording_names_its_lens_as_ros_does(drive: Drive, tmp_path: Path) -> None:
-    fisheye = Equidistant(115.0, 115.5, 158.7, 120.9, (-0.02, 0.004, -0.003, 0.0005))
-    ideal = fisheye.ideal(320, 240, drive.camera.mount_height)
-    record(replace(drive, camera=ideal), tmp_path / "walk", True, fisheye)
-    with AnyReader([tmp_path / "walk" / "walk_0"]) as reader:
-        (topic,) = (c for c in reader.connections if c.topic.endswith("camera_info"))
-        _, _, data = next(reader.messages([topic]))
-        message: Any = reader.deserialize(data, topic.msgtype)
-    assert message.distortion_model == "equidistant"
-    assert message.k.tolist() == [115.0, 0, 158.7, 0, 115.5, 120.9, 0, 0, 1]
-    assert tuple(message.d) == fisheye.k
-    described = Replay(tmp_path / "walk").describe()
-    assert (described.camera, described.distortion) == (ideal, NO_DISTORTION)
-
-
-def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> None:
-    """Read by rosbags with the definitions in the file itself."""
-    record(drive, tmp_path / "walk", lossless=False)
-    with AnyReader([tmp_path / "walk" / "walk_0"]) as reader:
-        kinds = {c.topic: (c.msgtype, c.msgcount) for c in reader.connections}
-        assert kinds == {
-            "/tf_static": ("tf2_msgs/msg/TFMessage", 1),
-            "/camera/image/compressed": ("sensor_msgs/msg/CompressedImage", COUNT),
-            "/camera/camera_info": ("sensor_msgs/msg/CameraInfo", COUNT),
-            "/odom": ("nav_msgs/msg/Odometry", COUNT),
-            "/cmd_vel": ("geometry_msgs/msg/TwistStamped", COUNT),
-            "/kidnap_status": (KIDNAP, 4),
-            "/proximity/0": ("sensor_msgs/msg/Range", COUNT),
-            "/proximity/1": ("sensor_msgs/msg/Range", COUNT),
-        }
-        for connection, stamp, data in reader.messages():
-            message = reader.deserialize(data, connection.msgtype)
-            if connection.topic == "/cmd_vel":
-                assert message.twist.linear.x == (0.0 if stamp == BEGUN_NS else 0.3)
-            if connection.topic == "/tf_static":
-                (mount,) = message.transforms
-                assert mount.transform.translation.z == 0.3 and mount.header.frame_id == "base_footprint"
-
-
-def test_a_long_recording_is_a_row_of_files(drive: Drive, tmp_path: Path) -> None:
-    gap = round((PART_S + 1.0) * 1e9 / 4)
-    slow = Drive(drive.images, [BEGUN_NS + k * gap for k in range(COUNT)], drive.poses, drive.camera)
-    record(slow, tmp_path / "walk")
-    assert sorted(p.name for p in (tmp_path / "walk").iterdir()) == ["walk_0", "walk_1", "walk_2"]
-    assert [o.stamp_ns for o in iter(Replay(tmp_path / "walk").sense, None)] == slow.stamps_ns
-    # The last folder of a robot whose battery failed has no index.
-    (tmp_path / "walk" / "walk_2" / "metadata.yaml").unlink()
-    assert len(Replay(tmp_path / "walk")) == COUNT
-    file = tmp_path / "walk" / "walk_2" / "walk_2.mcap"
-    file.write_bytes(file.read_bytes()[:-100])
-    replay = Replay(tmp_path / "walk")
-    assert len(replay) == COUNT and "walk_2.mcap: damaged or cut off" in replay.damage[0]
-    assert [k for k, seen in enumerate(iter(replay.sense, None)) if seen.kidnapped] == [*LIFTED]
-    file.write_bytes(b"")
-    assert len(Replay(tmp_path / "walk")) == 8
-
-
-def test_a_recording_overwrites_nothing(drive: Drive, tmp_path: Path) -> None:
-    (tmp_path / "walk").mkdir()
-    (tmp_path / "walk" / "notes.txt").write_text("mine")
-    with pytest.raises(DeviceError, match="not empty; a recording overwrites nothing"):
-        RecordedRobot(Driven(drive), tmp_path / "walk")
-
-
-def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, tmp_path: Path) -> None:
-    """One reading instead of two. What came before is kept, and the robot goes on."""
-    lines: list[str] = []
-    robot = Driven(drive)
-    recorded = RecordedRobot(robot, tmp_path / "walk", print_line=lines.append)
-    recorded.describe()
-    whole = robot.sense
-
-    def sense() -> Observation | None:
-        observation = whole()
-        if observation is None or observation.stamp_ns <= drive.stamps_ns[4]:
-            return observation
-        return replace(observation, proximity=np.ones(1))
-
-    robot.sense = sense  # type: ignore[method-assign]
-    assert len(list(iter(recorded.sense, None))) == COUNT
-    recorded.close()
-    (line,) = lines
-    assert line.startswith(f"{tmp_path / 'walk'}: the recording ends here, ") and "\n" not in line
-    assert len(Replay(tmp_path / "walk")) >= 5
 
 
 def test_a_camera_topic_that_lost_its_messages_is_reported_in_one_line() -> None:

@@ -104,7 +104,6 @@ def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: Ha
         (MAP, 1, 10), (MAP, 2, 10), (MAP, 3, 10), (MAP, 4, 20),
     ]  # fmt: skip
     assert {sample.key for sample in server.changes} == {KEYS.change(MAP)}
-    assert agent.replicator.status().bytes_sent == sum(len(s.payload) for s in server.changes)
 
 
 def test_the_longest_status_period_that_servers_want_counts(agent: Agent, hub: MemoryHub) -> None:
@@ -211,7 +210,6 @@ def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: Han
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
     assert not agent.replicator.wait_acknowledged(0.05)
-    assert agent.replicator.status().since_ack == float("inf")
     server.acknowledge(agent.log_id, 3)
     other = HandServer(hub, "s1")
     other.acknowledge(agent.log_id, 2)
@@ -221,7 +219,6 @@ def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: Han
     other.acknowledge(agent.log_id, 3)
     assert agent.replicator.wait_acknowledged(30)
     assert agent.replicator.status().unacknowledged == 0
-    assert agent.replicator.status().since_ack < 5
     agent.close()
     other.bus.close()
 

@@ -23,12 +23,10 @@ def test_coverage_counts_cells(pixels):
 def test_figures_are_those_of_the_tracks():
     pixels = np.array([[10.0, 10.0], [15.0, 12.0], [310.0, 230.0]])
     misses = np.array([[3.0, 4.0], [0.0, 1.0], [0.0, -2.0]])
-    report = TrackQuality.of(CAMERA, pixels, np.array([1, 5, 40]), np.array([True, True, False]), misses)
-    assert (report.alive, report.age_median, report.age_longest) == (3, 5.0, 40)
-    assert report.held == 2 / 3
+    report = TrackQuality.of(CAMERA, pixels, np.array([1, 5, 40]), misses)
+    assert (report.alive, report.age_median) == (3, 5.0)
     assert report.coverage == 2 / 16
     assert report.error_px_median == 2.0
-    assert math.isclose(report.error_px_p95, 2.0 + 0.9 * 3.0), "linear between the second and the third"
     assert str(report) == (
         "3 tracks over 12 % of the image, 5 images old in the median, 2.00 px from where they should be"
     )
@@ -36,9 +34,7 @@ def test_figures_are_those_of_the_tracks():
 
 def test_without_tracks_nothing_is_claimed():
     none = np.zeros((0, 2))
-    report = TrackQuality.of(CAMERA, none, np.zeros(0, np.int64), np.zeros(0, bool), none)
-    assert (report.alive, report.age_median, report.age_longest, report.coverage) == (0, 0.0, 0, 0.0)
+    report = TrackQuality.of(CAMERA, none, np.zeros(0, np.int64), none)
+    assert (report.alive, report.age_median, report.coverage) == (0, 0.0, 0.0)
     assert math.isnan(report.error_px_median)
-    assert math.isnan(report.error_px_p95)
-    assert math.isnan(report.held)
     assert str(report) == "0 tracks over 0 % of the image"

@@ -15,13 +15,12 @@ import pytest
 
 from mapweave.hybridmap.annotation import Annotation, Closure, Floor, Pin, Place, Preference
 from mapweave.hybridmap.area import inside
-from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredArea, RetiredMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.settings import MergeSettings
@@ -30,9 +29,10 @@ from mapweave.read_only_server import ReadOnlyServer
 from mapweave.storage.map_file import write_map_file
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from synthetic.world import room, take_map
+from synthetic.maps import map_tours, write_store
+from synthetic.world import room
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.test_corrections import FIRST, LAST, TRUE, A, B, entries
+from tests.mapserver.test_corrections import FIRST, LAST, TRUE, A, B
 from tests.waiting import eventually, free_port
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -52,11 +52,7 @@ def logs() -> dict[MapId, list[ChangeBody]]:
         A: [Pose2(2.5 - 0.6 * (2 - k), 2.5, 1.0 * k) for k in range(3)],
         B: [Pose2(2.7 + 0.6 * k, 2.4, 2.05 + 1.0 * k) for k in range(3)],
     }
-    out: dict[MapId, list[ChangeBody]] = {}
-    for map_id, poses in walks.items():
-        nodes, edges = take_map(world, map_id, poses, rng, None, 0.01, 0.01)
-        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    return out
+    return map_tours(world, walks, rng, 0.01, 0.01)
 
 
 class Person:
@@ -128,11 +124,8 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[MapServer]:
-    store = SqliteStore(tmp_path / "s0.sqlite")
-    for map_id, changes in logs().items():
-        store.apply(map_id, 7, entries(map_id, changes), len(changes))
-    store.close()
-    with MapServer(MemoryBus(MemoryHub()), Keys("demo"), tmp_path / "s0.sqlite", "s0") as server:
+    path = write_store(tmp_path / "s0.sqlite", logs())
+    with MapServer(MemoryBus(MemoryHub()), Keys("demo"), path, "s0") as server:
         assert server.settle(60.0)
         yield server
 

@@ -10,7 +10,8 @@ from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from synthetic.world import room, take_map
+from synthetic.maps import map_tours
+from synthetic.world import room
 
 Log = list[tuple[MapId, ChangeBody]]
 LIAR = MapId("liar", 1)
@@ -22,11 +23,8 @@ def sound() -> Log:
     rng = np.random.default_rng(1)
     world = room(0, 0, 5, 4, 600, rng)
     tour = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
-    log: Log = []
-    for agent in ("r0", "r1"):
-        nodes, edges = take_map(world, MapId(agent, 1), tour, rng)
-        log += [(MapId(agent, 1), change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))]
-    return log
+    logs = map_tours(world, {MapId(agent, 1): tour for agent in ("r0", "r1")}, rng)
+    return [(map_id, change) for map_id, log in logs.items() for change in log]
 
 
 def said(merged: MergedMap) -> tuple[object, ...]:

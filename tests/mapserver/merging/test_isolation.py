@@ -26,6 +26,7 @@ from mapweave.merge import merging
 from mapweave.merge.outlier_rejection import decision_cache
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_merge import merge_parts
+from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 
 Log = list[tuple[MapId, ChangeBody]]
@@ -77,11 +78,11 @@ def logs() -> dict[MapId, Log]:
     rng = np.random.default_rng(1)
     here, elsewhere = room(0, 0, 5, 4, 600, rng), room(0, 0, 5, 4, 600, rng)
     tour = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
-    out: dict[MapId, Log] = {}
-    for map_id, world in ((R0, here), (R1, here), (BAD, elsewhere), (WORSE, here)):
-        nodes, edges = take_map(world, map_id, tour, rng)
-        out[map_id] = [(map_id, change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))]
-    return out
+    worlds = {R0: here, R1: here, BAD: elsewhere, WORSE: here}
+    return {
+        map_id: [(map_id, change) for change in changes_of(*take_map(world, map_id, tour, rng))]
+        for map_id, world in worlds.items()
+    }
 
 
 def merger_of(result: dict[MapId, Log], *maps: MapId) -> Merger:

@@ -18,6 +18,7 @@ from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings
 from mapweave.mapserver.routes import NEAR, Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.recognition import examine_matches
+from synthetic.maps import changes_of, merger_of
 from synthetic.world import Sensing, World, room, take_map, take_view
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -38,7 +39,7 @@ class Scene:
             stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(7)]
             nodes, edges = take_map(self.world, map_id, stops, rng)
             self.truth |= {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
-            self.logs[map_id] = [(map_id, NodePut(n)) for n in nodes] + [(map_id, EdgePut(e)) for e in edges]
+            self.logs[map_id] = [(map_id, change) for change in changes_of(nodes, edges)]
 
     def merger(self, log: Log) -> Merger:
         merger = Merger()
@@ -244,9 +245,7 @@ def test_two_similar_rooms_are_ambiguous() -> None:
     world = one + room(5, 0, 5, 4, 500, rng) + one.moved(Pose2(40, 0, 0))
     stops = [Pose2(x + 2.2, 2, 0.6 * k) for x in (0, 5, 40) for k in range(4)]
     nodes, edges = take_map(world, A, stops, rng)
-    merger = Merger()
-    for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-        merger.apply(A, body)
+    merger = merger_of({A: changes_of(nodes, edges)})
     service = relocalizer(merger)
     view, _ = take_view(world, stops[1] @ Pose2(0.1, 0.05, 0.05), rng)
     answer = service.answer(view)

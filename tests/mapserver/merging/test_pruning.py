@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.annotation import Annotations
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint
@@ -34,6 +34,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.opened_map import open_map
 from mapweave.storage.map_file import pack_map_file, unpack_map_file
 from mapweave.wire.codec import encode_change
+from synthetic.maps import changes_of, numbered
 from synthetic.world import room, take_map
 
 MAPS = OLD, OTHER, NEW = MapId("r0", 1), MapId("r1", 1), MapId("r0", 2)
@@ -51,8 +52,7 @@ class Logs:
         for map_id, y, heading in ((OLD, 2.0, 0.3), (OTHER, 1.8, 0.35), (NEW, 2.15, 0.25)):
             tour = [Pose2(1.5 + 0.6 * k, y, heading) for k in range(7)]
             nodes, edges = take_map(world, map_id, tour, rng, sigma_xy=0.01, sigma_heading=0.01)
-            bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-            self.changes[map_id] = [Change(map_id, k + 1, BEGIN, body) for k, body in enumerate(bodies)]
+            self.changes[map_id] = numbered(map_id, changes_of(nodes, edges), stamp_ns=BEGIN)
 
 
 @pytest.fixture(scope="module")

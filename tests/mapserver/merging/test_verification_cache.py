@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
@@ -23,7 +23,8 @@ from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict
 from mapweave.merge.settings import ExclusionSettings, MergeSettings
-from synthetic.world import room, take_map
+from synthetic.maps import map_tours
+from synthetic.world import room
 from tests.quick import first_quick
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -35,12 +36,11 @@ def logged() -> Log:
     """Two robots in three rooms, of which they share one."""
     rng = np.random.default_rng(1)
     world = room(0, 0, 5, 4, 500, rng) + room(5, 0, 5, 4, 700, rng) + room(10, 0, 5, 4, 500, rng)
-    log: Log = []
-    for map_id, rooms in ((A, (0, 5)), (B, (5, 10))):
-        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.9 * k) for x in rooms for k in range(7)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        log += [(map_id, change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))]
-    return log
+    tours = {
+        map_id: [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.9 * k) for x in rooms for k in range(7)]
+        for map_id, rooms in ((A, (0, 5)), (B, (5, 10)))
+    }
+    return [(map_id, change) for map_id, log in map_tours(world, tours, rng).items() for change in log]
 
 
 def read(log: Log, path: Path | None = None) -> Merger:

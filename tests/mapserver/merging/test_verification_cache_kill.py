@@ -18,14 +18,11 @@ import hashlib, json, sys, time
 from pathlib import Path
 import pytest
 import numpy as np
-from synthetic.world import room, take_map
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from synthetic.maps import map_tours, write_store
+from synthetic.world import room
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.server import MapServer
-from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 
@@ -33,15 +30,12 @@ path = Path(sys.argv[1])
 if not path.exists():
     rng = np.random.default_rng(3)
     world = room(0, 0, 5, 4, 500, rng) + room(5, 0, 5, 4, 700, rng) + room(10, 0, 5, 4, 500, rng)
-    store = SqliteStore(path)
-    for agent, rooms in (("a", (0, 5)), ("b", (5, 10)), ("c", (0, 10)), ("d", (0, 5))):
-        map_id = MapId(agent, 1)
-        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.6 * k) for x in rooms for k in range(6)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        for k, body in enumerate((*map(NodePut, nodes), *map(EdgePut, edges)), 1):
-            change = Change(map_id, k, 0, body)
-            store.apply(map_id, 7, [Entry(k, encode_change(change), change)])
-    store.close()
+    rooms = {"a": (0, 5), "b": (5, 10), "c": (0, 10), "d": (0, 5)}
+    tours = {
+        MapId(agent, 1): [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.6 * k) for x in seen for k in range(6)]
+        for agent, seen in rooms.items()
+    }
+    write_store(path, map_tours(world, tours, rng))
 with MapServer(MemoryBus(MemoryHub()), Keys(), path, "s0") as server:
     began = time.thread_time()
     assert server.settle(120)

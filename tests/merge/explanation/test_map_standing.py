@@ -6,26 +6,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.explanation.map_standing import map_standings
+from synthetic.maps import changes_of, looking_around, merger_of
 from synthetic.world import World, room, take_map
 
-TOUR = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
 FIRST, SECOND, THIRD = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 
 
-def merger_of(*maps: tuple[MapId, World]) -> Merger:
-    rng, merger = np.random.default_rng(6), Merger()
-    for map_id, world in maps:
-        nodes, edges = take_map(world, map_id, TOUR, rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
-    return merger
+def mapping(*maps: tuple[MapId, World]) -> Merger:
+    rng = np.random.default_rng(6)
+    return merger_of(
+        {map_id: changes_of(*take_map(world, map_id, looking_around(4), rng)) for map_id, world in maps}
+    )
 
 
 def worlds(*seeds: int) -> Sequence[World]:
@@ -34,7 +30,7 @@ def worlds(*seeds: int) -> Sequence[World]:
 
 def test_links_and_the_newest_node_are_those_of_the_map() -> None:
     here, elsewhere = worlds(1, 2)
-    merged = merger_of((FIRST, here), (SECOND, here), (THIRD, elsewhere)).merged()
+    merged = mapping((FIRST, here), (SECOND, here), (THIRD, elsewhere)).merged()
     standings = map_standings(merged)
     across = [link for link in merged.links if link.a.map != link.b.map]
     assert len(across) > 0
@@ -49,12 +45,12 @@ def test_links_and_the_newest_node_are_those_of_the_map() -> None:
 
 def test_a_map_alone_lacks_nothing() -> None:
     (here,) = worlds(1)
-    assert map_standings(merger_of((FIRST, here)).merged())[FIRST].apart == ""
+    assert map_standings(mapping((FIRST, here)).merged())[FIRST].apart == ""
 
 
 def test_the_reason_is_that_of_people_or_of_the_merge() -> None:
     (here,) = worlds(1)
-    merger = merger_of((FIRST, here), (SECOND, here), (THIRD, here))
+    merger = mapping((FIRST, here), (SECOND, here), (THIRD, here))
     merger.constrain(
         ManualConstraints((ManualConstraint(RetiredMap(THIRD), True, "anna", 1, "moved house"),))
     )

@@ -35,7 +35,8 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.recognition import RecognitionSettings
-from synthetic.world import room, take_map
+from synthetic.maps import map_tours, merger_of
+from synthetic.world import room
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 
@@ -49,13 +50,12 @@ def merged() -> MergedMap:
 def fleet() -> Merger:
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 600, rng) + room(5, 0, 5, 4, 800, rng) + room(20, 0, 5, 4, 600, rng)
-    merger = Merger()
-    for map_id, rooms in ((A, (0, 5)), (B, (5,)), (C, (20,))):
-        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
-    return merger
+    return merger_of(map_tours(world, {A: tour(0, 5), B: tour(5), C: tour(20)}, rng))
+
+
+def tour(*rooms: float) -> list[Pose2]:
+    """A turn in each room, which begins at this x."""
+    return [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
 
 
 def between(merged: MergedMap) -> list[Link]:
@@ -311,12 +311,8 @@ def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
     """A server that starts again joins all maps with one merge; it listed some links twice."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 900, rng)
-    merger = Merger()
-    for map_id in [MapId(name, 1) for name in "abcdef"]:
-        nodes, edges = take_map(world, map_id, [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)], rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
-    merged = merger.merged()
+    stops = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
+    merged = merger_of(map_tours(world, {MapId(name, 1): stops for name in "abcdef"}, rng)).merged()
     assert len(merged.components) == 1
     result = joinings((), merged)
     assert (
@@ -344,12 +340,7 @@ def test_a_split_by_a_retired_map_names_the_person() -> None:
     """Two robots in two rooms, and one that has been in both."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 600, rng) + room(5, 0, 5, 4, 800, rng)
-    merger = Merger()
-    for map_id, rooms in ((A, (0,)), (B, (0, 5)), (C, (5,))):
-        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
+    merger = merger_of(map_tours(world, {A: tour(0), B: tour(0, 5), C: tour(5)}, rng))
     before = merger.merged()
     assert before.joined(A, C)
     constraint = ManualConstraint(RetiredMap(B), True, "anna", 0, "moved house")

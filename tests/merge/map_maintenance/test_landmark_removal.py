@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap import superseding
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
@@ -21,6 +21,7 @@ from mapweave.merge.map_maintenance import landmark_removal as removal
 from mapweave.merge.map_maintenance.landmark_observations import LandmarkObservations, expected
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover, detection_rate, presence, things
 from mapweave.merge.pose_graph.links import Link
+from synthetic.maps import changes_of
 from synthetic.world import CAMERA, Sensing, World, random_vectors, room, take_map, take_node
 
 SHARP = Sensing(unknown_depth=0.0, clutter=5, most=150)
@@ -235,8 +236,7 @@ def _drive(
     merger: Merger, world: World, map_id: MapId, tour: list[Pose2], rng: np.random.Generator
 ) -> HybridMap:
     nodes, edges = take_map(world, map_id, tour, rng, SHARP, sigma_xy=0.01, sigma_heading=0.005)
-    changes: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-    for number, change in enumerate(changes, start=1):
+    for number, change in enumerate(changes_of(nodes, edges), start=1):
         stamp = int(map_id.agent[1:]) * 10**12
         if isinstance(change, NodePut):
             change = NodePut(replace(change.node, stamp_ns=stamp + change.node.stamp_ns, clock="wall"))

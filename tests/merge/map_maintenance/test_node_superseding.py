@@ -9,7 +9,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.change import Change, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
@@ -30,6 +30,7 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import verify
 from mapweave.storage.map_file import pack_map_file, unpack_map_file
+from synthetic.maps import changes_of, map_tours, numbered
 from synthetic.world import room, take_map, take_view
 from tests.quick import first_quick
 
@@ -48,8 +49,7 @@ class Drives:
             tour = [Pose2(1.5 + 0.8 * k, y, heading) for k in range(5)]
             nodes, edges = take_map(self.world, map_id, tour, rng, sigma_xy=0.01, sigma_heading=0.01)
             self.truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
-            changes = [*map(NodePut, nodes), *map(EdgePut, edges)]
-            self.changes[map_id] = [Change(map_id, k + 1, 0, body) for k, body in enumerate(changes)]
+            self.changes[map_id] = numbered(map_id, changes_of(nodes, edges))
 
     def merger(self, *maps: MapId) -> Merger:
         merger = Merger()
@@ -175,11 +175,9 @@ def test_the_active_nodes_stay_few_over_many_drives(drives: Drives) -> None:
     merger, counts = Merger(), []
     for epoch in range(1, 6):
         tour = [Pose2(1.5 + 0.8 * k + rng.normal(0, 0.1), 2.0 + rng.normal(0, 0.1), 0.3) for k in range(4)]
-        nodes, edges = take_map(
-            drives.world, MapId("r0", epoch), tour, rng, sigma_xy=0.01, sigma_heading=0.01
-        )
-        for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
-            merger.on_change(Change(MapId("r0", epoch), k + 1, 0, body))
+        map_id = MapId("r0", epoch)
+        for change in numbered(map_id, map_tours(drives.world, {map_id: tour}, rng, 0.01, 0.01)[map_id]):
+            merger.on_change(change)
         counts.append(len(active(merger.merged())))
     assert counts[0] == 4 and max(counts) <= 8, counts
 
@@ -223,9 +221,9 @@ def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(
     merger = Merger()
     for epoch in range(1, 5):
         tour = [Pose2(*rng.uniform([1.5, 1.5], [3.5, 2.5]), rng.uniform(-0.6, 0.6)) for _ in range(6)]
-        nodes, edges = take_map(world, MapId("r0", epoch), tour, rng, sigma_xy=0.01, sigma_heading=0.01)
-        for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
-            merger.on_change(Change(MapId("r0", epoch), k + 1, 0, body))
+        map_id = MapId("r0", epoch)
+        for change in numbered(map_id, map_tours(world, {map_id: tour}, rng, 0.01, 0.01)[map_id]):
+            merger.on_change(change)
         merged = merger.merged()
         alive, replaced = active(merged), dict[NodeId, list[NodeId]]()
         for node, fate in merged.superseded.items():
@@ -258,8 +256,8 @@ def test_nodes_of_today_are_searched_even_if_superseded(drives: Drives) -> None:
     nodes, edges = take_map(drives.world, MapId("r2", 1), tour, rng, sigma_xy=0.01, sigma_heading=0.01)
     for k, node in enumerate(nodes):
         nodes[k] = replace(node, stamp_ns=node.stamp_ns + 10**12)
-    for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
-        merger.on_change(Change(MapId("r2", 1), k + 1, 0, body))
+    for change in numbered(MapId("r2", 1), changes_of(nodes, edges)):
+        merger.on_change(change)
     merged = merger.merged()
     assert {node.map for node in merged.superseded} == {OLD}
     assert all(node in merger.places for node in merged.poses)

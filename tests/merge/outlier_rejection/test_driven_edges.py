@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.change import EdgePut, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.routes import Router
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import verify
+from synthetic.maps import changes_of, merger_of
 from synthetic.world import room, take_map
 
 A, B, GUEST = MapId("a", 1), MapId("b", 1), MapId("guest", 1)
@@ -31,7 +31,7 @@ class Scene:
             stops = [Pose2(1.2 + 0.8 * k, y, 0.1 * k) for k in range(5)]
             nodes, edges = take_map(world, map_id, stops, rng)
             self.truth |= {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
-            self.maps[map_id] = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+            self.maps[map_id] = HybridMap(changes_of(nodes, edges))
         self.a, self.b = (sorted(self.maps[map_id].nodes) for map_id in (A, B))
 
     def merged(self, linked: bool = True) -> MergedMap:
@@ -97,10 +97,7 @@ def test_a_drive_to_a_node_that_is_gone_is_left_out(scene: Scene) -> None:
 
 def test_the_server_still_compares_nodes_connected_by_a_drive(scene: Scene) -> None:
     """Neighbours on a robot's way are not compared, for they share its tracks; ends of a drive do not."""
-    merger = Merger()
-    for map_id in (A, B):
-        for change in scene.maps[map_id].contents():
-            merger.apply(map_id, change)
+    merger = merger_of({map_id: scene.maps[map_id].contents() for map_id in (A, B)})
     links = [link.pair for link in merger.merged().links]
     assert links
     for a, b in links:

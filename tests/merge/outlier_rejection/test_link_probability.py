@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -17,6 +16,7 @@ from mapweave.merge.outlier_rejection.link_probability import (
     standpoints,
 )
 from mapweave.merge.pose_graph.links import Link
+from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 
 
@@ -35,7 +35,7 @@ def fleet(seed: int, false_share: float, links: int = 60) -> tuple[np.ndarray, n
         for _ in range(24):
             tour.append(tour[-1] @ Pose2(rng.uniform(0.3, 0.8), 0, rng.normal(0, 0.6)))
         nodes, edges = take_map(hall, MapId(agent, 1), tour, rng, sigma_xy=0.02, sigma_heading=0.01)
-        maps[MapId(agent, 1)] = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+        maps[MapId(agent, 1)] = HybridMap(changes_of(nodes, edges))
         truth |= {node.id: stop for node, stop in zip(nodes, tour, strict=True)}
     ids = sorted(truth)
     pairs = [(a, b) for a in ids for b in ids if a < b and a.map != b.map]

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Apart, RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -17,7 +16,8 @@ from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import frame_changes
-from synthetic.world import room, take_map
+from synthetic.maps import looking_around, map_tours, merger_of
+from synthetic.world import room
 
 A, B = MapId("a", 1), MapId("b", 1)
 APART = ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 10**18)])
@@ -28,15 +28,9 @@ POSE = Pose2(120.25, -3.5, 2.5)
 def merger() -> Merger:
     """Two robots have looked around in one room."""
     rng = np.random.default_rng(6)
-    world = room(0, 0, 5, 4, 700, rng)
-    merger = Merger()
-    for map_id in (A, B):
-        # Each robot's frame is where it begins.
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in (range(4) if map_id == A else range(3, -1, -1))]
-        nodes, edges = take_map(world, map_id, stops, rng)
-        for change in [*map(NodePut, nodes), *map(EdgePut, edges)]:
-            merger.apply(map_id, change)
-    return merger
+    # Each robot's frame is where it begins.
+    tours = {A: looking_around(4), B: looking_around(4)[::-1]}
+    return merger_of(map_tours(room(0, 0, 5, 4, 700, rng), tours, rng))
 
 
 def merged(merger: Merger, *pins: Pin, apart: bool = False) -> MergedMap:
