@@ -49,6 +49,7 @@ class FleetClient:
         placed: Callable[[], int] = lambda: 0,
         teleoperation: Teleoperation | None = None,
         limits: tuple[float, float] = (0.0, 0.0),
+        failure: Callable[[], str] = lambda: "",
     ) -> None:
         """Announce the agent and listen for missions.
 
@@ -62,6 +63,7 @@ class FleetClient:
             placed: counts the nodes of the map with a merged pose; likewise.
             teleoperation: takes the commands of a person who drives; it outlives this map.
             limits: of the robot's speeds, m/s and rad/s, for that person.
+            failure: why nothing is saved or taken at present, empty if all is well; called from any thread.
         """
         self._bus = bus
         self._keys = keys
@@ -74,7 +76,7 @@ class FleetClient:
         self._battery: float | None = None
         self._trouble, self._trouble_at = "", 0.0
         self._missions = missions
-        self._unsent, self._placed = unsent, placed
+        self._unsent, self._placed, self._failure = unsent, placed, failure
         self._timeout = answer_timeout
         self._teleoperation, self._limits = teleoperation or Teleoperation(), limits
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
@@ -148,6 +150,9 @@ class FleetClient:
 
     def _now(self) -> AgentStatus:
         traffic = self._bus.traffic if isinstance(self._bus, TrafficMeter) else 0
+        # What fails now comes before a question that once had no answer.
+        failure = one_line(self._failure())
+        age = time.monotonic() - self._trouble_at if self._trouble and not failure else 0.0
         return AgentStatus(
             self._status,
             self._stamp_ns,
@@ -159,8 +164,8 @@ class FleetClient:
             self._placed(),
             self._missions.report,
             self._battery,
-            self._trouble,
-            time.monotonic() - self._trouble_at if self._trouble else 0.0,
+            failure or self._trouble,
+            age,
             self._skipped,
         )
 

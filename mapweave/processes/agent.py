@@ -228,6 +228,7 @@ class Agent:
             self._bus, self._keys, map_id, self.missions, options.synchronization.answer_timeout,
             self.replicator.unacknowledged, self._placed, self._teleoperation,
             (self._description.max_forward, self._description.max_turn),
+            lambda: self.replicator.status().failure,
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)
         self._trajectory = TrajectoryFile(path) if options.trajectories else None
@@ -319,7 +320,6 @@ class Agent:
             self._trajectory.close()
         self._fleet.close()
         self.merged_poses.close()
-        self.replicator.flush(10.0)
         self.replicator.close()
 
     def close(self) -> None:
@@ -372,12 +372,14 @@ def run_agent(
             agent.run(robot, stop)
         finally:
             robot.close()
-            path = agent.write_map()
-            nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
-            say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
-            agent.replicator.flush(10.0)
-            _hand_over(say, agent.replicator, bus, options)
-            agent.close()
+            try:
+                path = agent.write_map()
+                nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
+                say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
+            finally:
+                # The journal is complete also where a full disk takes no map file.
+                _hand_over(say, agent.replicator, bus, options)
+                agent.close()
 
 
 def rerun_log(target: str, robot: str) -> RerunLog:
@@ -413,6 +415,8 @@ def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> Rob
 def _hand_over(
     say: Callable[[str], None], replicator: Replicator, bus: ZenohBus, options: AgentOptions
 ) -> None:
+    if not replicator.flush(10.0):
+        return  # closing it says what is lost
     if options.patience <= 0:
         line = "offline: the map stays in the journal and is sent when a server can be reached"
     elif not bus.wait_connected(min(2.0, options.patience)):
