@@ -6,10 +6,11 @@ import math
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
-from mapweave.agent.mission import Answer, AnswerContent, Driven, Question, WhoIsNear
+from mapweave.agent.mission import Answer, AnswerContent, Driven, Question, WhereAmI, WhoIsNear
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.queries import best, decode_answer, encode_query, settles
 from mapweave.agent.teleoperation import Teleoperation
@@ -20,6 +21,7 @@ from mapweave.hybridmap.mission_order import MissionOrder
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import RelocalizeAnswer
 from mapweave.wire.bus import Bus, Reply, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
@@ -28,6 +30,8 @@ from mapweave.wire.senders import serve_senders
 from mapweave.wire.traffic_meter import TrafficMeter
 
 NO_ANSWER = "no map server answered"
+FAILED = "failed"
+"""In place of the certainty of an answer."""
 FAILOVER = 1.0
 """s behind the loss of a server or router in which a question without an answer is asked again: a session is
 at the next router in some 10 ms, and routers that lose one find another way between them in 0.1 s."""
@@ -36,7 +40,12 @@ ASK_AGAIN = 0.05
 
 
 class FleetClient:
-    """Runs beside the robot's loop, which never waits for it unless it asks to."""
+    """Runs beside the robot's loop, which never waits for it unless it asks to.
+
+    Attributes:
+        asked: questions that were sent, by their type.
+        relocalized: answers where a view was taken, by certainty; `failed` where none came.
+    """
 
     def __init__(
         self,
@@ -82,6 +91,8 @@ class FleetClient:
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
         self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._open_questions = 0
+        self.asked: Counter[type[Question]] = Counter()
+        self.relocalized: Counter[str] = Counter()
         self._closing = [
             *serve_senders(bus, keys.mission(map_id.agent), self._take_mission),
             bus.serve(keys.drive(map_id.agent), self._take_drive),
@@ -121,11 +132,12 @@ class FleetClient:
         self._status = replace(status, doing=one_line(status.doing), detail=one_line(status.detail))
         self._stamp_ns, self._battery, self._skipped = stamp_ns, battery, skipped
         if publish:
-            self._bus.publish(self._keys.agent_status(self._agent), encode(self._now()))
+            self._bus.publish(self._keys.agent_status(self._agent), encode(self.status()))
 
     def ask(self, question: Question) -> None:
         """Send a question; its answer comes with a later `answers`."""
         self._open_questions += 1
+        self.asked[type(question)] += 1
         self._asked.put(question)
 
     def answers(self, wait: bool = False) -> tuple[Answer, ...]:
@@ -148,7 +160,8 @@ class FleetClient:
             closing.close()
         self._asker.join(self._timeout + 1.0)
 
-    def _now(self) -> AgentStatus:
+    def status(self) -> AgentStatus:
+        """As others receive it; from any thread."""
         traffic = self._bus.traffic if isinstance(self._bus, TrafficMeter) else 0
         # What fails now comes before a question that once had no answer.
         failure = one_line(self._failure())
@@ -170,7 +183,7 @@ class FleetClient:
         )
 
     def _tell_status(self, request: Request) -> None:
-        request.reply(encode(self._now()))
+        request.reply(encode(self.status()))
 
     def _see_server(self, key: str, alive: bool) -> None:
         if alive:
@@ -195,11 +208,16 @@ class FleetClient:
 
     def _take_drive(self, request: Request) -> None:
         answer_ns = self._teleoperation.take(decode(request.payload, DriveRequest))
-        request.reply(encode(DriveAnswer(self._now(), answer_ns, *self._limits)))
+        request.reply(encode(DriveAnswer(self.status(), answer_ns, *self._limits)))
 
     def _ask_all(self) -> None:
         while (question := self._asked.get()) is not None:
-            self._answered.put(self._answer(question))
+            answer = self._answer(question)
+            if isinstance(question, WhereAmI):
+                where = answer.content
+                outcome = str(where.certainty) if isinstance(where, RelocalizeAnswer) else FAILED
+                self.relocalized[outcome] += 1
+            self._answered.put(answer)
 
     def _answer(self, question: Question) -> Answer:
         # An older server does not answer that: the robot maps as without one.

@@ -51,6 +51,7 @@ from mapweave.wire.traffic_meter import TrafficMeter
 from mapweave.wire.zenoh_bus import ZenohBus
 
 if TYPE_CHECKING:
+    from mapweave.processes.agent_metrics import AgentMetrics, AgentSources
     from mapweave.processes.rerun_log import RerunLog
 
 FIRST_PATIENCE = 3.0
@@ -81,6 +82,7 @@ class AgentOptions:
         calibration: file with what `mapweave calibrate` has measured of this robot, if it exists.
         ros2: where pose and map are published as ROS 2 topics; None if they are not.
         rerun: where all that it senses and estimates goes for the Rerun viewer; None if it does not.
+        metrics: port of this machine on which it tells Prometheus about itself; None if it does not.
     """
 
     name: str
@@ -99,6 +101,7 @@ class AgentOptions:
     calibration: Path | None = None
     ros2: Ros2Link | None = None
     rerun: str | None = None
+    metrics: int | None = None
 
 
 def measured(description: RobotDescription, calibration: Path | None) -> RobotDescription:
@@ -287,6 +290,15 @@ class Agent:
                 return
             self.begin_new_map()
 
+    def sources(self) -> AgentSources:
+        """What it knows of itself."""
+        from mapweave.processes.agent_metrics import AgentSources
+
+        return AgentSources(
+            lambda: self._fleet.status(), lambda: self.replicator.status(), lambda: self._fleet.asked,
+            lambda: self._fleet.relocalized, lambda: self._server_watch.arrivals,
+        )  # fmt: skip
+
     def write_map(self) -> Path:
         """Write the map that it makes to its map file; returns where."""
         path = map_path(self._options.data, self.map_id)
@@ -351,6 +363,7 @@ def run_agent(
     describe = partial(_describe, robot, say, options.name)
     publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
     rerun = None if options.rerun is None else rerun_log(options.rerun, options.name)
+    metrics = None if options.metrics is None else _metrics(options.name)
 
     def stepped(observation: Observation, step: Step) -> None:
         manager.alive()
@@ -359,13 +372,19 @@ def run_agent(
             publisher.step(observation, bool(step.changes), agent.pipeline, agent.merged_poses)
         if rerun is not None:
             rerun.step(observation, step, agent.pipeline)
+        if metrics is not None:
+            metrics.step(step, agent.runner.busy)
 
     with contextlib.ExitStack() as closing:
         if publisher is not None:
             closing.callback(publisher.close)
         if rerun is not None:
             closing.callback(_end_log, rerun, say, options.name)
+        if metrics is not None and options.metrics is not None:
+            closing.callback(metrics.serve(options.metrics))
         agent = Agent(describe, bus, keys, settings, options, stepped, say)
+        if metrics is not None:
+            metrics.read(agent.sources())
         manager.ready()
         closing.enter_context(show)
         try:
@@ -394,6 +413,13 @@ def rerun_log(target: str, robot: str) -> RerunLog:
     from mapweave.processes.rerun_log import RerunLog
 
     return RerunLog(target, robot)
+
+
+def _metrics(robot: str) -> AgentMetrics:
+    """Metrics of an agent; the library is an extra, so it is imported here."""
+    from mapweave.processes.agent_metrics import AgentMetrics
+
+    return AgentMetrics(robot)
 
 
 def _end_log(rerun: RerunLog, say: Callable[[str], None], name: str) -> None:
