@@ -239,6 +239,8 @@ def test_no_camera_and_wrong_settings(tmp_path, capfd) -> None:
     settings.write_text("[robot]\ndrivre = 1\n")
     _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
     assert first == "settings" and "did you mean 'driver'" in findings["settings"].detail
+    _, findings, _ = doctor(capfd, "--robot", "koala", "--offline", "--data", tmp_path)
+    assert "driver koala" in findings["settings"].detail
 
 
 # Encoders against the image
