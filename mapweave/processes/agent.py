@@ -296,7 +296,8 @@ class Agent:
 
         return AgentSources(
             lambda: self._fleet.status(), lambda: self.replicator.status(), lambda: self._fleet.asked,
-            lambda: self._fleet.relocalized, lambda: self._server_watch.arrivals,
+            lambda: self._fleet.relocalized, lambda: self.pipeline.refuted,
+            lambda: self._server_watch.arrivals,
         )  # fmt: skip
 
     def write_map(self) -> Path:

@@ -55,6 +55,7 @@ class AgentSources:
         replication: where its changes are.
         asked: questions to the fleet, by their type.
         relocalized: answers where a view was taken, by certainty or `failed`.
+        refuted: answers that the robot's view did not bear out.
         arrivals: how often the map server came in reach.
     """
 
@@ -62,6 +63,7 @@ class AgentSources:
     replication: Callable[[], ReplicationStatus]
     asked: Callable[[], Mapping[type[Question], int]]
     relocalized: Callable[[], Mapping[str, int]]
+    refuted: Callable[[], int]
     arrivals: Callable[[], int]
 
 
@@ -191,6 +193,7 @@ class AgentMetrics(Collector):
         yield _counter("questions", "Questions to the fleet.", questions, "question")
         outcomes = {one: float(answers.get(one, 0)) for one in (*map(str, Certainty), FAILED)}
         yield _counter("relocalizations", "Answers where a view was taken.", outcomes, "outcome")
+        yield _counter("answers_refuted", "Answers that its own view did not bear out.", sources.refuted())
 
 
 def _gauge(

@@ -81,7 +81,7 @@ def test_the_page_lists_every_metric() -> None:
     metrics.read(
         AgentSources(
             lambda: status, lambda: replication, lambda: {WhereAmI: 6}, lambda: {"found": 2, "failed": 1},
-            lambda: 3,
+            lambda: 8, lambda: 3,
         )
     )  # fmt: skip
     scrape = Scrape(metrics.scrape())
@@ -91,6 +91,7 @@ def test_the_page_lists_every_metric() -> None:
     assert scrape("saving_fails") == scrape("changes_refused") == scrape("server_in_reach") == 1
     assert scrape("acknowledgement_age_seconds") == 1.5 and scrape("server_arrivals_total") == 3
     assert scrape("questions_total", "place") == 6 and scrape("questions_total", "route") == 0
+    assert scrape("answers_refuted_total") == 8
     assert scrape("relocalizations_total", "found") == 2 and scrape("relocalizations_total", "failed") == 1
     page = (ROOT / "docs" / "monitoring.md").read_text()
     listed = re.findall(r"^\| `(mapweave_agent_\w+)` \|([^|]*)\|", page, re.MULTILINE)
