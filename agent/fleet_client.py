@@ -6,10 +6,11 @@ import math
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
-from mapweave.agent.mission import Answer, AnswerContent, Driven, Question, WhoIsNear
+from mapweave.agent.mission import Answer, AnswerContent, Driven, Question, WhereAmI, WhoIsNear
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.queries import best, decode_answer, encode_query, settles
 from mapweave.agent.teleoperation import Teleoperation
@@ -20,6 +21,7 @@ from mapweave.hybridmap.mission_order import MissionOrder
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import RelocalizeAnswer
 from mapweave.wire.bus import Bus, Reply, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
@@ -28,6 +30,8 @@ from mapweave.wire.senders import serve_senders
 from mapweave.wire.traffic_meter import TrafficMeter
 
 NO_ANSWER = "no map server answered"
+FAILED = "failed"
+"""In place of the certainty of an answer."""
 FAILOVER = 1.0
 """s behind the loss of a server or router in which a question without an answer is asked again: a session is
 at the next router in some 10 ms, and routers that lose one find another way between them in 0.1 s."""
@@ -36,7 +40,12 @@ ASK_AGAIN = 0.05
 
 
 class FleetClient:
-    """Runs beside the robot's loop, which never waits for it unless it asks to."""
+    """Runs beside the robot's loop, which never waits for it unless it asks to.
+
+    Attributes:
+        asked: questions that were sent, by their type.
+        relocalized: answers where a view was taken, by certainty; `failed` where none came.
+    """
 
     def __init__(
         self,
@@ -49,6 +58,7 @@ class FleetClient:
         placed: Callable[[], int] = lambda: 0,
         teleoperation: Teleoperation | None = None,
         limits: tuple[float, float] = (0.0, 0.0),
+        failure: Callable[[], str] = lambda: "",
     ) -> None:
         """Announce the agent and listen for missions.
 
@@ -62,6 +72,7 @@ class FleetClient:
             placed: counts the nodes of the map with a merged pose; likewise.
             teleoperation: takes the commands of a person who drives; it outlives this map.
             limits: of the robot's speeds, m/s and rad/s, for that person.
+            failure: why nothing is saved or taken at present, empty if all is well; called from any thread.
         """
         self._bus = bus
         self._keys = keys
@@ -74,12 +85,14 @@ class FleetClient:
         self._battery: float | None = None
         self._trouble, self._trouble_at = "", 0.0
         self._missions = missions
-        self._unsent, self._placed = unsent, placed
+        self._unsent, self._placed, self._failure = unsent, placed, failure
         self._timeout = answer_timeout
         self._teleoperation, self._limits = teleoperation or Teleoperation(), limits
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
         self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._open_questions = 0
+        self.asked: Counter[type[Question]] = Counter()
+        self.relocalized: Counter[str] = Counter()
         self._closing = [
             *serve_senders(bus, keys.mission(map_id.agent), self._take_mission),
             bus.serve(keys.drive(map_id.agent), self._take_drive),
@@ -119,11 +132,12 @@ class FleetClient:
         self._status = replace(status, doing=one_line(status.doing), detail=one_line(status.detail))
         self._stamp_ns, self._battery, self._skipped = stamp_ns, battery, skipped
         if publish:
-            self._bus.publish(self._keys.agent_status(self._agent), encode(self._now()))
+            self._bus.publish(self._keys.agent_status(self._agent), encode(self.status()))
 
     def ask(self, question: Question) -> None:
         """Send a question; its answer comes with a later `answers`."""
         self._open_questions += 1
+        self.asked[type(question)] += 1
         self._asked.put(question)
 
     def answers(self, wait: bool = False) -> tuple[Answer, ...]:
@@ -146,8 +160,12 @@ class FleetClient:
             closing.close()
         self._asker.join(self._timeout + 1.0)
 
-    def _now(self) -> AgentStatus:
+    def status(self) -> AgentStatus:
+        """As others receive it; from any thread."""
         traffic = self._bus.traffic if isinstance(self._bus, TrafficMeter) else 0
+        # What fails now comes before a question that once had no answer.
+        failure = one_line(self._failure())
+        age = time.monotonic() - self._trouble_at if self._trouble and not failure else 0.0
         return AgentStatus(
             self._status,
             self._stamp_ns,
@@ -159,13 +177,13 @@ class FleetClient:
             self._placed(),
             self._missions.report,
             self._battery,
-            self._trouble,
-            time.monotonic() - self._trouble_at if self._trouble else 0.0,
+            failure or self._trouble,
+            age,
             self._skipped,
         )
 
     def _tell_status(self, request: Request) -> None:
-        request.reply(encode(self._now()))
+        request.reply(encode(self.status()))
 
     def _see_server(self, key: str, alive: bool) -> None:
         if alive:
@@ -190,11 +208,16 @@ class FleetClient:
 
     def _take_drive(self, request: Request) -> None:
         answer_ns = self._teleoperation.take(decode(request.payload, DriveRequest))
-        request.reply(encode(DriveAnswer(self._now(), answer_ns, *self._limits)))
+        request.reply(encode(DriveAnswer(self.status(), answer_ns, *self._limits)))
 
     def _ask_all(self) -> None:
         while (question := self._asked.get()) is not None:
-            self._answered.put(self._answer(question))
+            answer = self._answer(question)
+            if isinstance(question, WhereAmI):
+                where = answer.content
+                outcome = str(where.certainty) if isinstance(where, RelocalizeAnswer) else FAILED
+                self.relocalized[outcome] += 1
+            self._answered.put(answer)
 
     def _answer(self, question: Question) -> Answer:
         # An older server does not answer that: the robot maps as without one.

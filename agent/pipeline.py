@@ -107,6 +107,11 @@ class Pipeline:
         self._image: NDArray[np.uint8] | None = None
 
     @property
+    def refuted(self) -> int:
+        """Answers of the fleet that its view did not bear out, on the present mission."""
+        return 0 if self._navigator is None else self._navigator.refuted
+
+    @property
     def map(self) -> HybridMap:
         """The robot's own map so far."""
         return self.mapper.map

@@ -32,6 +32,7 @@ class Runner:
 
     Attributes:
         skipped: images that were skipped so far.
+        busy: how long the tick before took, s; 0 before the second.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Runner:
             print_line: takes lines for people.
             clock: s, only grows.
         """
-        self.skipped = 0
+        self.skipped, self.busy = 0, 0.0
         self._monitor = monitor
         self._print = print_line
         self._clock = clock
@@ -154,7 +155,8 @@ class Runner:
             self._hand_over(observation, step)
             if self.curious:
                 self.exchange()
-            self._previous = observation.stamp_ns, self._clock() - began
+            self.busy = self._clock() - began
+            self._previous = observation.stamp_ns, self.busy
         return self._ticks - first
 
     def _count_skipped(self, stamp_ns: int, tick: float) -> None:

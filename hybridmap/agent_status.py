@@ -96,7 +96,8 @@ class AgentStatus:
         placed: nodes of its map of which it knows where they lie in the merged map.
         mission: the mission that holds, and what has become of it.
         battery: charge, if the driver tells it.
-        last_error: the newest trouble with the fleet, in words; empty without any.
+        last_error: why nothing is saved or taken at present, else the newest trouble with the fleet, in
+            words; empty without any.
         error_age: how long ago that was, s.
         skipped: images that it has skipped because a tick took too long.
     """

@@ -21,6 +21,7 @@ uses only constants, and calls only kernels, of its own module.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from functools import cached_property, update_wrapper
 from inspect import signature
@@ -29,6 +30,8 @@ from typing import Annotated, Any, Concatenate, Generic, ParamSpec, TypeVar, get
 
 import numpy as np
 from numpy.typing import NDArray
+
+log = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -89,6 +92,12 @@ class Kernel(Generic[P, R]):
             return self.python
         form: Callable[P, R] = self._looping(numba) if self._loop else self._kept(numba)
         return form
+
+    @property
+    def compiled_now(self) -> bool:
+        """Whether it was compiled in this process; makes `machine` ready."""
+        statistics = None if self._loop else getattr(self.machine, "stats", None)
+        return statistics is not None and not statistics.cache_hits
 
     def _kept(self, numba: Any) -> Any:
         """Compiled for the annotated types."""
@@ -157,8 +166,11 @@ def for_each_pair(
 
 def load() -> None:
     """Compile, or read from disk, all kernels imported so far: a robot that drives must not wait for it."""
+    said = False
     for kernel in KERNELS:
-        _ = kernel.machine
+        if kernel.compiled_now and not said:
+            said = True
+            log.warning("compiling what runs often, once for this computer: this takes up to a minute")
 
 
 def _type_of(hint: Any) -> Any:

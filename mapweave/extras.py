@@ -26,6 +26,7 @@ MODULES = {
     "eval": ("evo",),
     "viz": ("matplotlib",),
     "rerun": ("rerun",),
+    "metrics": ("prometheus_client",),
 }
 """What each extra installs, by the names that are imported. No command needs `fast` or `gym`."""
 TRIAL = ("server", "sim", "eval", "viz")

@@ -89,6 +89,10 @@ def find_driver(name: str) -> Driver:
     if colon and path.endswith(".py"):
         return _driver(_of_file(Path(path), class_name), name)
     known = drivers()
+    if name not in known and name.endswith(".toml"):
+        raise SettingsError(f"{name} is no driver; settings, which name one, are given by --settings {name}")
+    if name not in known and name.endswith(".py"):
+        raise SettingsError(f"{name} is no driver without its class: {name}:CLASS")
     if name not in known:
         close = difflib.get_close_matches(name, known, 1)
         hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}."

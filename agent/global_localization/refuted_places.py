@@ -11,10 +11,15 @@ from mapweave.hybridmap.pose import Pose2
 
 
 class RefutedPlaces:
-    """By node. The same node may be right when another view, from elsewhere, gives it."""
+    """By node. The same node may be right when another view, from elsewhere, gives it.
+
+    Attributes:
+        count: answers that were refuted, of a node or a whole route.
+    """
 
     def __init__(self, motion: MotionPrimitives) -> None:
         """Nothing is refuted."""
+        self.count = 0
         self._motion = motion
         self._refuted: dict[NodeId, Pose2] = {}
 

@@ -85,6 +85,7 @@ class AnswerTrial:
     def refute(self, blind: float) -> None:
         """Nothing of the route was in view on so much way, m: the answers are not tried again from here."""
         self._failed += 1
+        self._refuted.count += 1
         goal = self._route[-1].node.id
         if self.node is not None:
             self._refuted.add(self.node)

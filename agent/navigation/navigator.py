@@ -147,6 +147,11 @@ class Navigator:
         self._behaviour = self._go()
 
     @property
+    def refuted(self) -> int:
+        """Answers of the fleet that the robot's view did not bear out, on this mission."""
+        return self._positioning.refuted.count
+
+    @property
     def arrived(self) -> bool:
         """Whether the robot is parked at the goal."""
         return self.stage == Stage.ARRIVED

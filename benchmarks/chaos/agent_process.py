@@ -18,9 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import signal
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,11 +29,11 @@ from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
+from mapweave.commands.network import stop_on_signals
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.processes import parent_watchdog
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_body
 from mapweave.wire.keys import Keys
@@ -109,9 +107,7 @@ def main() -> None:
     orders = Orders(**json.loads(sys.argv[1]))
     script, folder, keys = ScriptedRobot(orders.robot, orders.seed), Path(orders.folder), Keys(FLEET)
     name = script.map.agent
-    stop = threading.Event()
-    parent_watchdog.hold(stop)
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    stop = stop_on_signals()
     truth = EventLog(folder / f"{name}.truth")
     journal = NotedJournal(folder / f"{name}.sqlite", name, EventLog(folder / f"{name}.acks"))
     map_id = journal.open_map(1)

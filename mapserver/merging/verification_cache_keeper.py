@@ -21,6 +21,8 @@ SHARE = 0.05
 """Of the time that it may take to save."""
 WORTHWHILE = 0.02
 """Share of the pairs that must be new before a running server saves them."""
+RETRY = 60.0
+"""After a file that could not be written, s: a full disk stays full for long."""
 
 
 class VerificationCacheKeeper:
@@ -39,6 +41,7 @@ class VerificationCacheKeeper:
         self._fresh = fresh
         self._saved: tuple[int, int] = (0, 0)
         self._rest_until = 0.0
+        self._failure = ""
 
     def restore(self, merger: Merger) -> None:
         """Load the results for a new merger, if the file is there and valid."""
@@ -74,9 +77,11 @@ class VerificationCacheKeeper:
         try:
             save(self._path, merger.findings(), _made_by(merger))
         except InvalidFile as error:
-            log.warning("%s; the next start takes longer", error)
+            if str(error) != self._failure:
+                log.warning("%s; the next start takes longer", error)
+            self._failure, self._rest_until = str(error), self._clock() + RETRY
             return
-        self._saved = now
+        self._saved, self._failure = now, ""
         self._rest_until = self._clock() + (self._clock() - began) / SHARE
 
 

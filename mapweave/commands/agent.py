@@ -20,6 +20,7 @@ from mapweave.commands.network import (
     warn_without_router,
 )
 from mapweave.connection import SOON
+from mapweave.extras import need
 
 if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
@@ -66,6 +67,11 @@ def add_to(commands: Any) -> None:
         "Zenoh router (default: that of the driver ros2, else tcp/127.0.0.1:7447)",
     )  # fmt: skip
     add_rerun(parser)
+    parser.add_argument(
+        "--metrics", type=int, metavar="PORT",
+        help="tell Prometheus about the robot at http://127.0.0.1:PORT/metrics, on this machine alone "
+        "(docs/monitoring.md; default: off)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
@@ -112,6 +118,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     name = check_name(arguments.name)
     log_with_time(arguments.log_format, robot=name)
+    if arguments.metrics is not None:
+        need("metrics")  # before the robot is waited for
     if arguments.epoch is not None:
         check_epoch(arguments.epoch)
     resume = None if arguments.resume is None else map_of(arguments.resume)
@@ -151,6 +159,7 @@ def run(arguments: argparse.Namespace) -> int:
             calibration=calibration_of(arguments, name),
             ros2=None if arguments.ros2 is None else ros2_link(arguments, settings.robot),
             rerun=arguments.rerun,
+            metrics=arguments.metrics,
         )
         agent = settings.agent
         if arguments.without_rangers:

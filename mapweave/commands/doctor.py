@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,14 +61,17 @@ def run(arguments: argparse.Namespace) -> int:
     def load() -> Settings:
         from mapweave.settings import load_settings
 
-        return load_settings(arguments.settings)
+        settings = load_settings(arguments.settings)
+        if driver is None:
+            return settings
+        return replace(settings, robot=replace(settings.robot, driver=driver))
 
     buses: list[Bus] = []
 
     def open_robot(settings: Settings) -> Callable[[], Robot] | None:
         from mapweave.agent.drivers.settings import REMOTE
 
-        chosen = driver or settings.robot.driver
+        chosen = settings.robot.driver
         if chosen == REMOTE and driver is None and arguments.settings is None:
             return None
         return lambda: _robot(arguments, settings, chosen, buses)

@@ -20,7 +20,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "sim run": ("mapweave sim run office --set world.rooms=5 --seed 7",),
     "sim batch": ("mapweave sim batch kidnapped --seeds 20",),
     "sim serve": ("mapweave sim serve office --set robots=2",),
-    "agent": ("mapweave agent r0 --robot create --connect tcp/192.168.1.10:7447",),
+    "agent": (
+        "mapweave agent r0 --robot create --connect tcp/192.168.1.10:7447",
+        "mapweave agent r0 --settings robot.toml --metrics 9101",
+    ),
     "drive": ("mapweave drive r0", "mapweave drive r0 --gamepad"),
     "status": ("mapweave status --watch", "mapweave status --json"),
     "go": ("mapweave go r0 r1.1.17", "mapweave go r0 3.1,-2.0 --wait", "mapweave go r0 home"),

@@ -9,6 +9,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 from mapweave.connection import SOON
@@ -215,8 +216,16 @@ def stop_on_signals() -> threading.Event:
     """An event that SIGTERM, Ctrl-C and a parent's end set, so that a process can end in order."""
     from mapweave.processes import parent_watchdog
 
-    stop = threading.Event()
+    stop, came = threading.Event(), SimpleQueue[int]()
     parent_watchdog.hold(stop)
+
+    def wait() -> None:
+        came.get()
+        stop.set()
+
+    # A handler runs amid whatever the main thread does, which may hold the event's lock: it would wait for
+    # itself. So another thread sets it; a SimpleQueue may be filled at any time.
+    threading.Thread(target=wait, name="signals", daemon=True).start()
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, lambda signum, _: came.put(signum))
     return stop

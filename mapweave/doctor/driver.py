@@ -143,6 +143,8 @@ def _motion(
 
 def _advice(error: str) -> str:
     """What to do about an error of a driver, most of which say it themselves."""
+    if "mapweave sim serve" in error:
+        return "start it, and the router between (mapweave server), or give --robot robot.toml"
     if "port" in error or "/dev/" in error or "no answer" in error:
         ports = ", ".join(port.path for port in serial_ports())
         there = f"there are {ports}" if ports else "there is no serial port at all"

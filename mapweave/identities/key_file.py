@@ -59,15 +59,15 @@ def read_key_file(path: Path) -> KeyFile:
         mode = stat.S_IMODE(path.stat().st_mode)
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}") from None
-    # systemd hands keys over in a folder of the service's own.
-    handed_over = os.environ.get("CREDENTIALS_DIRECTORY") == str(path.parent)
-    if mode & 0o077 and not handed_over:
-        raise SettingsError(f"{path}: others may read this key (mode {mode:03o}); run: chmod 600 {path}")
     try:
         try:
             table = build(_Table, read_toml(path), str(path))
         except SettingsError as error:
             raise SettingsError(f"{error}; it is no key file, or not whole: copy it once more") from None
+        # systemd hands keys over in a folder of the service's own.
+        handed_over = os.environ.get("CREDENTIALS_DIRECTORY") == str(path.parent)
+        if mode & 0o077 and not handed_over:
+            raise SettingsError(f"{path}: others may read this key (mode {mode:03o}); run: chmod 600 {path}")
         credentials = Credentials(
             table.name, table.role, table.authority, table.certificate, table.private_key, table.password
         )

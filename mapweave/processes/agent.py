@@ -41,7 +41,7 @@ from mapweave.wire.ros2.settings import Ros2Link
 from mapweave.wire.traffic_meter import TrafficMeter
 
 if TYPE_CHECKING:
-    pass
+    from mapweave.processes.agent_metrics import AgentSources
 
 FIRST_PATIENCE = 3.0
 """How long a robot that remembers no map asks the server for the number of its next one, s."""
@@ -68,6 +68,7 @@ class AgentOptions:
         calibration: file with what `mapweave calibrate` has measured of this robot, if it exists.
         ros2: where pose and map are published as ROS 2 topics; None if they are not.
         rerun: where all that it senses and estimates goes for the Rerun viewer; None if it does not.
+        metrics: port of this machine on which it tells Prometheus about itself; None if it does not.
     """
 
     name: str
@@ -86,6 +87,7 @@ class AgentOptions:
     calibration: Path | None = None
     ros2: Ros2Link | None = None
     rerun: str | None = None
+    metrics: int | None = None
 
 
 def measured(description: RobotDescription, calibration: Path | None) -> RobotDescription:
@@ -220,6 +222,7 @@ class Agent:
             self._bus, self._keys, map_id, self.missions, options.synchronization.answer_timeout,
             self.replicator.unacknowledged, self._placed, self._teleoperation,
             (self._description.max_forward, self._description.max_turn),
+            lambda: self.replicator.status().failure,
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)
         self._trajectory = TrajectoryFile(path) if options.trajectories else None
@@ -289,6 +292,16 @@ class Agent:
                 return
             self.begin_new_map()
 
+    def sources(self) -> AgentSources:
+        """What it knows of itself."""
+        from mapweave.processes.agent_metrics import AgentSources
+
+        return AgentSources(
+            lambda: self._fleet.status(), lambda: self.replicator.status(), lambda: self._fleet.asked,
+            lambda: self._fleet.relocalized, lambda: self.pipeline.refuted,
+            lambda: self._server_watch.arrivals,
+        )  # fmt: skip
+
     def write_map(self) -> Path:
         """Write the map that it makes to its map file; returns where."""
         path = map_path(self._options.data, self.map_id)
@@ -322,7 +335,6 @@ class Agent:
             self._trajectory.close()
         self._fleet.close()
         self.merged_poses.close()
-        self.replicator.flush(10.0)
         self.replicator.close()
 
     def close(self) -> None:

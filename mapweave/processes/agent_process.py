@@ -25,8 +25,8 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
 
 if TYPE_CHECKING:
+    from mapweave.processes.agent_metrics import AgentMetrics
     from mapweave.processes.rerun_log import RerunLog
-
 
 SILENCE = 2.0
 """s; a longer wait for the robot is reported."""
@@ -53,6 +53,7 @@ def run_agent(
     describe = partial(_describe, robot, say, options.name)
     publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
     rerun = None if options.rerun is None else rerun_log(options.rerun, options.name)
+    metrics = None if options.metrics is None else _metrics(options.name)
 
     def stepped(observation: Observation, step: Step) -> None:
         manager.alive()
@@ -61,25 +62,33 @@ def run_agent(
             publisher.step(observation, bool(step.changes), agent.pipeline, agent.merged_poses)
         if rerun is not None:
             rerun.step(observation, step, agent.pipeline)
+        if metrics is not None:
+            metrics.step(step, agent.runner.busy)
 
     with contextlib.ExitStack() as closing:
         if publisher is not None:
             closing.callback(publisher.close)
         if rerun is not None:
             closing.callback(_end_log, rerun, say, options.name)
+        if metrics is not None and options.metrics is not None:
+            closing.callback(metrics.serve(options.metrics))
         agent = Agent(describe, bus, keys, settings, options, stepped, say)
+        if metrics is not None:
+            metrics.read(agent.sources())
         manager.ready()
         closing.enter_context(show)
         try:
             agent.run(robot, stop)
         finally:
             robot.close()
-            path = agent.write_map()
-            nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
-            say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
-            agent.replicator.flush(10.0)
-            _hand_over(say, agent.replicator, bus, options)
-            agent.close()
+            try:
+                path = agent.write_map()
+                nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
+                say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
+            finally:
+                # The journal is complete also where a full disk takes no map file.
+                _hand_over(say, agent.replicator, bus, options)
+                agent.close()
 
 
 def rerun_log(target: str, robot: str) -> RerunLog:
@@ -94,6 +103,13 @@ def rerun_log(target: str, robot: str) -> RerunLog:
     from mapweave.processes.rerun_log import RerunLog
 
     return RerunLog(target, robot)
+
+
+def _metrics(robot: str) -> AgentMetrics:
+    """Metrics of an agent; the library is an extra, so it is imported here."""
+    from mapweave.processes.agent_metrics import AgentMetrics
+
+    return AgentMetrics(robot)
 
 
 def _end_log(rerun: RerunLog, say: Callable[[str], None], name: str) -> None:
@@ -115,6 +131,8 @@ def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> Rob
 def _hand_over(
     say: Callable[[str], None], replicator: Replicator, bus: ZenohBus, options: AgentOptions
 ) -> None:
+    if not replicator.flush(10.0):
+        return  # closing it says what is lost
     if options.patience <= 0:
         line = "offline: the map stays in the journal and is sent when a server can be reached"
     elif not bus.wait_connected(min(2.0, options.patience)):

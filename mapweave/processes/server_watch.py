@@ -7,15 +7,22 @@ PATIENCE = 20.0
 
 
 class ServerWatch:
-    """Of one agent."""
+    """Of one agent.
+
+    Attributes:
+        arrivals: how often the map server has come in reach.
+    """
 
     def __init__(self, server: str) -> None:
         """Take the server's name."""
         self._server = server
+        self.arrivals, self._in_reach = 0, False
         self._missing, self._seen_ns = False, 0
 
     def see(self, in_reach: bool, stamp_ns: int) -> str:
         """Take in one tick; returns a line for people, or nothing."""
+        self.arrivals += in_reach and not self._in_reach
+        self._in_reach = in_reach
         if in_reach:
             missing, self._missing, self._seen_ns = self._missing, False, stamp_ns
             return f"map server {self._server} is in reach" if missing else ""

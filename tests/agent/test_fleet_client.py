@@ -129,7 +129,10 @@ def test_any_status_can_be_sent(text: str, times: int) -> None:
 def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     """Also when nothing was published: what waits for the server, what has gone over the network."""
     bus, waiting = TrafficMeter(MemoryBus(hub)), [3]
-    link = FleetClient(bus, KEYS, MAP, MissionControl("r0"), unsent=lambda: waiting[0])
+    failure = ["r0.sqlite: the disk\nis full"]
+    link = FleetClient(
+        bus, KEYS, MAP, MissionControl("r0"), unsent=lambda: waiting[0], failure=lambda: failure[0]
+    )
 
     def asked() -> AgentStatus:
         (reply,) = other.ask(KEYS.agent_status("r0"), b"", 1.0)
@@ -138,6 +141,8 @@ def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     first = asked()
     assert first.status.doing == "starting"
     assert (first.unsent, first.linked, first.epoch) == (3, False, MAP.epoch)
+    assert (first.last_error, first.error_age) == ("r0.sqlite: the disk is full", 0.0)
+    failure[0] = ""
     status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False)
     received: list[bytes] = []
     other.subscribe(KEYS.agent_statuses(), lambda sample: received.append(sample.payload))
@@ -147,7 +152,7 @@ def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     eventually(lambda: asked().linked)
     second = asked()
     assert (second.status, second.stamp_ns, second.unsent) == (status, 5, 0)
-    assert second.traffic > first.traffic > 0
+    assert second.traffic > first.traffic > 0 and second.last_error == ""
     token.close()
     eventually(lambda: not asked().linked)
     assert not received

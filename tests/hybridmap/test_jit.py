@@ -69,6 +69,8 @@ def run(folder: Path, how: str, cache: Path) -> dict[str, object]:
     collected: dict[str, object] = json.loads(done.stdout)
     assert collected["lengths"] == [12.0, 5.0]
     assert np.array(collected["table"]).tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
+    # Silence for half a minute looks like a process that hangs.
+    assert done.stderr.count("compiling") == int(collected["hits"] == 0)
     return collected
 
 

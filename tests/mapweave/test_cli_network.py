@@ -132,3 +132,19 @@ def test_waiting_is_reported_with_its_reason(command, hints, closed, tmp_path):
         process.communicate()
         watchdog.cancel()
     assert not hints
+
+
+def test_a_signal_amid_another_stops_a_process():
+    """Ctrl-C twice, or a signal to a process and its group: the second handler waited for the first."""
+    program = """
+import signal
+from mapweave.commands.network import stop_on_signals
+stop = stop_on_signals()
+with stop._cond:
+    signal.raise_signal(signal.SIGINT)
+    signal.raise_signal(signal.SIGTERM)
+print(stop.wait(30))
+"""
+    run = [sys.executable, "-c", program]
+    done = subprocess.run(run, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "True\n"

@@ -20,6 +20,7 @@ import pytest
 from mapweave.agent.drivers import wheeled
 from mapweave.agent.observation import Odometry, RobotDescription
 from mapweave.cli import main
+from mapweave.commands import doctor as doctor_command
 from mapweave.doctor import camera, camera_model, driver, machine
 from mapweave.doctor.finding import Finding, Verdict
 from mapweave.doctor.motion import MotionComparison
@@ -238,6 +239,8 @@ def test_no_camera_and_wrong_settings(tmp_path, capfd) -> None:
     settings.write_text("[robot]\ndrivre = 1\n")
     _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
     assert first == "settings" and "did you mean 'driver'" in findings["settings"].detail
+    _, findings, _ = doctor(capfd, "--robot", "koala", "--offline", "--data", tmp_path)
+    assert "driver koala" in findings["settings"].detail
 
 
 # Encoders against the image
@@ -313,6 +316,15 @@ def test_nothing_listens(tmp_path, capfd) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     status, findings, first = doctor(capfd, "--connect", endpoint, "--data", tmp_path)
     assert (status, first) == (NO, "server") and "refused" in findings["server"].detail
+
+
+def test_a_base_behind_the_network_has_no_serial_port(tmp_path, capfd, monkeypatch) -> None:
+    """The advice was to look for its serial port."""
+    monkeypatch.setattr(doctor_command, "REMOTE_PATIENCE", 0.2)
+    where = ("--connect", f"tcp/127.0.0.1:{free_port()}", "--offline", "--data", tmp_path)
+    _, findings, first = doctor(capfd, "--robot", "remote", "--name", "r0", *where)
+    assert first == "driver" and "mapweave sim serve" in findings["driver"].detail
+    assert "router" in findings["driver"].advice and "find-port" not in findings["driver"].advice
 
 
 def test_a_table_names_the_first_thing_wrong(tmp_path, capfd) -> None:

@@ -65,6 +65,7 @@ CASES: list[tuple[str, str, str]] = [
     ("record", "R0 --out {tmp}/drive --connect {closed}", "R0"),
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
     ("replay", "{recording} --offline --data {tmp} --rerun {tmp}/walk.rrd", 'needs the extra "rerun"'),
+    ("agent", "r0 --connect {closed} --data {tmp}/agents --metrics 9101", 'needs the extra "metrics"'),
     ("info", "{recording}", "3 images"),
     ("calibrate target", "--out {tmp}/board.pdf", "Print it at 100 %"),
     ("calibrate camera", "{recording}", "no view shows the target"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,17 +12,19 @@ import numpy as np
 import pytest
 
 from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
-from mapweave.agent.observation import Observation, Odometry
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.hybridmap.agent_status import AgentStatus
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_files import epochs_of_files
+from mapweave.processes.agent_process import run_agent
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
 from mapweave.wire.bus import Request
@@ -289,3 +292,35 @@ def test_a_robot_that_is_lifted_begins_a_new_map_and_keeps_the_old_one(tmp_path)
     bus.close()
     assert "r0: was lifted; it begins map r0.2, and the old one stays" in said
     assert len(HybridMap(read_map_file(tmp_path / "r0.1.mapweave").changes).nodes) == mapped
+
+
+class Ended:
+    """A robot that has nothing more to say; meanwhile its map's file can no longer be written."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+
+    def describe(self) -> RobotDescription:
+        return DESCRIPTION
+
+    def sense(self) -> Observation | None:
+        self._file.mkdir()
+        return None
+
+    def act(self, command: Command) -> Command:
+        return command
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_path: Path) -> None:
+    """The journal was never closed: what waited for the disk was lost without a word."""
+    bus = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
+    options = AgentOptions("r0", tmp_path, epoch=1, patience=0.0)
+    with pytest.raises(InvalidFile, match=r"r0\.1\.mapweave"):
+        run_agent(Ended(tmp_path / "r0.1.mapweave"), bus, KEYS, AgentSettings(), options, threading.Event())
+    bus.close()
+    journal = Journal(tmp_path / "r0.sqlite", "r0")  # in use, as long as the agent has not closed it
+    assert journal.maps() == [MapId("r0", 1)]
+    journal.close()

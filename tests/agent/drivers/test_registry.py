@@ -90,6 +90,10 @@ def test_an_unknown_name() -> None:
         find_driver("koalla")
     with pytest.raises(SettingsError, match="there are arduino, create"):
         find_driver("zzz")
+    with pytest.raises(SettingsError, match=r"given by --settings robot\.toml"):
+        find_driver("robot.toml")
+    with pytest.raises(SettingsError, match=r"its class: still\.py:CLASS"):
+        find_driver("still.py")
     assert "remote" in drivers()
 
 

@@ -62,7 +62,7 @@ def test_a_place_of_which_nothing_is_in_view_is_refuted_and_given_up(home):
 
     trial = Trial(navigator(eyes, NOWHERE, B), eyes, fleet)
     trial.run(200.0, lambda: trial.navigator.given_up)
-    assert trial.navigator.given_up
+    assert trial.navigator.given_up and trial.navigator.refuted == TRIALS
     reason = f"says that the robot is at node {A}; nothing of it is in view after {BLIND:.1f} m"
     assert f"{TRIALS} answers in a row were wrong" in trial.navigator.detail
     assert reason in trial.navigator.detail

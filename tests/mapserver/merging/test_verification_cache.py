@@ -225,5 +225,14 @@ def test_a_merge_before_the_store_is_read_keeps_earlier_results(logged: Log, tmp
 def test_a_full_disk_is_reported(logged: Log, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     merger = read(logged)
     merger.merged()
-    VerificationCacheKeeper(tmp_path / "nowhere" / "store").save(merger, last=True)
-    assert "the next start takes longer" in caplog.text
+    now = [0.0]
+    keeper = VerificationCacheKeeper(tmp_path / "later" / "store", clock=lambda: now[0])
+    for _ in range(5):
+        keeper.save(merger)
+        now[0] += verification_cache_keeper.RETRY + 1.0
+    keeper.save(merger, last=True)
+    assert caplog.text.count("the next start takes longer") == 1
+    (tmp_path / "later").mkdir()
+    now[0] += verification_cache_keeper.RETRY + 1.0
+    keeper.save(merger)
+    assert (tmp_path / "later" / f"store{SUFFIX}").exists()

@@ -63,6 +63,11 @@ def test_a_key_file_is_refused_if_others_may_read_it(keys: Path, capfd: pytest.C
     path = keys / "r0.key.toml"
     path.chmod(0o640)
     assert f"chmod 600 {path}" in complaint(capfd, "status", "--keys", path)
+    # The advice was to hide the certificate that all may read.
+    authority = path.with_name("others.pem")
+    authority.write_text("-----BEGIN CERTIFICATE-----\n")
+    authority.chmod(0o644)
+    assert "is no key file" in complaint(capfd, "status", "--keys", authority)
 
 
 def test_a_key_says_where_the_server_is_and_is_for_one_name_and_fleet(
