@@ -10,6 +10,7 @@ import heapq
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,6 +51,29 @@ IN_FRONT = 3
 the robot."""
 STARTS = 4
 """Nodes by which the server may know where the robot is: the newest are not merged yet."""
+
+
+class RobotBeside(NamedTuple):
+    """Another robot next to this one.
+
+    Attributes:
+        off: m, between their edges.
+        robot: its name.
+        x: m, in the frame of this robot.
+        y: m, likewise.
+        radius: of its footprint, m.
+    """
+
+    off: float
+    robot: str
+    x: float
+    y: float
+    radius: float
+
+    @property
+    def words(self) -> str:
+        """Who it is, and how far off."""
+        return f"{self.robot} is {self.off:.1f} m off"
 
 
 class RobotsInView:
@@ -97,19 +121,19 @@ class RobotsInView:
         return replace(observation, left_out=regions) if len(regions) else observation
 
     @property
-    def beside(self) -> str:
-        """The nearest robot and how far it is, in words; empty if none is beside this one."""
+    def beside(self) -> RobotBeside | None:
+        """The nearest robot; None if none is beside this one."""
         if self._seen is None:
-            return ""
+            return None
         at, odom_then, robots = self._seen
         robot_from_then = self._odom_from_robot.inverse() @ odom_then
-        around: list[tuple[float, str]] = []
+        around: list[RobotBeside] = []
         for one in robots:
             pose = robot_from_then @ one.robot_from_other
             off = math.hypot(pose.x, pose.y) - self.description.radius - one.radius
             if off < BESIDE and one.age + self._now - at < OLDEST:
-                around.append((max(off, 0.0), one.robot))
-        return f"{min(around)[1]} is {min(around)[0]:.1f} m off" if around else ""
+                around.append(RobotBeside(max(off, 0.0), one.robot, pose.x, pose.y, one.radius))
+        return min(around, default=None)
 
     @property
     def due(self) -> bool:

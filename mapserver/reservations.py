@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
+from mapweave.mapserver.nearby import StandingRobot
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
@@ -38,9 +39,8 @@ ASIDE, APART = 12, 0.3
 """Places that are tried to step aside to, and m between two: a place has a node for each heading."""
 
 Points = NDArray[np.float64]
-Standing = Callable[[NodeId, float, MergedMap, float], Sequence[str]]
-"""Names the robots that stand where one of some radius, m, would touch them if it were at a node of the map.
-The last argument is the time, s."""
+Standing = Callable[[Points, int, float, MergedMap, float], Sequence[StandingRobot]]
+"""Finds the robots that stand on a way; see mapweave.mapserver.nearby.Nearby.standing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class Reservations:
         """No robot holds anything.
 
         Args:
-            standing: see mapweave.mapserver.nearby.Nearby.standing.
+            standing: robots on a way.
         """
         self._standing = standing
         self._leases: dict[str, _Lease] = {}
@@ -121,7 +121,11 @@ class Reservations:
             radius = max(router.roads.union.nodes[node].radius for node in request.route) or RADIUS
             others = {name: one for name, one in self._leases.items() if one.component == component}
             granted, held, holder = _free(stops, radius, others)
-            taken = self._at_goal(request, radius, merged, now) if granted == len(request.route) else ""
+            taken = ""
+            if granted == len(request.route):
+                at_goal = self._standing(stops[-1:], component, radius, merged, now)
+                others_there = (one.robot for one in at_goal if one.robot != request.robot)
+                taken = next((name for name in others_there if name not in self._leases), "")
             if taken:
                 granted, holder = granted - 1, taken
                 held = np.vstack([here[None], *(_points(a, b) for a, b in pairwise(stops[:-1]))])
@@ -139,10 +143,17 @@ class Reservations:
             free = _free(aside.way, radius, others)[0] == len(aside.way) - 1
             return ReserveAnswer(0, holder, aside.node if free else None, reason)
 
-    def _at_goal(self, request: ReserveRequest, radius: float, merged: MergedMap, now: float) -> str:
-        """The robot that stands at the end of a robot's way, without a way of its own; empty if none does."""
-        there = self._standing(request.route[-1], radius, merged, now)
-        return next((name for name in there if name != request.robot and name not in self._leases), "")
+    def parked(
+        self, stops: Points, component: int, radius: float, merged: MergedMap, now: float, asker: str
+    ) -> list[StandingRobot]:
+        """Robots that stand on a way without one of their own; for the arguments see `Nearby.standing`.
+
+        The asking robot is left out.
+        """
+        with self._turn:
+            underway = {asker, *(name for name, lease in self._leases.items() if now < lease.until)}
+        there = self._standing(stops, component, radius + MARGIN, merged, now)
+        return [one for one in there if one.robot not in underway]
 
     def _yields(self, robot: str, router: Router) -> _Aside | None:
         """Where a robot steps aside; None if robots do not wait for each other in a circle, or another does.

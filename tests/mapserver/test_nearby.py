@@ -114,8 +114,13 @@ def test_only_a_robot_seen_twice_at_one_place_stands_at_a_node(merged: MergedMap
         nearby.ask(request("elsewhere", 2, PLACES[1]), merged, now)
         nearby.ask(request("of the first", 0, from_first), merged, now)
     nearby.ask(request("once", 1, Pose2()), merged, 15.0)
-    assert nearby.standing(NODES[1], 0.16, merged, 16.0) == ["of the first", "stands"]
-    assert nearby.standing(NODES[1], 0.0, merged, 16.0) == ["of the first"], "a smaller one has room"
-    assert nearby.standing(NODES[0], 0.16, merged, 16.0) == []
-    assert nearby.standing(NODES[1], 0.16, merged, 15.1 + KEPT) == [], "who is silent is gone"
-    assert nearby.standing(NodeId(*A, 99), 0.16, merged, 16.0) == []
+
+    def standing(number: int, radius: float, now: float) -> list[str]:
+        place = np.array([[PLACES[number].x, PLACES[number].y]])
+        return [one.robot for one in nearby.standing(place, 0, radius, merged, now)]
+
+    assert merged.component_of(NODES[0]) == merged.component_of(NODES[1]) == 0
+    assert standing(1, 0.16, 16.0) == ["of the first", "stands"]
+    assert standing(1, 0.0, 16.0) == ["of the first"], "a smaller one has room"
+    assert standing(0, 0.16, 16.0) == []
+    assert standing(1, 0.16, 15.1 + KEPT) == [], "who is silent is gone"

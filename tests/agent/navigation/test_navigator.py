@@ -9,9 +9,9 @@ import pytest
 
 from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
-from mapweave.agent.navigation.blocked_edges import BlockedEdges
-from mapweave.agent.navigation.navigator import Stage
+from mapweave.agent.navigation.blocks import Blocks
 from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.node import EdgeKind, NodeId
@@ -125,15 +125,15 @@ def test_endless_parking_is_retried_before_it_is_a_block(home):
 
 
 def test_blocks_are_kept_for_a_time_that_doubles():
-    blocks = BlockedEdges(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
+    blocks = Blocks(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
     blocks.add(B, A, 0.0)
-    assert blocks.at(9.9) == ((A, B),) and blocks.at(10.0) == ()
+    assert blocks.pairs(9.9) == ((A, B),) and blocks.pairs(10.0) == ()
     blocks.add(A, B, 20.0)
-    assert blocks.at(39.9) == ((A, B),) and blocks.at(40.0) == ()
+    assert blocks.pairs(39.9) == ((A, B),) and blocks.pairs(40.0) == ()
     blocks.add(A, B, 50.0)
     blocks.add(B, C, 50.0)
-    assert set(blocks.at(59.0)) == {(A, B), (B, C)}
-    assert blocks.at(74.9) == ((A, B),) and blocks.at(75.0) == ()
+    assert set(blocks.pairs(59.0)) == {(A, B), (B, C)}
+    assert blocks.pairs(74.9) == ((A, B),) and blocks.pairs(75.0) == ()
 
 
 # Alone

@@ -7,7 +7,9 @@ import math
 import pytest
 
 from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI
-from mapweave.agent.navigation.navigator import YIELDED, Stage
+from mapweave.agent.navigation.goal_patience import YIELDED
+from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -108,7 +110,8 @@ def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
 
 def test_a_robot_in_the_way_is_named(home):
     trial = trial_to(home)
-    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: "r7 is 0.2 m off")
+    r7 = RobotBeside(0.2, "r7", 0.5, 0.0, 0.14)
+    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: r7)
     trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
     trial.held = True
     trial.run(60.0, lambda: trial.navigator.stage == Stage.BLOCKED)
