@@ -154,8 +154,8 @@ class Pipeline:
 
     @property
     def fix(self) -> Fix | None:
-        """By which node the robot drives to a goal; None if it does not, or does not know where it is."""
-        navigator = self._navigator if isinstance(self._mission, GoTo) else None
+        """By which node the robot drives to a goal, or stands after it was told to stop; None without one."""
+        navigator = self._navigator if isinstance(self._mission, GoTo | Idle) else None
         return None if navigator is None else navigator.fix
 
     @property
@@ -196,6 +196,8 @@ class Pipeline:
         """
         self._mission = mission
         self._resumption, self._put_elsewhere = None, False
+        if isinstance(mission, Explore | Carried):
+            self._forget_fix()
         match mission:
             case Explore() if self._explorer is None and self._explores:
                 self._explorer = self._new_explorer()
@@ -246,6 +248,8 @@ class Pipeline:
             case Idle() if self._mapper.started:
                 # Mapping that goes on later needs the motion of the wheels until then.
                 self._keep_up(observation)
+            case Idle() if self.fix is not None:
+                self.fix.follow_wheels(observation, self._description)
             case Explore() | Carried() if self._mapper.astray:
                 command = self._resume(observation)
             case Explore() | Carried():
@@ -269,10 +273,10 @@ class Pipeline:
             return []
         fix = self.fix
         match self._mission:
-            case Explore() | Carried() if self._located and self.map.nodes:
+            case Explore() | Carried() | Idle() if self._located and self.map.nodes:
                 starts = nodes_around(self.map, self._mapper.map_from_robot.mean)
                 return [self._others.question(starts, self._mapper.since_anchor)]
-            case GoTo() if fix is not None:
+            case GoTo() | Idle() if fix is not None:
                 starts = ((fix.node, fix.node_from_robot.mean),)
                 return [self._others.question(starts, fix.node_from_robot)]
         return []
@@ -308,13 +312,21 @@ class Pipeline:
             self.set_mission(self._mission)
             return
         self._resumption = None
+        self._forget_fix()
         self._mapper.lose()
         self._restart()
+
+    def _forget_fix(self) -> None:
+        """Where a drive to a goal has ended says no longer where the robot is."""
+        if self._navigator is not None:
+            self._navigator.fix = None
 
     def _in_the_air(self, observation: Observation) -> bool:
         """Whether the base says that it is lifted. Put down again, the robot is at an unknown place."""
         if observation.kidnapped and not self._lifted:
             self._mapper.lose()
+            if not isinstance(self._mission, GoTo):
+                self._forget_fix()
         elif self._lifted and not observation.kidnapped:
             if isinstance(self._mission, GoTo):
                 self.set_mission(self.mission)

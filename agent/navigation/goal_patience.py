@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.hybridmap.node import NodeId
 
 REFUSED = 20.0
@@ -34,12 +35,21 @@ class GoalPatience:
     def pause(self, seconds: float) -> None:
         """The robot had to stand for so long: that does not count."""
         self._progressed_at += seconds
+        self._held_since += seconds
 
-    def drive(self, edge: tuple[NodeId, NodeId], now: float) -> None:
-        """The robot drives along an edge at a time, s: it gets on if it had not been there."""
+    def drive(self, edge: tuple[NodeId, NodeId], beside: RobotBeside | None, now: float) -> None:
+        """The robot drives: it gets on if it had not been on that edge.
+
+        Args:
+            edge: two nodes.
+            beside: the robot next to this one.
+            now: s.
+        """
+        if beside is None or beside.robot != self._held_by:
+            self._held_by = ""
         if edge not in self._driven:
             self._driven.add(edge)
-            self._progressed_at, self._held_by = now, ""
+            self._progressed_at = now
 
     def block(self, where: str, robot: str, now: float) -> None:
         """The robot is blocked.
@@ -58,19 +68,19 @@ class GoalPatience:
         since = self.refused_since
         return self.trouble if refusing and since is not None and now - since > REFUSED else ""
 
-    def shut_off(self, beside: str, now: float) -> str:
-        """Why the goal is given up where every way is blocked; empty if it is not yet.
+    def ended(self, beside: RobotBeside | None, now: float) -> str:
+        """Why the goal is given up; empty if it is not.
+
+        A robot in the way that has stayed beside this one since it was blocked leaves no way: where there is
+        another one, this robot has left.
 
         Args:
-            beside: the robot next to this one; empty without one.
+            beside: the robot next to this one.
             now: s.
         """
-        if not self._held_by or beside != self._held_by or now - self._held_since <= YIELDED:
-            return ""
-        return f"{beside} stands in the way {self._held_where}, and there is no other"
-
-    def ended(self, now: float) -> str:
-        """Why the goal is given up; empty if it is not."""
-        if now - self._progressed_at <= self._patience:
-            return ""
-        return f"no nearer in {self._patience:g} s: {self.trouble}"
+        held = beside is not None and beside.robot == self._held_by
+        if held and now - self._held_since > YIELDED:
+            return f"{self._held_by} stands in the way {self._held_where}, and there is no other"
+        if now - self._progressed_at > self._patience:
+            return f"no nearer in {self._patience:g} s: {self.trouble}"
+        return ""

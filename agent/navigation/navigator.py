@@ -151,8 +151,10 @@ class Navigator:
             self.fix.follow(observation, self._description)
         if standing or at_portal:
             self._patience.pause(self._description.tick)
-        elif not self.arrived and (reason := self._patience.ended(self._motion.now) or self._trial.ended):
-            self._give_up(reason)
+        elif not self.arrived:
+            reason = self._patience.ended(self._beside(), self._motion.now) or self._trial.ended
+            if reason:
+                self._give_up(reason)
         command = Command() if standing else next(self._behaviour)
         fix = None if self._positioning.search or self.crossing.wait else self.fix
         if fix is not None:
@@ -247,10 +249,7 @@ class Navigator:
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""
         self.stage, now, patience = Stage.WAITING, self._motion.now, self._patience
-        beside, blocked = self._beside(), bool(self._blocks.pairs(now))
-        if blocked and (reason := patience.shut_off(beside.robot if beside else "", now)):
-            self._give_up(reason)
-        elif not blocked and patience.refused_since is None:
+        if not self._blocks.pairs(now) and patience.refused_since is None:
             self.fix, patience.refused_since = None, now
         elif reason := patience.refused(self._routes.refusing, now):
             self._give_up(reason)
@@ -268,7 +267,7 @@ class Navigator:
             if not (yield from self._let_pass(right_of_way, follower)):
                 return
             leg = follower.leg
-            self._patience.drive(follower.blocked, self._motion.now)
+            self._patience.drive(follower.blocked, self._beside(), self._motion.now)
             command = follower.step(self._motion.observation)
             self.fix, self.stage = follower.fix, follower.progress
             self.detail = "; ".join(filter(None, (follower.detail, self._detour)))

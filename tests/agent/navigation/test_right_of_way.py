@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
-from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI
+from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI, WhichWay
 from mapweave.agent.navigation.goal_patience import YIELDED
 from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.robots_in_view import RobotBeside
@@ -206,3 +207,51 @@ def test_a_robot_passes_what_it_must_in_order_and_then_seeks_its_goal(home):
     goals = [question.goal for question in trial.asked if not isinstance(question, WhereAmI)]
     assert list(dict.fromkeys(goals)) == [B, C, goal]
     assert eyes.pose.x - 1.0 == pytest.approx(poses[C], abs=0.35), "it has been at the last before it turns"
+
+
+def test_a_robot_that_stands_in_the_only_way_is_named_and_the_goal_given_up(home):
+    """Before, it tried again for 300 s."""
+    trial = trial_to(home)
+    reach = BODY.radius + 0.14
+    r7 = RobotBeside(0.2, "r7", reach + 0.2, 0.0, 0.14)
+    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: r7)
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.held = True
+    trial.run(70.0, lambda: trial.navigator.given_up)
+    seconds = len(trial.commands) * BODY.tick
+    assert YIELDED < seconds < 65.0, "of these 30 s until parking counts as blocked"
+    assert trial.navigator.detail == f"r7 stands in the way between {A} and {B}, and there is no other"
+    ways = [question for question in trial.asked if isinstance(question, WhichWay)]
+    (obstacle,) = ways[1].obstacles
+    assert obstacle.node == A and obstacle.reach == pytest.approx(BODY.radius + 0.14 + 0.1)
+    assert (obstacle.x, obstacle.y) == pytest.approx((r7.x, r7.y), abs=0.05), "it has not moved from A"
+
+
+def test_a_robot_that_has_left_the_way_again_ends_no_goal(home):
+    trial, r7 = trial_to(home), RobotBeside(0.2, "r7", 0.5, 0.0, 0.14)
+    around = [r7]
+    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: around[0] if around else None)
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.held = True
+    trial.run(60.0, lambda: trial.navigator.stage == Stage.BLOCKED)
+    assert trial.navigator.stage == Stage.BLOCKED
+    around.clear()
+    trial.run(60.0)
+    assert not trial.navigator.given_up
+
+
+def test_the_reason_of_a_longer_way_is_said_all_along_it(home):
+    trial = trial_to(home)
+    plain = trial.fleet
+
+    def fleet(question: Question) -> Answer:
+        answer = plain(question)
+        if isinstance(answer.content, RouteAnswer):
+            return replace(answer, content=replace(answer.content, detour="r7 stands on a shorter way"))
+        return answer
+
+    trial.fleet = fleet
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.run(8.0)
+    driving = [detail for stage, detail in trial.said if stage == "driving along the route"]
+    assert len(driving) > 5 and all(detail.endswith("r7 stands on a shorter way") for detail in driving)
