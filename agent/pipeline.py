@@ -154,7 +154,7 @@ class Pipeline:
 
     @property
     def fix(self) -> Fix | None:
-        """By which node the robot drives to a goal, or stands after it was told to stop; None without one."""
+        """By which node the robot drives to a goal, or stands after it was stopped; None without one."""
         navigator = self._navigator if isinstance(self._mission, GoTo | Idle) else None
         return None if navigator is None else navigator.fix
 

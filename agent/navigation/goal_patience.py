@@ -33,7 +33,7 @@ class GoalPatience:
         self._held_by, self._held_where, self._held_since = "", "", 0.0
 
     def pause(self, seconds: float) -> None:
-        """The robot had to stand for so long: that does not count."""
+        """The robot must not move; that time, s, does not count."""
         self._progressed_at += seconds
         self._held_since += seconds
 
