@@ -116,7 +116,7 @@ class Pipeline:
         self._navigator: Navigator | None = None
         self._resumption: Resumption | None = None
         self._guard = CommandGuard(self._caution)
-        self._lifted = self._put_elsewhere = False
+        self._lifted = self._put_elsewhere = self._made_room = False
         self._image: NDArray[np.uint8] | None = None
 
     @property
@@ -195,7 +195,7 @@ class Pipeline:
         place of its own map.
         """
         self._mission = mission
-        self._resumption, self._put_elsewhere = None, False
+        self._resumption, self._put_elsewhere, self._made_room = None, False, False
         if isinstance(mission, Explore | Carried):
             self._forget_fix()
         match mission:
@@ -255,6 +255,7 @@ class Pipeline:
             case Explore() | Carried():
                 command, questions = self._map(observation, answers)
             case GoTo() if self._navigator is not None:
+                self._make_room(self._navigator)
                 command, questions = self._navigator.step(observation, answers, self._held)
                 self._mapper.drove(self._navigator.traverse, self._navigator.refined)
         questions = [*questions, *self._who_is_near()]
@@ -266,6 +267,13 @@ class Pipeline:
         own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
         self._command = safe if own else None
         return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
+
+    def _make_room(self, navigator: Navigator) -> None:
+        """Drive out of the way of another robot, if this one has nothing else to do, and may."""
+        aside, self._others.aside = self._others.aside, None
+        if aside is not None and navigator.arrived and self._settings.navigation.make_room and not self._held:
+            self.set_mission(GoTo(aside))
+            self._made_room = True
 
     def _who_is_near(self) -> list[Question]:
         """Ask for the robots around this one, if it is time and it knows where it is."""
@@ -482,6 +490,7 @@ class Pipeline:
                 doing, detail = str(self._navigator.stage), self._navigator.detail
                 finished, given_up = self._navigator.arrived, self._navigator.given_up
                 progress = self._navigator.progress
+                detail += "; it makes room for another robot" if self._made_room else ""
         if self._blind:
             doing, detail = "standing still", self._blind
         if self._driven is not None:

@@ -81,6 +81,7 @@ class RobotsInView:
 
     Attributes:
         description: of this robot.
+        aside: the node where this robot is in no other's way, if it stands in one by the newest answer.
     """
 
     def __init__(self, description: RobotDescription) -> None:
@@ -90,6 +91,7 @@ class RobotsInView:
             description: of this one.
         """
         self.description = description
+        self.aside: NodeId | None = None
         self._odom_from_robot = Pose2()
         self._now = 0.0
         self._stamp_ns: int | None = None
@@ -155,6 +157,7 @@ class RobotsInView:
         return WhoIsNear(NUMBER, starts, min(sigma, 100.0), min(turn, 4.0), d.radius, height, speed)
 
     def _take(self, answer: Answer, at: float, odom_then: Pose2) -> None:
+        self.aside = answer.content.aside if isinstance(answer.content, NearbyAnswer) else None
         if not isinstance(answer.content, NearbyAnswer):
             self._due = self._now + EVERY[1]
             return

@@ -84,6 +84,23 @@ class _Aside:
     boxed_in: bool
 
 
+@dataclass(eq=False)
+class _Passing:
+    """A robot's way leads past one that stands there without a way.
+
+    Attributes:
+        robot: that drives.
+        until: s.
+        asked: whether the node where the other one is in no way was looked for.
+        aside: that node.
+    """
+
+    robot: str
+    until: float
+    asked: bool = False
+    aside: NodeId | None = None
+
+
 class Reservations:
     """Leases by robot. Thread-safe."""
 
@@ -95,6 +112,7 @@ class Reservations:
         """
         self._standing = standing
         self._leases: dict[str, _Lease] = {}
+        self._passings: dict[str, _Passing] = {}
         self._turn = threading.Lock()
 
     def ask(self, request: ReserveRequest, router: Router, now: float) -> ReserveAnswer:
@@ -133,6 +151,7 @@ class Reservations:
             way = np.vstack([_points(a, b) for a, b in pairwise(stops)])
             lease = _Lease(request, component, radius, here, held, way, now + LEASE, holder)
             self._leases[request.robot] = lease
+            self._note_standing(lease, stops[: granted + 1], stops[-1], merged, now)
             if not holder:
                 return ReserveAnswer(granted, "", None, "")
             aside = self._yields(request.robot, router)
@@ -142,6 +161,48 @@ class Reservations:
             self._leases[request.robot] = replace(lease, held=aside.way)
             free = _free(aside.way, radius, others)[0] == len(aside.way) - 1
             return ReserveAnswer(0, holder, aside.node if free else None, reason)
+
+    def _note_standing(
+        self, lease: _Lease, stops: Points, goal: Points, merged: MergedMap, now: float
+    ) -> None:
+        """Take note of the robots without a way that stand on what is granted of a way, but not at its goal."""
+        self._passings = {name: one for name, one in self._passings.items() if now < one.until}
+        robot = lease.request.robot
+        for one in self._standing(stops, lease.component, lease.radius + MARGIN, merged, now):
+            at_goal = np.hypot(one.x - goal[0], one.y - goal[1]) < lease.radius + one.radius
+            if one.robot == robot or one.robot in self._leases or at_goal:
+                continue
+            passing = self._passings.setdefault(one.robot, _Passing(robot, now))
+            if passing.robot == robot:
+                passing.until = now + LEASE
+
+    def room_for(
+        self, robot: str, start: NodeId, start_from_robot: Pose2, router: Router, now: float
+    ) -> NodeId | None:
+        """The node where a robot that stands in another one's way is in no way; None without need, or one.
+
+        Args:
+            robot: its name.
+            start: node that the robot knows itself by.
+            start_from_robot: where it is exactly.
+            router: of the newest merged map.
+            now: of the same clock, s.
+        """
+        with self._turn:
+            passing = self._passings.get(robot)
+            component = router.merged.component_of(start)
+            if passing is None or now >= passing.until or robot in self._leases or component is None:
+                return None
+            other = self._leases.get(passing.robot)
+            if not passing.asked and other is not None and other.component == component:
+                passing.asked, pose = True, router.roads.poses[start] @ start_from_robot
+                here = np.array([pose.x, pose.y])
+                request = ReserveRequest(robot, start, start_from_robot, (start,))
+                radius = router.roads.union.nodes[start].radius or RADIUS
+                lease = _Lease(request, component, radius, here, here[None], here[None], now, passing.robot)
+                aside = _place_aside(lease, [other], router)
+                passing.aside = None if aside is None else aside.node
+            return passing.aside
 
     def parked(
         self, stops: Points, component: int, radius: float, merged: MergedMap, now: float, asker: str

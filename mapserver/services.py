@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 
 from mapweave.hybridmap.errors import Busy, InvalidMessage, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
@@ -235,7 +236,13 @@ class Services:
         request = decode(payload, NearbyRequest)
         if robot not in ("", request.robot):
             raise InvalidMessage(f"{robot} does not say where {request.robot} is")
-        return encode(self._nearby.ask(request, self._answers().merged, self._clock()))
+        router, now = self._answers().router, self._clock()
+        answer = self._nearby.ask(request, router.merged, now)
+        known = (start for start in request.starts if router.merged.component_of(start[0]) is not None)
+        for node, node_from_robot in islice(known, 1):
+            aside = self._reservations.room_for(request.robot, node, node_from_robot, router, now)
+            answer = replace(answer, aside=aside)
+        return encode(answer)
 
     def _known(self, payload: bytes) -> bytes:
         request = decode(payload, KnownRequest)
