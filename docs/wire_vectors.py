@@ -269,7 +269,7 @@ def answers() -> dict[str, tuple[Any, ...]]:
     views = np.array([[1.5, -2.0, 0.5, 0.75], [3.0, 0.0, -1.5, 0.5]], np.float32)
     image = floor_plan.PlanImage("0f" * 32, 760, 800, "office.png")
     request = MissionRequest("7f3a9c", "r0", MissionKind.GO, STAMP, "anna", "kitchen", ("r0.3.17",))
-    obstacle = query.Obstacle(NEXT, 0.25, -0.5, 0.375)
+    obstacle = query.Obstacle(NEXT, 0.25, -0.5, 0.375, "r1")
     route = query.RouteRequest(NODE, FAR, ((NODE, NEXT),), Pose2(0.1, 0.0, 0.2), (obstacle,))
     robots = (
         RobotEntry("r0", True, 0.5, status(), Pose2(1.0, 2.0, 3.0), 0, "kitchen", "ground"),
@@ -299,7 +299,7 @@ def answers() -> dict[str, tuple[Any, ...]]:
                 "r0", ((NODE, Pose2(0.1, 0.0, 0.2)), (NEXT, Pose2())), 0.05, 0.01, 0.16, 0.3, 0.3
             ),
             nearby.NearbyAnswer(
-                (nearby.NearbyRobot("r1", Pose2(1.5, -0.25, 3.0), 0.125, 0.16, 0.3, 0.3, 0.5),), ""
+                (nearby.NearbyRobot("r1", Pose2(1.5, -0.25, 3.0), 0.125, 0.16, 0.3, 0.3, 0.5),), "", FAR
             ),
         ),
         "server/s0/explain": (

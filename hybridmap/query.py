@@ -16,6 +16,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import (
     MAX_NUMBER,
     MAX_POSITION,
+    NAME_OR_NOTHING,
     Angle,
     Coordinate,
     LandmarkCount,
@@ -222,12 +223,14 @@ class Obstacle:
         x: m, in the robot frame of that node.
         y: m, likewise.
         reach: m, from the place to the middle of a robot that touches what is there.
+        robot: that stands there; empty if it is none. Once the server knows it elsewhere, the place is free.
     """
 
     node: NodeId
     x: Coordinate
     y: Coordinate
     reach: Annotated[float, Meta(ge=0.0, le=MAX_REACH)]
+    robot: Annotated[str, Meta(pattern=NAME_OR_NOTHING)] = ""
 
 
 @dataclass(frozen=True, slots=True)

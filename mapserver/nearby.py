@@ -137,6 +137,14 @@ class Nearby:
         off = distances(places, np.vstack([stops[:1], stops[:-1]]), stops).min(axis=1)
         return [one for one, d in zip(still, off.tolist(), strict=True) if d < radius + one.radius]
 
+    def left(self, robot: str, place: tuple[float, float], reach: float, frame: NodeId, now: float) -> bool:
+        """Whether a robot is known to be elsewhere than within some reach, m, of a place, m, in a frame."""
+        with self._turn:
+            seen = [one for one in self._seen.get(robot, ()) if one.at < now and now - one.at <= KEPT]
+        return bool(seen) and (
+            seen[-1].frame != frame or math.dist(place, (seen[-1].pose.x, seen[-1].pose.y)) > reach
+        )
+
     def _around(self, cells: Collection[_Cell], now: float, but: str = "") -> list[_Sighting]:
         """Where the robots in some cells, and in those around them, were when they last asked before now."""
         beside = [(di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -85,12 +85,10 @@ class Discs:
         )
 
 
-def placed(obstacles: Collection[Obstacle], roads: Roadmap) -> list[Disc]:
-    """Where obstacles are in the merged map; those whose node is not in it are left out."""
-    discs = []
-    for obstacle in obstacles:
-        component = roads.merged.component_of(obstacle.node)
-        if component is not None:
-            at = roads.poses[obstacle.node] @ Pose2(obstacle.x, obstacle.y)
-            discs.append(Disc(component, at.x, at.y, obstacle.reach))
-    return discs
+def placed(obstacle: Obstacle, roads: Roadmap) -> Disc | None:
+    """Where an obstacle is in the merged map; None if its node is not in it."""
+    component = roads.merged.component_of(obstacle.node)
+    if component is None:
+        return None
+    at = roads.poses[obstacle.node] @ Pose2(obstacle.x, obstacle.y)
+    return Disc(component, at.x, at.y, obstacle.reach)

@@ -165,7 +165,7 @@ class Reservations:
     def _note_standing(
         self, lease: _Lease, stops: Points, goal: Points, merged: MergedMap, now: float
     ) -> None:
-        """Take note of the robots without a way that stand on what is granted of a way, but not at its goal."""
+        """Take note of robots without a way on what is granted of another's way, but for its goal."""
         self._passings = {name: one for name, one in self._passings.items() if now < one.until}
         robot = lease.request.robot
         for one in self._standing(stops, lease.component, lease.radius + MARGIN, merged, now):

@@ -17,6 +17,7 @@ from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import (
     KnownRequest,
+    Obstacle,
     RelocalizeAnswer,
     ReserveAnswer,
     ReserveRequest,
@@ -37,6 +38,7 @@ from mapweave.mapserver.quotas import Quotas
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.route_rules import rule_words
+from mapweave.mapserver.routes import Router
 from mapweave.mapserver.wire_limits import drivable, within_range
 from mapweave.merge.floors import maps_elsewhere
 from mapweave.wire.bus import Bus, Closing, Request
@@ -195,8 +197,10 @@ class Services:
     def _route(self, payload: bytes, robot: str) -> bytes:
         request, now = decode(payload, RouteRequest), self._clock()
         router = self._answers().router
-        barred = placed(request.obstacles, router.roads) if request.obstacles else []
-        hops = (tuple(sorted(hop)) for hop in Discs(router.roads, barred).barred)
+        barred = self._barred(request.obstacles, router, now)
+        # Of robots the server knows itself where they stand.
+        things = self._barred([one for one in request.obstacles if not one.robot], router, now)
+        hops = (tuple(sorted(hop)) for hop in Discs(router.roads, things).barred)
         self._blockages.report([*request.blocked, *((a, b) for a, b in hops)], now)
         wary = self._blockages.known(now)
 
@@ -211,6 +215,20 @@ class Services:
             return self._reservations.parked(way, component, radius, router.merged, now, robot)
 
         return encode(route_past_parked(request, router.roads, route, standing))
+
+    def _barred(self, obstacles: Sequence[Obstacle], router: Router, now: float) -> list[Disc]:
+        """Where the obstacles are that a robot has met, without those of robots that have left."""
+        graphs, discs = router.merged.graphs, []
+        for one in obstacles:
+            disc = placed(one, router.roads)
+            if disc is not None and not (
+                one.robot
+                and self._nearby.left(
+                    one.robot, (disc.x, disc.y), disc.reach, graphs[disc.component].anchor, now
+                )
+            ):
+                discs.append(disc)
+        return discs
 
     def _reserve_in_name(self, request: Request) -> None:
         guarded(lambda payload: self._reserve(payload, robot_of(request.key)))(request)

@@ -15,14 +15,16 @@ class _Block(NamedTuple):
     """Somewhere.
 
     Attributes:
-        until: it counts until then, s.
+        until: the pair counts until then, s.
         pair: of nodes, the smaller one first.
         obstacle: what is between them; None if that is not known.
+        stays_until: the obstacle counts until then, s.
     """
 
     until: float
     pair: Pair
     obstacle: Obstacle | None
+    stays_until: float
 
 
 class Blocks:
@@ -41,13 +43,15 @@ class Blocks:
             a: one node.
             b: the other.
             now: s.
-            obstacle: what keeps the robot from driving there, and from all edges past it.
+            obstacle: what keeps the robot from driving there, and from all edges past it. That of another
+                robot counts for the longest time: the server knows when it has left.
         """
         s, pair = self._settings, (a, b) if a <= b else (b, a)
         times = self._times[pair] = self._times.get(pair, 0) + 1
         until = now + min(s.blocked_first * 2.0 ** (times - 1), s.blocked_longest)
-        self._blocks = [block for block in self._blocks if now < block.until and block.pair != pair]
-        self._blocks.append(_Block(until, pair, obstacle))
+        stays = now + s.blocked_longest if obstacle is not None and obstacle.robot else until
+        self._blocks = [block for block in self._blocks if now < block.stays_until and block.pair != pair]
+        self._blocks.append(_Block(until, pair, obstacle, stays))
 
     def pairs(self, now: float) -> tuple[Pair, ...]:
         """Pairs that count as blocked at a time, s: the newest that a message holds."""
@@ -55,5 +59,5 @@ class Blocks:
 
     def obstacles(self, now: float) -> tuple[Obstacle, ...]:
         """Likewise places."""
-        held = (block.obstacle for block in self._blocks if now < block.until)
+        held = (block.obstacle for block in self._blocks if now < block.stays_until)
         return tuple(obstacle for obstacle in held if obstacle is not None)[-MAX_OBSTACLES:]

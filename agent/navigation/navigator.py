@@ -249,7 +249,7 @@ class Navigator:
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""
         self.stage, now, patience = Stage.WAITING, self._motion.now, self._patience
-        if not self._blocks.pairs(now) and patience.refused_since is None:
+        if not (self._blocks.pairs(now) or self._blocks.obstacles(now)) and patience.refused_since is None:
             self.fix, patience.refused_since = None, now
         elif reason := patience.refused(self._routes.refusing, now):
             self._give_up(reason)
@@ -360,7 +360,7 @@ class Navigator:
     def _report_block(self, follower: RouteFollower) -> Behaviour:
         """Something is in the way: report it, wait, then plan another route."""
         (a, b), now = follower.blocked, self._motion.now
-        words, obstacle, robot = obstruction(
+        words, obstacle = obstruction(
             self._description, self._motion.observation, follower.fix, follower.robot_from_target,
             self._touched, self._beside(),
         )  # fmt: skip
@@ -372,7 +372,7 @@ class Navigator:
         self._blocks.add(a, b, now, obstacle)
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
-        self._patience.block(where, robot, now)
+        self._patience.block(where, obstacle.robot if obstacle else "", now)
         self.stage, self.detail = Stage.BLOCKED, f"{where}: {words}"
         self._patience.trouble = self.detail
         yield from self._motion.stand(PAUSE)

@@ -26,12 +26,10 @@ class Obstruction(NamedTuple):
     Attributes:
         words: what it is.
         obstacle: where it is; None if nothing is near.
-        robot: that stands there; empty if it is none.
     """
 
     words: str
     obstacle: Obstacle | None
-    robot: str
 
 
 def obstruction(
@@ -64,16 +62,16 @@ def obstruction(
         reach = description.radius + beside.radius + MARGIN
         way = np.array([[robot_from_target.x, robot_from_target.y]])
         if distances(np.array([[beside.x, beside.y]]), np.zeros((1, 2)), way)[0, 0] < reach:
-            return Obstruction(words, _obstacle(fix, beside.x, beside.y, reach), beside.robot)
+            return Obstruction(words, _obstacle(fix, beside.x, beside.y, reach, beside.robot))
     if not near:
-        return Obstruction(words, None, "")
+        return Obstruction(words, None)
     distance = math.hypot(robot_from_target.x, robot_from_target.y)
     share = min((description.radius + MARGIN) / max(distance, 1e-9), 1.0)
     ahead = share * robot_from_target.x, share * robot_from_target.y
-    return Obstruction(words, _obstacle(fix, *ahead, description.radius), "")
+    return Obstruction(words, _obstacle(fix, *ahead, description.radius))
 
 
-def _obstacle(fix: Fix, x: float, y: float, reach: float) -> Obstacle:
+def _obstacle(fix: Fix, x: float, y: float, reach: float, robot: str = "") -> Obstacle:
     """At a position in the robot's frame."""
     at = fix.node_from_robot.mean @ Pose2(x, y)
-    return Obstacle(fix.node, at.x, at.y, reach)
+    return Obstacle(fix.node, at.x, at.y, reach, robot)

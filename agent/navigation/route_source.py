@@ -51,7 +51,7 @@ class RouteSource:
         if not isinstance(content, RouteAnswer):
             trouble = f"{answer.error or 'no answer'}; "
             content = onboard_route(self._own_map, fix.node, goal, blocked, obstacles)
-        self.refusing = not (trouble or blocked)
+        self.refusing = not (trouble or blocked or obstacles)
         return replace(content, reason=f"{trouble}{content.reason}")
 
     def undriven(self, route: Collection[RouteLeg]) -> tuple[NodeId, NodeId] | None:

@@ -48,8 +48,9 @@ def test_edges_that_pass_a_place_are_those_that_points_along_them_show(router: R
 
 
 def test_an_obstacle_is_placed_by_its_node(router: Router) -> None:  # noqa: F811
-    unknown = Obstacle(NodeId("z", 1, 1), 0.0, 0.0, 1.0)
-    (disc,) = placed([unknown, Obstacle(node(3), 0.5, 0.25, 0.3)], router.roads)
+    assert placed(Obstacle(NodeId("z", 1, 1), 0.0, 0.0, 1.0), router.roads) is None
+    disc = placed(Obstacle(node(3), 0.5, 0.25, 0.3), router.roads)
+    assert disc is not None
     here = router.roads.poses[node(3)] @ Pose2(0.5, 0.25)
     assert (disc.x, disc.y, disc.reach) == pytest.approx((here.x, here.y, 0.3)) and math.isinf(disc.cost)
 

@@ -31,22 +31,22 @@ def seen(proximity: np.ndarray, touched: str = "", beside: RobotBeside | None = 
 
 
 def test_a_robot_on_the_straight_way_is_the_obstacle_and_one_beside_it_is_only_named() -> None:
-    words, obstacle, robot = seen(FREE, beside=RobotBeside(0.1, "r7", 0.5, 0.1, 0.2))
-    assert (words, robot) == ("no progress; r7 is 0.1 m off", "r7")
-    assert obstacle is not None and obstacle.node == A
+    words, obstacle = seen(FREE, beside=RobotBeside(0.1, "r7", 0.5, 0.1, 0.2))
+    assert words == "no progress; r7 is 0.1 m off"
+    assert obstacle is not None and (obstacle.node, obstacle.robot) == (A, "r7")
     assert (obstacle.x, obstacle.y) == pytest.approx((1.0 - 0.1, 2.0 + 0.5)), "in the node's frame"
     assert obstacle.reach == pytest.approx(BODY.radius + 0.2 + MARGIN)
     behind = seen(FREE, beside=RobotBeside(0.1, "r7", -0.6, 0.0, 0.2))
-    assert behind.robot == "" and behind.obstacle is None and "r7" in behind.words
+    assert behind.obstacle is None and "r7" in behind.words
 
 
 def test_what_is_near_is_right_before_the_robot_and_leaves_the_robot_outside() -> None:
-    _, obstacle, robot = seen(WALL_AHEAD)
-    assert obstacle is not None and robot == ""
+    _, obstacle = seen(WALL_AHEAD)
+    assert obstacle is not None and obstacle.robot == ""
     assert (obstacle.x, obstacle.y) == pytest.approx((1.0, 2.0 + BODY.radius + MARGIN))
     assert obstacle.reach < math.dist((obstacle.x, obstacle.y), (1.0, 2.0))
     assert seen(FREE, touched="a box").obstacle == obstacle
-    assert seen(FREE) == (NO_PROGRESS, None, "")
+    assert seen(FREE) == (NO_PROGRESS, None)
 
 
 def test_the_own_map_leads_around_a_place_whichever_edges_pass_it() -> None:
