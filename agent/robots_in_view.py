@@ -45,8 +45,8 @@ MOST_TOGETHER = 0.5
 """Share of the image that all regions together may cover: the rest is used, however many robots a server says
 there are."""
 BESIDE = 1.0
-"""Nearer than this another robot is beside this one, m between their edges: in a corridor without room to pass
-robots come to stand 0.7 m before each other."""
+"""Nearer than this another robot is beside this one, m between their edges: in a corridor without room
+to pass robots come to stand 0.7 m before each other."""
 IN_FRONT = 3
 """So many landmarks of a region that are nearer than the robot, and most of it, show that something hides
 the robot."""

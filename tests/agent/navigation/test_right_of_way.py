@@ -12,6 +12,7 @@ from mapweave.agent.navigation.goal_patience import YIELDED
 from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import NavigatorSettings
+from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
@@ -168,6 +169,55 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
         assert Stage.ASIDE in said and Stage.YIELDING in said
     else:
         assert min(gaps) < 2 * BODY.radius, "without reservations they drive into each other"
+
+
+def test_a_parked_robot_makes_room_in_a_corridor_and_the_other_passes(home, router):  # noqa: F811
+    """One has parked in the middle, another one drives from end to end; both by exact wheels."""
+    poses, nearby = router.roads.poses, Nearby()
+    reservations = Reservations(nearby.standing)
+    clock = [0.0]
+
+    def robot(name: str, start: int, goal: int) -> Trial:
+        eyes = Eyes(home, poses[node(start)])
+
+        def fleet(question: Question) -> Answer:
+            if isinstance(question, WhereAmI):
+                return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
+            ends = question.start, question.goal
+            answer = router.route(*ends, question.blocked, (), question.start_from_robot)
+            return Answer(question.number, answer)
+
+        def traffic(question: MayIDrive) -> Answer:
+            request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
+            return Answer(question.number, reservations.ask(request, router, clock[0]))
+
+        trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
+        trial.traffic = traffic
+        return trial
+
+    driving, parked, room = robot("r0", 0, 8), robot("r1", 5, 5), None
+    gaps: list[float] = []
+    for tick in range(1200):
+        clock[0] = tick * BODY.tick
+        place = ((node(5), poses[node(5)].inverse() @ parked.eyes.pose),)
+        if tick % 5 == 0:
+            nearby.ask(NearbyRequest("r1", place, 0.01, 0.01, BODY.radius, 0.3, 0.3), router.merged, clock[0])
+        if room is None and tick % 5 == 0:
+            room = reservations.room_for("r1", *place[0], router, clock[0])
+            if room is not None:
+                pose = parked.eyes.pose
+                parked = robot("r1", 5, room.number - 1)
+                parked.eyes.pose = pose
+        driving.run(BODY.tick)
+        if room is not None:
+            parked.run(BODY.tick)
+        gaps.append(driving.eyes.pose.distance(parked.eyes.pose))
+        if driving.eyes.pose.distance(poses[node(8)]) < 0.3:
+            break
+    assert room == node(9), "the niche"
+    assert len(gaps) * BODY.tick < 60.0, "32 s without the other one"
+    assert driving.eyes.pose.distance(poses[node(8)]) < 0.3
+    assert min(gaps) > 2 * BODY.radius, "they have not touched"
 
 
 def test_a_robot_whose_way_is_closed_asks_for_another_one_at_once(home):
