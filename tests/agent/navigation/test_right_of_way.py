@@ -281,6 +281,14 @@ def test_a_robot_that_has_left_the_way_again_ends_no_goal(home):
     trial, r7 = trial_to(home), RobotBeside(0.2, "r7", 0.5, 0.0, 0.14)
     around = [r7]
     trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: around[0] if around else None)
+    plain = trial.fleet
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhichWay) and question.obstacles:
+            return Answer(question.number, RouteAnswer((), "blocked"))
+        return plain(question)
+
+    trial.fleet = fleet
     trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
     trial.held = True
     trial.run(60.0, lambda: trial.navigator.stage == Stage.BLOCKED)
