@@ -9,7 +9,14 @@ from mapweave.hybridmap.nearby import NearbyAnswer
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import KnownAnswer, RelocalizeAnswer, ReserveAnswer, RouteAnswer, View
+from mapweave.hybridmap.query import (
+    KnownAnswer,
+    Obstacle,
+    RelocalizeAnswer,
+    ReserveAnswer,
+    RouteAnswer,
+    View,
+)
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,7 @@ class WhichWay:
         goal: node where it wants to be.
         start_from_robot: where it is exactly.
         blocked: pairs of nodes between which it could not drive.
+        obstacles: places where it could not drive.
     """
 
     number: int
@@ -92,6 +100,7 @@ class WhichWay:
     goal: NodeId
     start_from_robot: Pose2 = field(default_factory=Pose2)
     blocked: tuple[tuple[NodeId, NodeId], ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ class Pipeline:
         self._mission: Mission = Idle()
         self._navigator: Navigator | None = None
         self._guard = CommandGuard(self._caution)
-        self._lifted = self._put_elsewhere = False
+        self._lifted = self._put_elsewhere = self._made_room = False
         self._image: NDArray[np.uint8] | None = None
 
     @property
@@ -151,8 +151,8 @@ class Pipeline:
 
     @property
     def fix(self) -> Fix | None:
-        """By which node the robot drives to a goal; None if it does not, or does not know where it is."""
-        navigator = self._navigator if isinstance(self._mission, GoTo) else None
+        """By which node the robot drives to a goal, or stands after it was stopped; None without one."""
+        navigator = self._navigator if isinstance(self._mission, GoTo | Idle) else None
         return None if navigator is None else navigator.fix
 
     @property
@@ -187,8 +187,10 @@ class Pipeline:
         place of its own map.
         """
         self._mission = mission
-        self._put_elsewhere = False
+        self._put_elsewhere = self._made_room = False
         self._map_making.end_search()
+        if isinstance(mission, Explore | Carried):
+            self._forget_fix()
         match mission:
             case Explore():
                 self._map_making.explore()
@@ -239,12 +241,15 @@ class Pipeline:
             case Idle() if self.mapper.started:
                 # Mapping that goes on later needs the motion of the wheels until then.
                 self._map_making.keep_up(observation)
+            case Idle() if self.fix is not None:
+                self.fix.follow_wheels(observation, self._map_making.description)
             case Explore() | Carried():
                 command, questions = self._map_making.step(
                     observation, answers, self._exploring, bool(self._blind), self._held
                 )
                 self._others.description = self._map_making.description
             case GoTo() if self._navigator is not None:
+                self._make_room(self._navigator)
                 command, questions = self._navigator.step(observation, answers, self._held)
                 self.mapper.drove(self._navigator.traverse, self._navigator.refined)
         questions = [*questions, *self._who_is_near()]
@@ -258,16 +263,23 @@ class Pipeline:
         self._command = safe if own else None
         return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
 
+    def _make_room(self, navigator: Navigator) -> None:
+        """Drive out of the way of another robot, if this one has nothing else to do, and may."""
+        aside, self._others.aside = self._others.aside, None
+        if aside is not None and navigator.arrived and self._settings.navigation.make_room and not self._held:
+            self.set_mission(GoTo(aside))
+            self._made_room = True
+
     def _who_is_near(self) -> list[Question]:
         """Ask for the robots around this one, if it is time and it knows where it is."""
         if not self._others.due:
             return []
         fix = self.fix
         match self._mission:
-            case Explore() | Carried() if self._map_making.located and self.map.nodes:
+            case Explore() | Carried() | Idle() if self._map_making.located and self.map.nodes:
                 starts = nodes_around(self.map, self.mapper.map_from_robot.mean)
                 return [self._others.question(starts, self.mapper.since_anchor)]
-            case GoTo() if fix is not None:
+            case GoTo() | Idle() if fix is not None:
                 starts = ((fix.node, fix.node_from_robot.mean),)
                 return [self._others.question(starts, fix.node_from_robot)]
         return []
@@ -303,12 +315,20 @@ class Pipeline:
             self.set_mission(self._mission)
             return
         self._map_making.end_search()
+        self._forget_fix()
         self._map_making.lose_pose()
+
+    def _forget_fix(self) -> None:
+        """Where a drive to a goal has ended says no longer where the robot is."""
+        if self._navigator is not None:
+            self._navigator.fix = None
 
     def _in_the_air(self, observation: Observation) -> bool:
         """Whether the base says that it is lifted. Put down again, the robot is at an unknown place."""
         if observation.kidnapped and not self._lifted:
             self.mapper.lose()
+            if not isinstance(self._mission, GoTo):
+                self._forget_fix()
         elif self._lifted and not observation.kidnapped:
             if isinstance(self._mission, GoTo):
                 self.set_mission(self.mission)
@@ -355,6 +375,7 @@ class Pipeline:
                 doing, detail = str(self._navigator.stage), self._navigator.detail
                 finished, given_up = self._navigator.arrived, self._navigator.given_up
                 progress = self._navigator.progress
+                detail += "; it makes room for another robot" if self._made_room else ""
         if self._blind:
             doing, detail = "standing still", self._blind
         if self._driven is not None:

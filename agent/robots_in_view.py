@@ -10,6 +10,7 @@ import heapq
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,8 +44,9 @@ MOST_SHARE = 0.25
 MOST_TOGETHER = 0.5
 """Share of the image that all regions together may cover: the rest is used, however many robots a server says
 there are."""
-BESIDE = 0.5
-"""Nearer than this another robot is beside this one, m between their edges."""
+BESIDE = 1.0
+"""Nearer than this another robot is beside this one, m between their edges: in a corridor without room
+to pass robots come to stand 0.7 m before each other."""
 IN_FRONT = 3
 """So many landmarks of a region that are nearer than the robot, and most of it, show that something hides
 the robot."""
@@ -52,11 +54,35 @@ STARTS = 4
 """Nodes by which the server may know where the robot is: the newest are not merged yet."""
 
 
+class RobotBeside(NamedTuple):
+    """Another robot next to this one.
+
+    Attributes:
+        off: m, between their edges.
+        robot: its name.
+        x: m, in the frame of this robot.
+        y: m, likewise.
+        radius: of its footprint, m.
+    """
+
+    off: float
+    robot: str
+    x: float
+    y: float
+    radius: float
+
+    @property
+    def words(self) -> str:
+        """Who it is, and how far off."""
+        return f"{self.robot} is {self.off:.1f} m off"
+
+
 class RobotsInView:
     """Asks who is near, and predicts where in the image they are.
 
     Attributes:
         description: of this robot.
+        aside: the node where this robot is in no other's way, if it stands in one by the newest answer.
     """
 
     def __init__(self, description: RobotDescription) -> None:
@@ -66,6 +92,7 @@ class RobotsInView:
             description: of this one.
         """
         self.description = description
+        self.aside: NodeId | None = None
         self._odom_from_robot = Pose2()
         self._now = 0.0
         self._stamp_ns: int | None = None
@@ -97,19 +124,19 @@ class RobotsInView:
         return replace(observation, left_out=regions) if len(regions) else observation
 
     @property
-    def beside(self) -> str:
-        """The nearest robot and how far it is, in words; empty if none is beside this one."""
+    def beside(self) -> RobotBeside | None:
+        """The nearest robot; None if none is beside this one."""
         if self._seen is None:
-            return ""
+            return None
         at, odom_then, robots = self._seen
         robot_from_then = self._odom_from_robot.inverse() @ odom_then
-        around: list[tuple[float, str]] = []
+        around: list[RobotBeside] = []
         for one in robots:
             pose = robot_from_then @ one.robot_from_other
             off = math.hypot(pose.x, pose.y) - self.description.radius - one.radius
             if off < BESIDE and one.age + self._now - at < OLDEST:
-                around.append((max(off, 0.0), one.robot))
-        return f"{min(around)[1]} is {min(around)[0]:.1f} m off" if around else ""
+                around.append(RobotBeside(max(off, 0.0), one.robot, pose.x, pose.y, one.radius))
+        return min(around, default=None)
 
     @property
     def due(self) -> bool:
@@ -131,6 +158,7 @@ class RobotsInView:
         return WhoIsNear(NUMBER, starts, min(sigma, 100.0), min(turn, 4.0), d.radius, height, speed)
 
     def _take(self, answer: Answer, at: float, odom_then: Pose2) -> None:
+        self.aside = answer.content.aside if isinstance(answer.content, NearbyAnswer) else None
         if not isinstance(answer.content, NearbyAnswer):
             self._due = self._now + EVERY[1]
             return

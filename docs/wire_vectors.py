@@ -269,7 +269,8 @@ def answers() -> dict[str, tuple[Any, ...]]:
     views = np.array([[1.5, -2.0, 0.5, 0.75], [3.0, 0.0, -1.5, 0.5]], np.float32)
     image = floor_plan.PlanImage("0f" * 32, 760, 800, "office.png")
     request = MissionRequest("7f3a9c", "r0", MissionKind.GO, STAMP, "anna", "kitchen", ("r0.3.17",))
-    route = query.RouteRequest(NODE, FAR, ((NODE, NEXT),), Pose2(0.1, 0.0, 0.2))
+    obstacle = query.Obstacle(NEXT, 0.25, -0.5, 0.375, "r1")
+    route = query.RouteRequest(NODE, FAR, ((NODE, NEXT),), Pose2(0.1, 0.0, 0.2), (obstacle,))
     robots = (
         RobotEntry("r0", True, 0.5, status(), Pose2(1.0, 2.0, 3.0), 0, "kitchen", "ground"),
         RobotEntry(
@@ -283,7 +284,11 @@ def answers() -> dict[str, tuple[Any, ...]]:
                 query.Certainty.UNKNOWN, (), "no place agrees", (similar,), "1 of 4 shards did not answer"
             ),
         ),
-        "server/s0/route": (route, query.RouteAnswer(legs, "2 nodes"), query.RouteAnswer(legs, "", LIFT)),
+        "server/s0/route": (
+            route,
+            query.RouteAnswer(legs, "2 nodes"),
+            query.RouteAnswer(legs, "", LIFT, "r1 stands on a shorter way"),
+        ),
         "server/s0/known": (query.KnownRequest(MAP, 1.25, -2.5, 8.5), query.KnownAnswer(views, "2 views")),
         "server/s0/reserve": (
             query.ReserveRequest("r0", NODE, Pose2(0.1, 0.0, 0.2), (NEXT, FAR)),
@@ -294,7 +299,7 @@ def answers() -> dict[str, tuple[Any, ...]]:
                 "r0", ((NODE, Pose2(0.1, 0.0, 0.2)), (NEXT, Pose2())), 0.05, 0.01, 0.16, 0.3, 0.3
             ),
             nearby.NearbyAnswer(
-                (nearby.NearbyRobot("r1", Pose2(1.5, -0.25, 3.0), 0.125, 0.16, 0.3, 0.3, 0.5),), ""
+                (nearby.NearbyRobot("r1", Pose2(1.5, -0.25, 3.0), 0.125, 0.16, 0.3, 0.3, 0.5),), "", FAR
             ),
         ),
         "server/s0/explain": (

@@ -72,7 +72,10 @@ class NearbyAnswer:
     Attributes:
         robots: the others.
         reason: why there are none, in words; may be empty.
+        aside: the asking robot has no way and stands in another's: the node where it is in no way; None if it
+            stands in no way, or there is no such node.
     """
 
     robots: Annotated[tuple[NearbyRobot, ...], Meta(max_length=MAX_NEARBY)]
     reason: Words = ""
+    aside: NodeId | None = None

@@ -16,6 +16,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import (
     MAX_NUMBER,
     MAX_POSITION,
+    NAME_OR_NOTHING,
     Angle,
     Coordinate,
     LandmarkCount,
@@ -30,6 +31,9 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 MAX_CANDIDATES = 64
 MAX_BLOCKED = 256
+MAX_OBSTACLES = 64
+MAX_REACH = 5.0
+"""Of an obstacle, m: two of the largest robots beside each other."""
 MAX_LEGS = 512
 """A route through a building has tens of legs."""
 MAX_WORDS_ASKED = 64
@@ -169,11 +173,13 @@ class RouteAnswer:
         legs: the first is the node where the robot is; empty if there is no way.
         reason: in words.
         portal: where the legs end if that is not the goal: from its other side on the robot asks again.
+        detour: which robots stand on a shorter way, in words; empty without one.
     """
 
     legs: Annotated[tuple[RouteLeg, ...], Meta(max_length=MAX_LEGS)]
     reason: Words
     portal: PortalStop | None = None
+    detour: Words = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +215,25 @@ Blocked = Annotated[tuple[tuple[NodeId, NodeId], ...], Meta(max_length=MAX_BLOCK
 
 
 @dataclass(frozen=True, slots=True)
+class Obstacle:
+    """A place where a robot could not drive: no way that passes within `reach` of it is of use to it.
+
+    Attributes:
+        node: by which the place is known.
+        x: m, in the robot frame of that node.
+        y: m, likewise.
+        reach: m, from the place to the middle of a robot that touches what is there.
+        robot: that stands there; empty if it is none. Once the server knows it elsewhere, the place is free.
+    """
+
+    node: NodeId
+    x: Coordinate
+    y: Coordinate
+    reach: Annotated[float, Meta(ge=0.0, le=MAX_REACH)]
+    robot: Annotated[str, Meta(pattern=NAME_OR_NOTHING)] = ""
+
+
+@dataclass(frozen=True, slots=True)
 class RouteRequest:
     """How does one get from node to node?
 
@@ -217,12 +242,14 @@ class RouteRequest:
         goal: node where it wants to be.
         blocked: pairs of nodes between which it could not drive.
         start_from_robot: where it is exactly.
+        obstacles: places where it could not drive.
     """
 
     start: NodeId
     goal: NodeId
     blocked: Blocked = ()
     start_from_robot: Pose2 = field(default_factory=Pose2)
+    obstacles: Annotated[tuple[Obstacle, ...], Meta(max_length=MAX_OBSTACLES)] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
+from mapweave.mapserver.nearby import StandingRobot
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
@@ -38,9 +39,8 @@ ASIDE, APART = 12, 0.3
 """Places that are tried to step aside to, and m between two: a place has a node for each heading."""
 
 Points = NDArray[np.float64]
-Standing = Callable[[NodeId, float, MergedMap, float], Sequence[str]]
-"""Names the robots that stand where one of some radius, m, would touch them if it were at a node of the map.
-The last argument is the time, s."""
+Standing = Callable[[Points, int, float, MergedMap, float], Sequence[StandingRobot]]
+"""Finds the robots that stand on a way; see mapweave.mapserver.nearby.Nearby.standing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +84,23 @@ class _Aside:
     boxed_in: bool
 
 
+@dataclass(eq=False)
+class _Passing:
+    """A robot's way leads past one that stands there without a way.
+
+    Attributes:
+        robot: that drives.
+        until: s.
+        asked: whether the node where the other one is in no way was looked for.
+        aside: that node.
+    """
+
+    robot: str
+    until: float
+    asked: bool = False
+    aside: NodeId | None = None
+
+
 class Reservations:
     """Leases by robot. Thread-safe."""
 
@@ -91,10 +108,11 @@ class Reservations:
         """No robot holds anything.
 
         Args:
-            standing: see mapweave.mapserver.nearby.Nearby.standing.
+            standing: robots on a way.
         """
         self._standing = standing
         self._leases: dict[str, _Lease] = {}
+        self._passings: dict[str, _Passing] = {}
         self._turn = threading.Lock()
 
     def ask(self, request: ReserveRequest, router: Router, now: float) -> ReserveAnswer:
@@ -121,7 +139,11 @@ class Reservations:
             radius = max(router.roads.union.nodes[node].radius for node in request.route) or RADIUS
             others = {name: one for name, one in self._leases.items() if one.component == component}
             granted, held, holder = _free(stops, radius, others)
-            taken = self._at_goal(request, radius, merged, now) if granted == len(request.route) else ""
+            taken = ""
+            if granted == len(request.route):
+                at_goal = self._standing(stops[-1:], component, radius, merged, now)
+                others_there = (one.robot for one in at_goal if one.robot != request.robot)
+                taken = next((name for name in others_there if name not in self._leases), "")
             if taken:
                 granted, holder = granted - 1, taken
                 held = np.vstack([here[None], *(_points(a, b) for a, b in pairwise(stops[:-1]))])
@@ -129,6 +151,7 @@ class Reservations:
             way = np.vstack([_points(a, b) for a, b in pairwise(stops)])
             lease = _Lease(request, component, radius, here, held, way, now + LEASE, holder)
             self._leases[request.robot] = lease
+            self._note_standing(lease, stops[: granted + 1], stops[-1], merged, now)
             if not holder:
                 return ReserveAnswer(granted, "", None, "")
             aside = self._yields(request.robot, router)
@@ -139,10 +162,59 @@ class Reservations:
             free = _free(aside.way, radius, others)[0] == len(aside.way) - 1
             return ReserveAnswer(0, holder, aside.node if free else None, reason)
 
-    def _at_goal(self, request: ReserveRequest, radius: float, merged: MergedMap, now: float) -> str:
-        """The robot that stands at the end of a robot's way, without a way of its own; empty if none does."""
-        there = self._standing(request.route[-1], radius, merged, now)
-        return next((name for name in there if name != request.robot and name not in self._leases), "")
+    def _note_standing(
+        self, lease: _Lease, stops: Points, goal: Points, merged: MergedMap, now: float
+    ) -> None:
+        """Take note of robots without a way on what is granted of another's way, but for its goal."""
+        self._passings = {name: one for name, one in self._passings.items() if now < one.until}
+        robot = lease.request.robot
+        for one in self._standing(stops, lease.component, lease.radius + MARGIN, merged, now):
+            at_goal = np.hypot(one.x - goal[0], one.y - goal[1]) < lease.radius + one.radius
+            if one.robot == robot or one.robot in self._leases or at_goal:
+                continue
+            passing = self._passings.setdefault(one.robot, _Passing(robot, now))
+            if passing.robot == robot:
+                passing.until = now + LEASE
+
+    def room_for(
+        self, robot: str, start: NodeId, start_from_robot: Pose2, router: Router, now: float
+    ) -> NodeId | None:
+        """The node where a robot that stands in another one's way is in no way; None without need, or one.
+
+        Args:
+            robot: its name.
+            start: node that the robot knows itself by.
+            start_from_robot: where it is exactly.
+            router: of the newest merged map.
+            now: of the same clock, s.
+        """
+        with self._turn:
+            passing = self._passings.get(robot)
+            component = router.merged.component_of(start)
+            if passing is None or now >= passing.until or robot in self._leases or component is None:
+                return None
+            other = self._leases.get(passing.robot)
+            if not passing.asked and other is not None and other.component == component:
+                passing.asked, pose = True, router.roads.poses[start] @ start_from_robot
+                here = np.array([pose.x, pose.y])
+                request = ReserveRequest(robot, start, start_from_robot, (start,))
+                radius = router.roads.union.nodes[start].radius or RADIUS
+                lease = _Lease(request, component, radius, here, here[None], here[None], now, passing.robot)
+                aside = _place_aside(lease, [other], router)
+                passing.aside = None if aside is None else aside.node
+            return passing.aside
+
+    def parked(
+        self, stops: Points, component: int, radius: float, merged: MergedMap, now: float, asker: str
+    ) -> list[StandingRobot]:
+        """Robots that stand on a way without one of their own; for the arguments see `Nearby.standing`.
+
+        The asking robot is left out.
+        """
+        with self._turn:
+            underway = {asker, *(name for name, lease in self._leases.items() if now < lease.until)}
+        there = self._standing(stops, component, radius + MARGIN, merged, now)
+        return [one for one in there if one.robot not in underway]
 
     def _yields(self, robot: str, router: Router) -> _Aside | None:
         """Where a robot steps aside; None if robots do not wait for each other in a circle, or another does.

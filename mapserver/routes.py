@@ -21,6 +21,7 @@ from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.route import Route, RouteSettings, Ways
 from mapweave.mapserver.active_nodes import without_faded
+from mapweave.mapserver.obstacles import Disc, Discs
 from mapweave.mapserver.portals import Portals
 from mapweave.mapserver.roadmap import Roadmap
 from mapweave.mapserver.route_rules import RouteRules, rule_words
@@ -99,6 +100,13 @@ class Router:
         self.costs = costs or RouteSettings()
         self._shared = _Shared(merged, reaches)
         self.annotations, self._stamp_ns = Annotations(), 0
+        self._discs: Discs | None = None
+
+    def past(self, discs: Collection[Disc]) -> Router:
+        """The same router, with places that ways should not pass."""
+        router = copy(self)
+        router._discs = Discs(self.roads, discs) if discs else None
+        return router
 
     def at(self, annotations: Annotations, stamp_ns: int) -> Router:
         """The same router, by closures and preferences at a time (wall time, ns); costs nothing."""
@@ -241,7 +249,7 @@ class Router:
         """
         rules = self.rules
         closed = set() if within is None else rules.closed_for(within)
-        barred = [*map(frozenset, blocked), *closed]
+        barred = [*map(frozenset, blocked), *closed, *(self._discs.barred if self._discs else ())]
         return Ways(
             self.roads.union, poses=poses, penalties=self._penalties(wary), blocked=barred,
             closed=self.roads.closed, settings=self.costs, toll=toll,
@@ -316,6 +324,10 @@ class Router:
             for distance, node in nearest
             if (distance <= ENTRY_REACH or node == start) and frozenset((start, node)) not in barred
         ]
+        if discs := self._discs:
+            number = component or 0
+            entries = [(node, cost + discs.entry(number, pose, poses[node])) for node, cost in entries]
+            entries = [entry for entry in entries if math.isfinite(entry[1])]
         if within is not None and (rules := self.rules):
             entries = [
                 (node, cost)
@@ -344,12 +356,13 @@ class Router:
         return saved
 
     def _penalties(self, wary: Collection[tuple[NodeId, NodeId]]) -> Mapping[EdgeId, float]:
-        if not wary:
+        costs = dict(self._discs.costs) if self._discs else {}
+        for pair in map(frozenset, wary):
+            costs[pair] = costs.get(pair, 0.0) + WARY_COST
+        if not costs:
             return {}
-        pairs, cost = {frozenset(pair) for pair in wary}, WARY_COST
-        return {
-            edge.id: cost for edge in self.roads.union.edges.values() if frozenset((edge.a, edge.b)) in pairs
-        }
+        hops = ((edge.id, frozenset((edge.a, edge.b))) for edge in self.roads.union.edges.values())
+        return {edge: costs[hop] for edge, hop in hops if hop in costs}
 
     def _relative(self, a: NodeId, b: NodeId) -> PoseGaussian:
         if a == b:

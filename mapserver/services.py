@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 
 from mapweave.hybridmap.errors import Busy, InvalidMessage, MapweaveError
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
 from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import (
     KnownRequest,
+    Obstacle,
     RelocalizeAnswer,
     ReserveAnswer,
     ReserveRequest,
@@ -26,14 +29,17 @@ from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.mission_relay import MissionRelay
-from mapweave.mapserver.nearby import Nearby
+from mapweave.mapserver.nearby import Nearby, StandingRobot
+from mapweave.mapserver.obstacles import Disc, Discs, placed
 from mapweave.mapserver.packed_map import PackedMap
+from mapweave.mapserver.parked_robots import route_past_parked
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.route_rules import rule_words
-from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
+from mapweave.mapserver.routes import Router
+from mapweave.mapserver.wire_limits import drivable, within_range
 from mapweave.merge.floors import maps_elsewhere
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys, robot_of
@@ -109,7 +115,7 @@ class Services:
         )  # fmt: skip
         of_robots: dict[str, Callable[[Request], None]] = {
             keys.relocalize(name): self._relocalize_later,
-            keys.route(name): guarded(self._route),
+            keys.route(name): self._route_in_name,
             keys.known(name): guarded(self._known),
             keys.reserve(name): self._reserve_in_name,
             keys.nearby(name): self._nearby_in_name,
@@ -185,17 +191,44 @@ class Services:
             elsewhere = maps_elsewhere(answers.merged, places.annotations.floors, view.near)
         return places.named(answers.relocalizer.answer(view, elsewhere))
 
-    def _route(self, payload: bytes) -> bytes:
-        request = decode(payload, RouteRequest)
-        answers = self._answers()
-        self._blockages.report(request.blocked, self._clock())
-        wary = self._blockages.known(self._clock())
+    def _route_in_name(self, request: Request) -> None:
+        guarded(lambda payload: self._route(payload, robot_of(request.key)))(request)
 
-        def route(blocked: Pairs) -> RouteAnswer:
-            start, goal, start_from_robot = request.start, request.goal, request.start_from_robot
-            return answers.router.route(start, goal, blocked, wary, start_from_robot)
+    def _route(self, payload: bytes, robot: str) -> bytes:
+        request, now = decode(payload, RouteRequest), self._clock()
+        router = self._answers().router
+        barred = self._barred(request.obstacles, router, now)
+        # Of robots the server knows itself where they stand.
+        things = self._barred([one for one in request.obstacles if not one.robot], router, now)
+        hops = (tuple(sorted(hop)) for hop in Discs(router.roads, things).barred)
+        self._blockages.report([*request.blocked, *((a, b) for a, b in hops)], now)
+        wary = self._blockages.known(now)
 
-        return encode(drivable(route, request.blocked))
+        def route(parked: Sequence[Disc]) -> RouteAnswer:
+            past, start, goal = router.past([*barred, *parked]), request.start, request.goal
+            return drivable(
+                lambda blocked: past.route(start, goal, blocked, wary, request.start_from_robot),
+                request.blocked,
+            )
+
+        def standing(way: Array, component: int, radius: float) -> list[StandingRobot]:
+            return self._reservations.parked(way, component, radius, router.merged, now, robot)
+
+        return encode(route_past_parked(request, router.roads, route, standing))
+
+    def _barred(self, obstacles: Sequence[Obstacle], router: Router, now: float) -> list[Disc]:
+        """Where the obstacles are that a robot has met, without those of robots that have left."""
+        graphs, discs = router.merged.graphs, []
+        for one in obstacles:
+            disc = placed(one, router.roads)
+            if disc is not None and not (
+                one.robot
+                and self._nearby.left(
+                    one.robot, (disc.x, disc.y), disc.reach, graphs[disc.component].anchor, now
+                )
+            ):
+                discs.append(disc)
+        return discs
 
     def _reserve_in_name(self, request: Request) -> None:
         guarded(lambda payload: self._reserve(payload, robot_of(request.key)))(request)
@@ -221,7 +254,13 @@ class Services:
         request = decode(payload, NearbyRequest)
         if robot not in ("", request.robot):
             raise InvalidMessage(f"{robot} does not say where {request.robot} is")
-        return encode(self._nearby.ask(request, self._answers().merged, self._clock()))
+        router, now = self._answers().router, self._clock()
+        answer = self._nearby.ask(request, router.merged, now)
+        known = (start for start in request.starts if router.merged.component_of(start[0]) is not None)
+        for node, node_from_robot in islice(known, 1):
+            aside = self._reservations.room_for(request.robot, node, node_from_robot, router, now)
+            answer = replace(answer, aside=aside)
+        return encode(answer)
 
     def _known(self, payload: bytes) -> bytes:
         request = decode(payload, KnownRequest)

@@ -46,7 +46,11 @@ class Fix:
             if self.localizer.in_sight:
                 self.node_from_robot, self.blind = self.localizer.pose, 0.0
                 return
-            self.localizer = None
+        self.follow_wheels(observation, description)
+
+    def follow_wheels(self, observation: Observation, description: RobotDescription) -> None:
+        """Take in what the wheels say; landmarks are no longer looked for."""
+        self.localizer = None
         step, blind = wheel_step(observation.odometry, description)
         self.node_from_robot, self.blind = self.node_from_robot @ step, self.blind + blind
 

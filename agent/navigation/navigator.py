@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Generator
 from dataclasses import replace
-from enum import StrEnum
+from functools import partial
 
 import numpy as np
 
-from mapweave.agent.clearance import obstacle_words
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.mission import Answer, GoTo, Question
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.navigation.answer_trial import AnswerTrial
-from mapweave.agent.navigation.blocked_edges import BlockedEdges
+from mapweave.agent.navigation.blocks import Blocks
+from mapweave.agent.navigation.goal_patience import GoalPatience
 from mapweave.agent.navigation.local_planner import LocalPlanner
+from mapweave.agent.navigation.obstruction import obstruction
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.navigation.positioning import Positioning
-from mapweave.agent.navigation.right_of_way import RightOfWay
+from mapweave.agent.navigation.right_of_way import Passage, RightOfWay
 from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteProgress
 from mapweave.agent.navigation.route_source import RouteSource
+from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -32,38 +33,16 @@ from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
-from mapweave.registration.recognition import RecognitionSettings
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
 HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
-NO_PROGRESS = "no progress, though nothing is near"
-
-
-class Stage(StrEnum):
-    """What the navigator is doing while it follows no route."""
-
-    LOST = "turning to localize"
-    ASKING = "asking for a route"
-    BLOCKED = "waiting at an obstacle"
-    WAITING = "waiting for a route"
-    YIELDING = "waiting for another robot"
-    ASIDE = "stepping aside for another robot"
-    PORTAL = "waiting at a portal"
-    ARRIVED = "parked at the goal"
-    GIVEN_UP = "gave up its goal"
-
-
 UNDERWAY = (RouteProgress.DRIVING, RouteProgress.PARKING)
 
 ANSWER_PATIENCE = 100
 """Ticks that an answer may take before the question counts as lost."""
 PAUSE = 2.0
 """How long it waits before what is in its way, and before it asks again for a route, s."""
-REFUSED = 20.0
-"""A fleet that answers for so long that there is no way is believed, s: it may first have to merge."""
-YIELDED = 30.0
-"""How long it waits for another robot before it looks for another way, s."""
 THERE = 0.05
 """It has stepped aside within this distance of the node, m: others pass with a margin of 0.1 m."""
 TRUSTED = 1.0
@@ -99,12 +78,12 @@ class Navigator:
         via: tuple[NodeId, ...] = (),
         crossing: PortalCrossing | None = None,
         near: NodeId | None = None,
-        beside: Callable[[], str] = str,
+        beside: Callable[[], RobotBeside | None] = lambda: None,
     ) -> None:
         """Start lost, or at a portal, with a goal and nodes to pass before, in order.
 
-        The robot is on the floor of the node `near`, if that is known. `beside` names a robot next to it, in
-        words, if there is one.
+        The robot is on the floor of the node `near`, if that is known. `beside` is the robot next to it,
+        if there is one.
         """
         self.stage: str = Stage.LOST
         self.detail = ""
@@ -119,31 +98,25 @@ class Navigator:
         self.traverse: Traverse | None = None
         self.refined: Node | None = None
         self._description = description
-        self._lens = lens
-        self._sift = sift
         self._settings = s = settings or AgentSettings()
-        self._rng = np.random.default_rng(seed)
-        self._local_planner = LocalPlanner(description, s.navigation)
+        rng = np.random.default_rng(seed)
+        self._planner = planner = LocalPlanner(description, s.navigation)
+        self._follower = partial(RouteFollower, description, lens, sift, detour=planner, settings=s, rng=rng)
         self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
         self._routes = RouteSource(self._motion, own_map, description)
-        self._positioning = Positioning(description, lens, sift, own_map, self._motion, s, self._rng, near)
+        self._positioning = Positioning(description, lens, sift, own_map, self._motion, s, rng, near)
         self._trial = AnswerTrial(self._motion, self._positioning.refuted)
-        self._detector = NodeDetector(description, lens, sift, self._rng, s)
-        self._blocks = BlockedEdges(s.navigation)
+        self._blocks = Blocks(s.navigation)
+        self._patience = GoalPatience(s.navigation.patience)
         self._beside = beside
         self._traverse_recorder = TraverseRecorder(description)
         self._refinement = LandmarkRefinement(own_map)
         self._expected: Pose2 | None = None
-        self._failed_views = 0
         self._goal_hidden = False
         self._following = self._parking_retried = False
-        self._touched = ""
-        self._refused_since: float | None = None
-        self._driven: set[tuple[NodeId, NodeId]] = set()
-        self._progressed_at = 0.0
+        self._touched = self._detour = ""
         self._portal: PortalStop | None = None
         self._aside: NodeId | None = None
-        self._trouble = "it does not know where it is"
         self._behaviour = self._go()
 
     @property
@@ -177,16 +150,16 @@ class Navigator:
             standing: the robot must not move; the behaviour waits, and the fix is updated.
         """
         self._motion.take_in(observation, answers)
-        self._local_planner.see(observation)
+        self._planner.see(observation)
         at_portal = self.crossing.wait is not None
         if self.fix is not None and not at_portal and (standing or not self._following):
             self.fix.follow(observation, self._description)
         if standing or at_portal:
-            self._progressed_at += self._description.tick
-        elif not self.arrived and self._motion.now - self._progressed_at > self._settings.navigation.patience:
-            self._give_up(f"no nearer in {self._settings.navigation.patience:g} s: {self._trouble}")
-        elif not self.arrived and self._trial.ended:
-            self._give_up(self._trial.ended)
+            self._patience.pause(self._description.tick)
+        elif not self.arrived:
+            reason = self._patience.ended(self._beside(), self._motion.now) or self._trial.ended
+            if reason:
+                self._give_up(reason)
         command = Command() if standing else next(self._behaviour)
         fix = None if self._positioning.search or self.crossing.wait else self.fix
         if fix is not None:
@@ -221,7 +194,7 @@ class Navigator:
             if (undriven := self._routes.undriven(route)) is not None:
                 self._blocks.add(*undriven, self._motion.now)
             elif route:
-                self._refused_since = None
+                self._patience.refused_since = None
                 yield from self._follow(route, self.fix)
                 if self._aside is not None and self.fix is not None:
                     yield from self._step_aside(self.fix, self._aside)
@@ -257,7 +230,7 @@ class Navigator:
 
     def _find(self) -> Behaviour:
         self.stage, self._goal_hidden = Stage.LOST, False
-        self._trouble = "it does not know where it is"
+        self._patience.trouble = "it does not know where it is"
         expected, self._expected = self._expected, None
         self._start_from((yield from self._positioning.find(expected)))
 
@@ -271,34 +244,27 @@ class Navigator:
     def _get_route(self, fix: Fix, goal: NodeId) -> Generator[Command, None, RouteAnswer]:
         """Ask for a way."""
         self.stage = Stage.ASKING
-        answer = yield from self._routes.route(fix, goal, self._blocks.at(self._motion.now))
-        self.detail = answer.reason
+        answer = yield from self._routes.route(fix, goal, self._blocks)
+        self.detail, self._detour = answer.reason, answer.detour
         if not answer.legs:
-            self._trouble = self.detail
+            self._patience.trouble = self.detail
         self.legs = self.legs or len(answer.legs)
         return answer
 
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""
-        self.stage, now = Stage.WAITING, self._motion.now
-        if not self._blocks.at(now) and self._refused_since is None:
-            self.fix, self._refused_since = None, now
-        elif (
-            self._routes.refusing and self._refused_since is not None and now - self._refused_since > REFUSED
-        ):
-            self._give_up(self._trouble)
+        self.stage, now, patience = Stage.WAITING, self._motion.now, self._patience
+        if not (self._blocks.pairs(now) or self._blocks.obstacles(now)) and patience.refused_since is None:
+            self.fix, patience.refused_since = None, now
+        elif reason := patience.refused(self._routes.refusing, now):
+            self._give_up(reason)
         yield from self._motion.stand(PAUSE)
-
-    def _follower(self, route: tuple[RouteLeg, ...], fix: Fix) -> RouteFollower:
-        return RouteFollower(
-            self._description, self._lens, self._sift, route, fix, self._local_planner,
-            self._settings, self._rng,
-        )  # fmt: skip
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
         """Follow a route until it is driven, or blocked, or the robot is lost."""
-        fix = self._compared(route, fix)
-        follower = self._follower(route, fix)
+        if self._trial.node is not None:
+            fix = self._positioning.compared(route, fix)
+        follower = self._follower(route=route, fix=fix)
         self._trial.took(route, fix)
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
         self._following, self._touched = True, ""
@@ -306,15 +272,14 @@ class Navigator:
             if not (yield from self._let_pass(right_of_way, follower)):
                 return
             leg = follower.leg
-            if follower.blocked not in self._driven:
-                self._driven.add(follower.blocked)
-                self._progressed_at = self._motion.now
+            self._patience.drive(follower.blocked, self._beside(), self._motion.now)
             command = follower.step(self._motion.observation)
-            self.fix, self.stage, self.detail = follower.fix, follower.progress, follower.detail
+            self.fix, self.stage = follower.fix, follower.progress
+            self.detail = "; ".join(filter(None, (follower.detail, self._detour)))
             self.progress = follower.leg / len(route)
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
-                self._failed_views = 0
+                self._positioning.failed_views = 0
                 self._trial.saw(follower.fix.node)
             if self._via and self._portal is None and follower.to_goal <= THERE:
                 del self._via[0]
@@ -331,19 +296,8 @@ class Navigator:
         match follower.progress:
             case RouteProgress.ARRIVED:
                 self._reach()
-            case RouteProgress.BLOCKED if not self._parking_retried and self._stuck_at_goal(follower):
-                # Nothing keeps it from its goal but its own precision: that blocks no other robot.
-                self.detail, self._parking_retried = "parking did not end: trying once more", True
             case RouteProgress.BLOCKED:
-                self._trial.blocked()
-                yield from self._report_block(*follower.blocked)
-                if self._parking_retried:
-                    # Twice: localize again, so that parking begins from another heading.
-                    self.fix, self._expected, self._parking_retried = (
-                        None,
-                        self._positioning.on_own_map(self.fix),
-                        False,
-                    )
+                yield from self._report_block(follower)
             case RouteProgress.UNSURE if (
                 self._goal_hidden
                 and self._trial.node is None
@@ -360,20 +314,6 @@ class Navigator:
                     self._trial.refute(blind)
                 yield from self._relocalize()
 
-    def _compared(self, route: tuple[RouteLeg, ...], fix: Fix) -> Fix:
-        """The fix, or the robot's own if it sees the node by which the fleet has localized it.
-
-        The robot still stands where it asked. What it recognises itself comes before any answer.
-        """
-        node = next((leg.node for leg in route if leg.node.id == fix.node), None)
-        image = self._motion.observation.image
-        if self._trial.node is None or node is None or image is None:
-            return fix
-        # More is asked than of an expected node: any pose will do.
-        anywhere = Expected(0, node, fix.node_from_robot.mean, math.inf)
-        seen = self._detector.find(image, [anywhere], RecognitionSettings())
-        return fix if seen is None else Fix.of(seen[1])
-
     def _reach(self) -> None:
         """The robot is where the route ends: at the goal, or at a portal on the way there."""
         self.tally = self.tally.passed([0.0])
@@ -387,26 +327,23 @@ class Navigator:
 
         Where the way ahead is closed by a person, another one is asked for at once.
         """
-        began, self._following, go_on = self._motion.now, False, True
-        while go_on and not right_of_way.may_drive(follower.leg, follower.fix):
+        self._following = False
+        while (passage := right_of_way.passage(follower.leg, follower.fix)) is Passage.HELD:
             if right_of_way.holder:
                 self.stage, self.detail = Stage.YIELDING, right_of_way.reason
-                self._trouble = f"{right_of_way.holder} is in the way"
-            if right_of_way.closed:
-                self._trouble = self.detail = right_of_way.closed
-            self._aside = right_of_way.aside
-            go_on = self._aside is None and not right_of_way.closed
-            if go_on and self._motion.now - began > YIELDED:
-                if right_of_way.occupied and follower.blocked[1] in (self.goal, *self._via[:1]):
-                    self._give_up(right_of_way.reason)
-                else:
-                    # It is stuck, or stands there: another way may be free.
-                    self._blocks.add(*follower.blocked, self._motion.now)
-                go_on = False
-            if go_on:
-                yield Command()
-        self._following = go_on
-        return go_on
+                self._patience.trouble = f"{right_of_way.holder} is in the way"
+            yield Command()
+        self._following = passage is Passage.FREE
+        self._aside = right_of_way.aside if passage is Passage.ASIDE else None
+        if passage is Passage.CLOSED:
+            self._patience.trouble = self.detail = right_of_way.reason
+        elif passage is Passage.STUCK:
+            if right_of_way.occupied and follower.blocked[1] in (self.goal, *self._via[:1]):
+                self._give_up(right_of_way.reason)
+            else:
+                # It is stuck, or stands there: another way may be free.
+                self._blocks.add(*follower.blocked, self._motion.now)
+        return self._following
 
     def _step_aside(self, fix: Fix, node: NodeId) -> Behaviour:
         """Drive to a node off another robot's way; then the way to the goal is asked for again."""
@@ -415,7 +352,7 @@ class Navigator:
         if not route:
             yield from self._motion.stand(PAUSE)
             return
-        follower = self._follower(route, fix)
+        follower = self._follower(route=route, fix=fix)
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
         while follower.to_goal > THERE and follower.progress in UNDERWAY:
             if not (yield from self._let_pass(right_of_way, follower)):
@@ -425,39 +362,42 @@ class Navigator:
             yield command
         self._following = False
 
-    def _report_block(self, a: NodeId, b: NodeId) -> Behaviour:
+    def _report_block(self, follower: RouteFollower) -> Behaviour:
         """Something is in the way: report it, wait, then plan another route."""
-        self._blocks.add(a, b, self._motion.now)
+        (a, b), now = follower.blocked, self._motion.now
+        words, obstacle = obstruction(
+            self._description, self._motion.observation, follower.fix, follower.robot_from_target,
+            self._touched, self._beside(),
+        )  # fmt: skip
+        if obstacle is None and follower.to_goal <= NEAR and not self._parking_retried:
+            # Nothing keeps it from its goal but its own precision: that blocks no other robot.
+            self.detail, self._parking_retried = "parking did not end: trying once more", True
+            return
+        self._trial.blocked()
+        self._blocks.add(a, b, now, obstacle)
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
-        beside = self._beside()
-        words = self._obstacle() or ("no progress" if beside else NO_PROGRESS)
-        self.stage, self.detail = Stage.BLOCKED, "; ".join(filter(None, (f"{where}: {words}", beside)))
-        self._trouble = self.detail
+        self._patience.block(where, obstacle.robot if obstacle else "", now)
+        self.stage, self.detail = Stage.BLOCKED, f"{where}: {words}"
+        self._patience.trouble = self.detail
         yield from self._motion.stand(PAUSE)
-        if self.fix is not None and not self.fix.in_sight and self.fix.blind > TRUSTED:
-            self.fix, self._expected = None, self._positioning.on_own_map(self.fix)
+        lost = self.fix is not None and not self.fix.in_sight and self.fix.blind > TRUSTED
+        # Parking did not end twice: localize again, so that it begins from another heading.
+        if lost or self._parking_retried:
+            self._parking_retried = False
+            self._lose()
+
+    def _lose(self) -> None:
+        """It no longer knows where it is, but about where it should be."""
+        self.fix, self._expected = None, self._positioning.on_own_map(self.fix)
 
     def _relocalize(self) -> Behaviour:
         """No landmark was visible for a while: try one view, else drive on by odometry a little."""
-        before, s = self.fix, self._settings.navigation
-        place = yield from self._positioning.look(self.detail)
-        if place is None and before is not None and self._failed_views < s.looks:
-            self._failed_views += 1
-            blind = max(s.blind_distance - s.further, 0.0)
-            self.fix = Fix(before.node, before.node_from_robot, None, blind)
+        before = self.fix
+        fix = yield from self._positioning.look(before, self.detail)
+        if fix is not None and self._positioning.place is None:
+            self.fix = fix
             return
-        if place is None:
+        if fix is None:
             self._expected = self._positioning.on_own_map(before)
-        self._failed_views = 0
-        self._start_from(place)
-
-    def _obstacle(self) -> str:
-        """The obstacle ahead, in words; empty if nothing is near."""
-        if self._touched:
-            return f"something was touched: {self._touched}"
-        return obstacle_words(self._description, self._motion.observation.proximity)
-
-    def _stuck_at_goal(self, follower: RouteFollower) -> bool:
-        """Whether the robot is near the route's last node, with nothing in its way."""
-        return follower.to_goal <= NEAR and not self._obstacle()
+        self._start_from(fix)

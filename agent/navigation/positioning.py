@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 
 import numpy as np
@@ -10,6 +11,7 @@ from mapweave.agent.global_localization.candidates import Candidate, FleetMap, O
 from mapweave.agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
 from mapweave.agent.global_localization.search_policy import BEYOND_PORTAL, TO_NAVIGATE
 from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
@@ -18,6 +20,8 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import RouteLeg
+from mapweave.registration.recognition import RecognitionSettings
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
@@ -31,6 +35,7 @@ class Positioning:
     Attributes:
         search: the search that goes on; None without one.
         place: that the last search has found; None if it found none.
+        failed_views: in a row, that showed no certain place.
         refuted: places of the fleet's map that the robot's own view did not bear out.
         detail: of the last search, in words.
     """
@@ -49,8 +54,10 @@ class Positioning:
         """Take the means; see mapweave.agent.navigation.navigator.Navigator."""
         self.search: GlobalLocalization | None = None
         self.place: Candidate | None = None
+        self.failed_views = 0
         self._found_by = ""
         self._motion = motion
+        self._detector = NodeDetector(description, lens, sift, rng, settings)
         self._description, self._lens, self._settings = description, lens, settings
         self._own, self._fleet = OwnMap(own_map, rng), FleetMap(motion)
         self._fleet.near = near
@@ -79,11 +86,24 @@ class Positioning:
         self.search = self._localization
         return self._fix((yield from self._localization.search(expected)))
 
-    def look(self, detail: str) -> FixSearch:
-        """Stand still for one view, which may be less exact; None if it shows no place for certain."""
+    def look(self, before: Fix | None, detail: str) -> FixSearch:
+        """Stand still for one view, which may be less exact.
+
+        Without a certain place in it the robot drives on a little by odometry, from the fix before; after
+        some such views in a row it is lost: None.
+
+        Args:
+            before: where the robot was last known to be.
+            detail: why it looks, in words.
+        """
         self.search, self._localization.detail = self._localization, detail
         yield from self._motion.stand(STILL)
-        return self._fix((yield from self._localization.look(LENIENT)))
+        fix, s = self._fix((yield from self._localization.look(LENIENT))), self._settings.navigation
+        if fix is None and before is not None and self.failed_views < s.looks:
+            self.failed_views += 1
+            return Fix(before.node, before.node_from_robot, None, max(s.blind_distance - s.further, 0.0))
+        self.failed_views = 0
+        return fix
 
     def find_beyond(self, crossing: PortalCrossing) -> FixSearch:
         """Look around once on the floor to which a portal leads, then by all that is known."""
@@ -91,6 +111,20 @@ class Positioning:
         self.search = self._beyond
         self._own.elsewhere, self._fleet.near = crossing.elsewhere, crossing.wait.portal.exit
         return self._fix((yield from self._beyond.search()) or (yield from self._beyond.search()))
+
+    def compared(self, route: tuple[RouteLeg, ...], fix: Fix) -> Fix:
+        """The fix, or the robot's own if it sees the node by which the fleet has localized it.
+
+        The robot still stands where it asked. What it recognises itself comes before any answer.
+        """
+        node = next((leg.node for leg in route if leg.node.id == fix.node), None)
+        image = self._motion.observation.image
+        if node is None or image is None:
+            return fix
+        # More is asked than of an expected node: any pose will do.
+        anywhere = Expected(0, node, fix.node_from_robot.mean, math.inf)
+        seen = self._detector.find(image, [anywhere], RecognitionSettings())
+        return fix if seen is None else Fix.of(seen[1])
 
     def on_own_map(self, fix: Fix | None) -> Pose2 | None:
         """`map_from_robot` in the own map, if the fix is on one of its nodes."""

@@ -6,10 +6,12 @@ Without an answer the robot drives on: its rangers keep it from touching anythin
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import StrEnum
 
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mission import MayIDrive
 from mapweave.agent.motion_primitives import MotionPrimitives
+from mapweave.agent.navigation.goal_patience import YIELDED
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ReserveAnswer
 
@@ -17,6 +19,16 @@ EVERY = 1.0
 """Time between two questions, s."""
 OVERDUE = 3.0
 """A question without an answer for so long is lost, s."""
+
+
+class Passage(StrEnum):
+    """Whether a robot may drive on."""
+
+    FREE = "free"
+    HELD = "held by another robot"
+    STUCK = "held for too long"
+    ASIDE = "the robot must step aside"
+    CLOSED = "closed by a person"
 
 
 class RightOfWay:
@@ -27,22 +39,21 @@ class RightOfWay:
         reason: why this one waits, in words.
         occupied: whether the holder stands at the end of the route.
         aside: the node to which this one must step aside; None if it need not.
-        closed: why the way ahead is closed, in words; empty if it is not.
     """
 
     def __init__(self, motion: MotionPrimitives, route: Sequence[NodeId]) -> None:
         """Take a route; nothing is known of it yet."""
         self.holder = self.reason = ""
-        self.occupied = False
+        self.occupied = self._closed = False
         self.aside: NodeId | None = None
-        self.closed = ""
         self._motion = motion
         self._route = tuple(route)
         self._asked: tuple[int, int, float] | None = None
         self._last = -EVERY
         self._granted: int | None = None
+        self._held_since: float | None = None
 
-    def may_drive(self, leg: int, fix: Fix) -> bool:
+    def passage(self, leg: int, fix: Fix) -> Passage:
         """Whether the robot may drive to a node of the route; called each tick.
 
         Args:
@@ -60,13 +71,20 @@ class RightOfWay:
             number = self._motion.number()
             self._motion.post(MayIDrive(number, fix.node, fix.node_from_robot.mean, self._route[leg:]))
             self._asked, self._last = (number, leg, now), now
-        return self._granted is not None and leg < self._granted and not self.closed
+        if self._closed:
+            return Passage.CLOSED
+        if self._granted is not None and leg < self._granted:
+            self._held_since = None
+            return Passage.FREE
+        if self.aside is not None:
+            return Passage.ASIDE
+        self._held_since = now if self._held_since is None else self._held_since
+        return Passage.STUCK if now - self._held_since > YIELDED else Passage.HELD
 
     def _take(self, content: object, first: int) -> None:
         if isinstance(content, ReserveAnswer):
             self._granted, self.holder, self.aside = first + content.granted, content.holder, content.aside
-            self.reason, self.occupied = content.reason, content.occupied
-            self.closed = content.reason if content.closed else ""
+            self.reason, self.occupied, self._closed = content.reason, content.occupied, content.closed
         else:
-            self._granted, self.holder, self.aside, self.closed = len(self._route), "", None, ""
-            self.occupied = False
+            self._granted, self.holder, self.aside = len(self._route), "", None
+            self.occupied = self._closed = False

@@ -139,6 +139,11 @@ class RouteFollower:
         return before, self._route[self.leg].node.id
 
     @property
+    def robot_from_target(self) -> Pose2:
+        """Where the node is that it drives to."""
+        return self._target().inverse()
+
+    @property
     def to_goal(self) -> float:
         """How far the robot is from the last node, m."""
         return self.distance(self._last)

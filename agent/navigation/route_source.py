@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Generator
+from dataclasses import replace
 from itertools import pairwise
 
 from mapweave.agent.cautious_driving import lacks_rangers
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mission import WhichWay
 from mapweave.agent.motion_primitives import MotionPrimitives
+from mapweave.agent.navigation.blocks import Blocks
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -33,24 +35,24 @@ class RouteSource:
         self.refusing = False
         self._motion, self._own_map, self._description = motion, own_map, description
 
-    def route(
-        self, fix: Fix, goal: NodeId, blocked: tuple[tuple[NodeId, NodeId], ...]
-    ) -> Generator[Command, None, RouteAnswer]:
+    def route(self, fix: Fix, goal: NodeId, blocks: Blocks) -> Generator[Command, None, RouteAnswer]:
         """A way from where the robot is, or the reason why there is none.
 
         Args:
             fix: where the robot is.
             goal: the node to reach.
-            blocked: pairs of nodes between which it could not drive.
+            blocks: where it could not drive.
         """
-        question = WhichWay(self._motion.number(), fix.node, goal, fix.node_from_robot.mean, blocked)
+        blocked, obstacles = blocks.pairs(self._motion.now), blocks.obstacles(self._motion.now)
+        here = fix.node_from_robot.mean
+        question = WhichWay(self._motion.number(), fix.node, goal, here, blocked, obstacles)
         answer = yield from self._motion.ask(question)
         content, trouble = answer.content, ""
         if not isinstance(content, RouteAnswer):
             trouble = f"{answer.error or 'no answer'}; "
-            content = onboard_route(self._own_map, fix.node, goal, blocked)
-        self.refusing = not (trouble or blocked)
-        return RouteAnswer(content.legs, f"{trouble}{content.reason}", content.portal)
+            content = onboard_route(self._own_map, fix.node, goal, blocked, obstacles)
+        self.refusing = not (trouble or blocked or obstacles)
+        return replace(content, reason=f"{trouble}{content.reason}")
 
     def undriven(self, route: Collection[RouteLeg]) -> tuple[NodeId, NodeId] | None:
         """The first leg of a route that no robot has driven; None without one, or if there are rangers."""

@@ -54,7 +54,8 @@ def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes
         q = question
         who = NearbyRequest(robot, q.starts, q.sigma, q.heading_sigma, q.radius, q.height, q.speed)
         return sent_by(keys.any_nearby(), robot), encode(who)
-    request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
+    way = question
+    request = RouteRequest(way.start, way.goal, way.blocked, way.start_from_robot, way.obstacles)
     return sent_by(keys.any_route(), robot), encode(request)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from mapweave.agent.mission import Answer, MayIDrive, Question
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
@@ -97,7 +98,7 @@ def navigator(
     settings: NavigatorSettings | None = None,
     body: RobotDescription = BODY,
     via: tuple[NodeId, ...] = (),
-    beside: Callable[[], str] = str,
+    beside: Callable[[], RobotBeside | None] = lambda: None,
 ) -> Navigator:
     every = AgentSettings(navigation=settings or NavigatorSettings())
     return Navigator(body, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every, via=via, beside=beside)  # type: ignore[arg-type]

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from mapweave.agent.global_localization import pose_consistency
-from mapweave.agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
+from mapweave.agent.localization.fix import Fix
+from mapweave.agent.mission import Carried, Explore, GoTo, Idle, Mission, WhereAmI, WhoIsNear
+from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, Step
-from mapweave.agent.settings import AgentSettings
+from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
-from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import Lens
 from mapweave.wire.codec import encode_body
@@ -177,6 +179,53 @@ def test_a_mission_can_be_changed_at_any_time(walls, drive):
     step = pipeline.step(still(walls, tick=33))
     assert step.status.mission == "carried"
     assert "no nodes yet" in step.status.detail
+
+
+def test_a_robot_that_was_stopped_on_its_way_says_where_it_stands(walls):
+    """Others are led around it: before, a robot without a mission was nowhere."""
+    pipeline, node = on(GoTo(NodeId("r2", 1, 1))), NodeId("r2", 1, 7)
+
+    def asked(tick: int, lifted: bool = False) -> list[tuple[int, WhoIsNear]]:
+        odometry = Odometry(0.02 if tick % 2 else 0.0, 0.0)
+        image = walls.render(Pose2(1.0, 2.0))
+        observation = Observation(
+            tick * 100_000_000, odometry, image, np.full(len(BEARINGS), 3.0), kidnapped=lifted
+        )
+        questions = pipeline.step(observation).questions
+        return [(tick, question) for question in questions if isinstance(question, WhoIsNear)]
+
+    pipeline._navigator.fix = Fix(node, PoseGaussian(Pose2(1.0, 0.5), 1e-4 * np.eye(3)))
+    pipeline.set_mission(Idle())
+    questions = [question for tick in range(100) for question in asked(tick)]
+    assert len(questions) >= 2, "it goes on asking who is near"
+    for tick, question in questions:
+        ((start, pose),) = question.starts
+        assert start == node
+        assert pose.x == pytest.approx(1.0 + 0.01 * tick, abs=0.03), "its wheels know how it is pushed"
+    assert [question for tick in range(100, 200) for question in asked(tick, lifted=True)] == []
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_a_robot_that_has_parked_makes_room_and_others_do_not(walls, allowed):
+    navigation = NavigatorSettings(make_room=allowed)
+    goal, aside = NodeId("r2", 1, 1), NodeId("r2", 1, 9)
+
+    def asked(mission: Mission, stage: Stage) -> Pipeline:
+        pipeline = Pipeline(MAP, BODY, AgentSettings(navigation=navigation))
+        pipeline.set_mission(GoTo(goal))
+        pipeline._navigator.stage = stage
+        pipeline.set_mission(mission) if not isinstance(mission, GoTo) else None
+        pipeline._others.aside = aside
+        pipeline.step(still(walls, tick=1))
+        return pipeline
+
+    parked = asked(GoTo(goal), Stage.ARRIVED)
+    assert parked.mission == GoTo(aside if allowed else goal)
+    assert asked(GoTo(goal), Stage.LOST).mission == GoTo(goal), "it is on its way"
+    assert asked(GoTo(goal), Stage.GIVEN_UP).mission == GoTo(goal), "it has failed"
+    assert asked(Idle(), Stage.ARRIVED).mission == Idle(), "it was stopped"
+    step = parked.step(still(walls, tick=2))
+    assert ("makes room" in step.status.detail) == allowed
 
 
 def test_exploration_that_was_interrupted_goes_on(walls, drive):

@@ -195,12 +195,19 @@ def test_the_pipeline_asks_once_it_is_on_its_map_and_marks_the_image(walls) -> N
 
 def test_a_robot_beside_this_one_is_named() -> None:
     eyes = Eyes(other(0.5, 0.0), replace(other(0.4, -0.4), robot="r2"), replace(other(3.0, 0.0), robot="r3"))
-    assert eyes.others.beside == f"r1 is {0.5 - BODY.radius - 0.16:.1f} m off"
+
+    def words() -> str:
+        return eyes.others.beside.words if eyes.others.beside is not None else ""
+
+    assert words() == f"r1 is {0.5 - BODY.radius - 0.16:.1f} m off"
+    assert eyes.others.beside is not None
+    assert (eyes.others.beside.x, eyes.others.beside.y) == pytest.approx((0.5, 0.0))
     eyes.step(0.5, Odometry(0.0, math.pi / 2))
-    assert eyes.others.beside.startswith("r1 is"), "turning changes no distance"
+    assert (eyes.others.beside.x, eyes.others.beside.y) == pytest.approx((0.0, -0.5)), "on its right now"
+    assert words().startswith("r1 is"), "turning changes no distance"
     eyes.step(0.5, Odometry(-2.0, 0.0))
-    assert eyes.others.beside == ""
+    assert words() == ""
     eyes.step(0.5, Odometry(2.0, 0.0))
-    assert eyes.others.beside.startswith("r1 is")
+    assert words().startswith("r1 is")
     eyes.step(OLDEST)
-    assert eyes.others.beside == "", "what is old is not said"
+    assert words() == "", "what is old is not said"

@@ -114,8 +114,29 @@ def test_only_a_robot_seen_twice_at_one_place_stands_at_a_node(merged: MergedMap
         nearby.ask(request("elsewhere", 2, PLACES[1]), merged, now)
         nearby.ask(request("of the first", 0, from_first), merged, now)
     nearby.ask(request("once", 1, Pose2()), merged, 15.0)
-    assert nearby.standing(NODES[1], 0.16, merged, 16.0) == ["of the first", "stands"]
-    assert nearby.standing(NODES[1], 0.0, merged, 16.0) == ["of the first"], "a smaller one has room"
-    assert nearby.standing(NODES[0], 0.16, merged, 16.0) == []
-    assert nearby.standing(NODES[1], 0.16, merged, 15.1 + KEPT) == [], "who is silent is gone"
-    assert nearby.standing(NodeId(*A, 99), 0.16, merged, 16.0) == []
+
+    def standing(number: int, radius: float, now: float) -> list[str]:
+        place = np.array([[PLACES[number].x, PLACES[number].y]])
+        return [one.robot for one in nearby.standing(place, 0, radius, merged, now)]
+
+    assert merged.component_of(NODES[0]) == merged.component_of(NODES[1]) == 0
+    assert standing(1, 0.16, 16.0) == ["of the first", "stands"]
+    assert standing(1, 0.0, 16.0) == ["of the first"], "a smaller one has room"
+    assert standing(0, 0.16, 16.0) == []
+    assert standing(1, 0.16, 15.1 + KEPT) == [], "who is silent is gone"
+
+
+def test_a_robot_has_left_once_it_is_known_elsewhere(merged: MergedMap) -> None:
+    nearby, frame = Nearby(), merged.graphs[0].anchor
+    there = PLACES[1].x, PLACES[1].y
+
+    def left(now: float, reach: float = 0.4) -> bool:
+        return nearby.left("r1", there, reach, frame, now)
+
+    assert not left(1.0), "nothing is known of it"
+    nearby.ask(request("r1", 1, Pose2(0.3)), merged, 1.0)
+    assert not left(1.5) and left(1.5, 0.2)
+    nearby.ask(request("r1", 1, Pose2(0.5)), merged, 2.0)
+    assert left(2.5) and not left(2.1 + KEPT), "what is old says nothing"
+    nearby.ask(request("r1", 2, Pose2()), merged, 3.0)
+    assert left(3.5), "it is on another map"

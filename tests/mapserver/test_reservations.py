@@ -176,6 +176,26 @@ def test_who_has_parked_holds_its_place_but_not_the_way_past_it(router: Router) 
     assert traffic.ask("r0", 2, 3, 4) == ReserveAnswer(2, "", None, ""), "it is silent for 16 s"
 
 
+def test_who_has_parked_in_a_way_is_sent_to_the_nearest_node_off_it(router: Router) -> None:
+    """At 5 in the corridor, which another one drives along to its end: into the niche."""
+    for goal, room in ((8, 9), (5, None), (3, None)):
+        traffic = Traffic(router)
+        parked = NearbyRequest("r9", ((node(5), Pose2(0.1)),), 0.01, 0.01, 0.16, 0.3, 0.3)
+        for traffic.now in (0.0, 5.0):
+            traffic.nearby.ask(parked, router.merged, traffic.now)
+
+        def aside(robot: str, traffic: Traffic = traffic) -> NodeId | None:
+            return traffic.reservations.room_for(robot, node(5), Pose2(0.1), router, traffic.now)
+
+        traffic.now = 6.0
+        assert aside("r9") is None, "no one wants to pass"
+        traffic.ask("r0", *range(0, goal + 1))
+        assert aside("r9") == (None if room is None else node(room))
+        assert aside("r0") is None and aside("r1") is None
+        traffic.now += LEASE + 0.1
+        assert aside("r9") is None, "who wanted to pass is gone"
+
+
 def test_of_what_is_not_on_the_map_nothing_is_held(router: Router) -> None:
     traffic = Traffic(router)
     assert traffic.ask("r0", 98, 99).granted == 1

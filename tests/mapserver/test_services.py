@@ -11,11 +11,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
     Certainty,
     KnownRequest,
+    Obstacle,
     RelocalizeAnswer,
     RouteAnswer,
     RouteRequest,
@@ -32,6 +34,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode, encode_view
+from mapweave.wire.senders import sent_by
 from synthetic.world import take_node
 
 KEYS = Keys("fleet")
@@ -225,3 +228,37 @@ def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
             alone.add(replace(template, id=NodeId("x", 1, number)))
     assert len(index) == 80
     assert {n for n, _ in index.query(view, 80)} == {n for n, _ in alone.query(view, 80)}
+
+
+def test_a_place_that_one_robot_could_not_pass_is_barred_for_it_and_dear_for_others(mapped_room) -> None:
+    """A robot stands there by its own word: once it has left, the place is free."""
+    with Served(mapped_room(), lockstep=True) as served:
+        roads = served.server._answers().router.roads
+        start, goal = served.nodes[0], served.nodes[-1]
+
+        def way(robot: str, *obstacles: Obstacle) -> list[NodeId]:
+            asked = encode(RouteRequest(start, goal, obstacles=obstacles))
+            (reply,) = served.asker.ask(sent_by(KEYS.route("s0"), robot), asked, 20.0)
+            assert not reply.error
+            return [leg.node.id for leg in decode(reply.payload, RouteAnswer).legs]
+
+        def says(robot: str, node: NodeId, stamp: float) -> None:
+            served.server._schedule.observe(round(stamp * 1e9))
+            request = NearbyRequest(robot, ((node, Pose2()),), 0.01, 0.01, 0.16, 0.3, 0.3)
+            (reply,) = served.asker.ask(sent_by(KEYS.nearby("s0"), robot), encode(request), 20.0)
+            assert not reply.error
+
+        free = way("r0")
+        middle = free[len(free) // 2]
+        thing, other = Obstacle(middle, 0.0, 0.0, 0.1), Obstacle(middle, 0.0, 0.0, 0.1, "r7")
+        far = max(served.nodes, key=lambda node: roads.poses[node].distance(roads.poses[middle]))
+        assert middle not in way("r0", other)
+        assert way("r1") == free, "where robots stand nothing is reported for others"
+        says("r7", middle, 0.5)
+        says("r0", start, 0.8)
+        assert middle not in way("r0", other), "it is there"
+        says("r7", far, 1.0)
+        says("r0", start, 2.0)
+        assert way("r0", other) == free, "it has left"
+        way("r0", thing)
+        assert served.server._blockages.known(2.0), "others hear of a thing"

@@ -6,7 +6,7 @@ import pytest
 
 from mapweave.agent.mission import Answer, Question, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER
-from mapweave.agent.navigation.navigator import Stage
+from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2

@@ -9,14 +9,14 @@ import pytest
 
 from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
-from mapweave.agent.navigation.blocked_edges import BlockedEdges
-from mapweave.agent.navigation.navigator import Stage
+from mapweave.agent.navigation.blocks import Blocks
 from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.node import EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
+from mapweave.hybridmap.query import Certainty, Obstacle, RelocalizeAnswer, RouteAnswer, RouteLeg
 from synthetic.world import World, take_map
 from tests.agent.scripted_fleet import (
     BODY,
@@ -125,15 +125,25 @@ def test_endless_parking_is_retried_before_it_is_a_block(home):
 
 
 def test_blocks_are_kept_for_a_time_that_doubles():
-    blocks = BlockedEdges(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
+    blocks = Blocks(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
     blocks.add(B, A, 0.0)
-    assert blocks.at(9.9) == ((A, B),) and blocks.at(10.0) == ()
+    assert blocks.pairs(9.9) == ((A, B),) and blocks.pairs(10.0) == ()
     blocks.add(A, B, 20.0)
-    assert blocks.at(39.9) == ((A, B),) and blocks.at(40.0) == ()
+    assert blocks.pairs(39.9) == ((A, B),) and blocks.pairs(40.0) == ()
     blocks.add(A, B, 50.0)
     blocks.add(B, C, 50.0)
-    assert set(blocks.at(59.0)) == {(A, B), (B, C)}
-    assert blocks.at(74.9) == ((A, B),) and blocks.at(75.0) == ()
+    assert set(blocks.pairs(59.0)) == {(A, B), (B, C)}
+    assert blocks.pairs(74.9) == ((A, B),) and blocks.pairs(75.0) == ()
+
+
+def test_the_place_of_another_robot_is_avoided_for_longer_than_the_pair_of_nodes():
+    blocks = Blocks(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
+    thing, robot = Obstacle(A, 0.0, 0.0, 0.2), Obstacle(B, 0.0, 0.0, 0.4, "r7")
+    blocks.add(A, B, 0.0, thing)
+    blocks.add(B, C, 0.0, robot)
+    assert blocks.obstacles(9.9) == (thing, robot) and len(blocks.pairs(9.9)) == 2
+    assert blocks.obstacles(10.0) == blocks.obstacles(24.9) == (robot,) and blocks.pairs(10.0) == ()
+    assert blocks.obstacles(25.0) == ()
 
 
 # Alone

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
-from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI
-from mapweave.agent.navigation.navigator import YIELDED, Stage
+from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI, WhichWay
+from mapweave.agent.navigation.goal_patience import YIELDED
+from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import NavigatorSettings
+from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
@@ -108,7 +112,8 @@ def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
 
 def test_a_robot_in_the_way_is_named(home):
     trial = trial_to(home)
-    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: "r7 is 0.2 m off")
+    r7 = RobotBeside(0.2, "r7", 0.5, 0.0, 0.14)
+    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: r7)
     trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
     trial.held = True
     trial.run(60.0, lambda: trial.navigator.stage == Stage.BLOCKED)
@@ -166,6 +171,55 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
         assert min(gaps) < 2 * BODY.radius, "without reservations they drive into each other"
 
 
+def test_a_parked_robot_makes_room_in_a_corridor_and_the_other_passes(home, router):  # noqa: F811
+    """One has parked in the middle, another one drives from end to end; both by exact wheels."""
+    poses, nearby = router.roads.poses, Nearby()
+    reservations = Reservations(nearby.standing)
+    clock = [0.0]
+
+    def robot(name: str, start: int, goal: int) -> Trial:
+        eyes = Eyes(home, poses[node(start)])
+
+        def fleet(question: Question) -> Answer:
+            if isinstance(question, WhereAmI):
+                return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
+            ends = question.start, question.goal
+            answer = router.route(*ends, question.blocked, (), question.start_from_robot)
+            return Answer(question.number, answer)
+
+        def traffic(question: MayIDrive) -> Answer:
+            request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
+            return Answer(question.number, reservations.ask(request, router, clock[0]))
+
+        trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
+        trial.traffic = traffic
+        return trial
+
+    driving, parked, room = robot("r0", 0, 8), robot("r1", 5, 5), None
+    gaps: list[float] = []
+    for tick in range(1200):
+        clock[0] = tick * BODY.tick
+        place = ((node(5), poses[node(5)].inverse() @ parked.eyes.pose),)
+        if tick % 5 == 0:
+            nearby.ask(NearbyRequest("r1", place, 0.01, 0.01, BODY.radius, 0.3, 0.3), router.merged, clock[0])
+        if room is None and tick % 5 == 0:
+            room = reservations.room_for("r1", *place[0], router, clock[0])
+            if room is not None:
+                pose = parked.eyes.pose
+                parked = robot("r1", 5, room.number - 1)
+                parked.eyes.pose = pose
+        driving.run(BODY.tick)
+        if room is not None:
+            parked.run(BODY.tick)
+        gaps.append(driving.eyes.pose.distance(parked.eyes.pose))
+        if driving.eyes.pose.distance(poses[node(8)]) < 0.3:
+            break
+    assert room == node(9), "the niche"
+    assert len(gaps) * BODY.tick < 60.0, "32 s without the other one"
+    assert driving.eyes.pose.distance(poses[node(8)]) < 0.3
+    assert min(gaps) > 2 * BODY.radius, "they have not touched"
+
+
 def test_a_robot_whose_way_is_closed_asks_for_another_one_at_once(home):
     trial = trial_to(home)
     closed = ReserveAnswer(0, "", None, "the way ahead is closed by anna: wet floor", closed=True)
@@ -203,3 +257,59 @@ def test_a_robot_passes_what_it_must_in_order_and_then_seeks_its_goal(home):
     goals = [question.goal for question in trial.asked if not isinstance(question, WhereAmI)]
     assert list(dict.fromkeys(goals)) == [B, C, goal]
     assert eyes.pose.x - 1.0 == pytest.approx(poses[C], abs=0.35), "it has been at the last before it turns"
+
+
+def test_a_robot_that_stands_in_the_only_way_is_named_and_the_goal_given_up(home):
+    """Before, it tried again for 300 s."""
+    trial = trial_to(home)
+    reach = BODY.radius + 0.14
+    r7 = RobotBeside(0.2, "r7", reach + 0.2, 0.0, 0.14)
+    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: r7)
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.held = True
+    trial.run(70.0, lambda: trial.navigator.given_up)
+    seconds = len(trial.commands) * BODY.tick
+    assert YIELDED < seconds < 65.0, "of these 30 s until parking counts as blocked"
+    assert trial.navigator.detail == f"r7 stands in the way between {A} and {B}, and there is no other"
+    ways = [question for question in trial.asked if isinstance(question, WhichWay)]
+    (obstacle,) = ways[1].obstacles
+    assert obstacle.node == A and obstacle.reach == pytest.approx(BODY.radius + 0.14 + 0.1)
+    assert (obstacle.x, obstacle.y) == pytest.approx((r7.x, r7.y), abs=0.05), "it has not moved from A"
+
+
+def test_a_robot_that_has_left_the_way_again_ends_no_goal(home):
+    trial, r7 = trial_to(home), RobotBeside(0.2, "r7", 0.5, 0.0, 0.14)
+    around = [r7]
+    trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: around[0] if around else None)
+    plain = trial.fleet
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhichWay) and question.obstacles:
+            return Answer(question.number, RouteAnswer((), "blocked"))
+        return plain(question)
+
+    trial.fleet = fleet
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.held = True
+    trial.run(60.0, lambda: trial.navigator.stage == Stage.BLOCKED)
+    assert trial.navigator.stage == Stage.BLOCKED
+    around.clear()
+    trial.run(60.0)
+    assert not trial.navigator.given_up
+
+
+def test_the_reason_of_a_longer_way_is_said_all_along_it(home):
+    trial = trial_to(home)
+    plain = trial.fleet
+
+    def fleet(question: Question) -> Answer:
+        answer = plain(question)
+        if isinstance(answer.content, RouteAnswer):
+            return replace(answer, content=replace(answer.content, detour="r7 stands on a shorter way"))
+        return answer
+
+    trial.fleet = fleet
+    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.run(8.0)
+    driving = [detail for stage, detail in trial.said if stage == "driving along the route"]
+    assert len(driving) > 5 and all(detail.endswith("r7 stands on a shorter way") for detail in driving)
