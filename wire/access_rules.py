@@ -100,6 +100,8 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/mission/*",
                   f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive",
                   f"{base}/describe", f"{base}/step"]),
+        # A publisher hears who listens to its key, under any pattern. If it hears of none it sends nothing.
+        ("egress", ("declare_subscriber",), ["**"]),
         *_reads([*addressed, keys.servers_alive(), f"{base}/driver/*", f"{agent}/alive/*"]),
         *_asks([*addressed, *questions, f"{keys.root}/server/*/status",
                 f"{base}/describe", f"{base}/step", f"{agent}/log/*"]),

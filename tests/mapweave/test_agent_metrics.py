@@ -25,8 +25,9 @@ from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.pose import Pose2
-from mapweave.processes.agent import AgentOptions, run_agent
+from mapweave.processes.agent import AgentOptions
 from mapweave.processes.agent_metrics import AgentMetrics, AgentSources
+from mapweave.processes.agent_process import run_agent
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus

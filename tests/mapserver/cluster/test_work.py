@@ -34,9 +34,9 @@ def test_verdicts_are_those_of_one_server(failing: int, monkeypatch: pytest.Monk
         return workers.submit(answer_work, request)
 
     with ThreadPoolExecutor(2) as workers:
-        found = WorkPool(call, lambda: 2).compare(pairs)
+        found = [*WorkPool(call, lambda: 2).compare(pairs)]
     assert asked == 10
-    expected = compare(pairs)
+    expected = [*compare(pairs)]
     assert [(v.a, v.b, type(v)) for v in found] == [(v.a, v.b, type(v)) for v in expected]
     for one, other in zip(found, expected, strict=True):
         if isinstance(one, Link) and isinstance(other, Link):
@@ -50,7 +50,7 @@ def test_without_a_cluster_all_is_done_here(monkeypatch: pytest.MonkeyPatch) -> 
     def call(request: bytes) -> Future[bytes]:
         raise AssertionError("there is no cluster")
 
-    assert len(WorkPool(call, lambda: 0).compare(list(combinations(nodes, 2)))) == 6
+    assert len([*WorkPool(call, lambda: 0).compare(list(combinations(nodes, 2)))]) == 6
 
 
 def test_workers_that_never_answer_are_not_waited_for_twice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,4 +63,4 @@ def test_workers_that_never_answer_are_not_waited_for_twice(monkeypatch: pytest.
         return Future()
 
     pool = WorkPool(call, lambda: 1)
-    assert len(pool.compare(pairs)) == len(pool.compare(pairs)) == 10 and len(asked) == 3
+    assert len([*pool.compare(pairs)]) == len([*pool.compare(pairs)]) == 10 and len(asked) == 3

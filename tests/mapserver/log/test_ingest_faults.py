@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
-from mapweave.hybridmap.change import Change, NodeRetired
+from mapweave.hybridmap.change import Change, EdgePut
 from mapweave.hybridmap.node import NodeId
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest
@@ -22,6 +23,7 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
+from tests.wire.conftest import sample_edge
 
 KEYS = Keys("fleet")
 AGENT = ReplicationSettings(beacon_interval=0.02, answer_bytes=1500)
@@ -54,7 +56,8 @@ class Robot:
     def work(self, count: int) -> None:
         for _ in range(count):
             number = next(self.numbers)
-            self.replicator.submit([NodeRetired(NodeId(*self.map, number))], number)
+            edge = replace(sample_edge(0, self.map), id=NodeId(*self.map, number))
+            self.replicator.submit([EdgePut(edge)], number)
 
 
 class Server:

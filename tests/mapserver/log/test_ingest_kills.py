@@ -43,8 +43,9 @@ import sys, time
 from pathlib import Path
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
-from mapweave.hybridmap.change import NodeRetired
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -56,8 +57,9 @@ map_id = journal.open_map(1)
 print("up", flush=True)
 print(journal.head(map_id), flush=True)
 replicator = Replicator(bus, Keys(), journal, map_id, ("s0",))
+pose, ends = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01), (NodeId(*map_id, 1), NodeId(*map_id, 2))
 for number in range(journal.head(map_id) + 1, int(total) + 1):
-    replicator.submit([NodeRetired(NodeId(*map_id, number))], number)
+    replicator.submit([EdgePut(Edge(NodeId(*map_id, number), *ends, pose, EdgeKind.MAPPED))], number)
     if number % 5 == 0:
         assert replicator.flush(30)
         print(number, flush=True)
@@ -136,7 +138,7 @@ def test_nothing_is_lost_when_processes_are_killed(tmp_path: Path) -> None:
     journal, store = Journal(journal_path, "r0"), SqliteStore(store_path)
     kept = journal.changes(map_id, 1, 2 * CHANGES)
     assert [change.sequence for change in kept] == list(range(1, CHANGES + 1))
-    assert [change.body.id.number for change in kept] == list(range(1, CHANGES + 1))  # type: ignore[union-attr]
+    assert [change.body.edge.id.number for change in kept] == list(range(1, CHANGES + 1))  # type: ignore[union-attr]
     assert [encode_change(c) for c in store.replay(map_id)] == [encode_change(c) for c in kept]
     assert store.refused() == 0
     journal.close()
