@@ -43,13 +43,13 @@ def serial_ports(devices: Path = DEVICES) -> list[SerialPort]:
     Args:
         devices: folder of the devices.
     """
-    by_id = {str(link.resolve()): str(link) for link in sorted((devices / "serial" / "by-id").glob("*"))}
+    by_id = {_target(link): str(link) for link in sorted((devices / "serial" / "by-id").glob("*"))}
     known = _descriptions()
     paths = {path for pattern in PATTERNS for path in devices.glob(pattern) if path.exists()}
     paths |= {path for path in map(Path, known) if path.parent == devices}
     return [
         SerialPort(
-            str(path), known.get(str(path), ""), by_id.get(str(path.resolve()), ""),
+            str(path), known.get(str(path), ""), by_id.get(_target(path), ""),
             os.access(path, os.R_OK | os.W_OK),
         )
         for path in sorted(paths)
@@ -60,6 +60,14 @@ def gone(before: Sequence[SerialPort], after: Sequence[SerialPort]) -> list[Seri
     """Ports that were there and are no longer."""
     left = {port.path for port in after}
     return [port for port in before if port.path not in left]
+
+
+def _target(path: Path) -> str:
+    """Where a link leads; empty if it is pulled out at this moment."""
+    try:
+        return str(path.resolve())
+    except OSError:
+        return ""
 
 
 def _descriptions() -> dict[str, str]:

@@ -47,6 +47,21 @@ def test_ports_are_listed(plugged: tuple[Path, ArduinoSketch], capsys: pytest.Ca
     assert robot == f"{devices}/ttyUSB0"
 
 
+def test_a_cable_may_be_pulled_while_ports_are_listed(plugged, monkeypatch) -> None:
+    devices, sketch = plugged
+    readlink = ports.os.readlink
+
+    def pulled(path, **more):
+        """Python looks whether it is a link, and then where it leads."""
+        if str(path) == str(sketch.path):
+            sketch.unplug()
+        return readlink(path, **more)
+
+    monkeypatch.setattr(ports.os, "readlink", pulled)
+    assert [port.path for port in ports.serial_ports(devices)] == [f"{devices}/ttyACM3", f"{devices}/ttyUSB0"]
+    assert [port.path for port in ports.serial_ports(devices)] == [f"{devices}/ttyACM3"]
+
+
 def test_the_port_whose_cable_is_pulled_is_named(plugged, monkeypatch, capsys) -> None:
     devices, sketch = plugged
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
