@@ -50,6 +50,7 @@ def test_pose_errors_match_the_covariance(runs: list[tuple[MappingRun, MappingFi
     assert low < np.mean(nees) < high
 
 
+@pytest.mark.slow
 def test_landmark_errors_match_their_covariances(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     low, high = INTERVAL
     assert low < np.mean([landmark_nees(run, filter_) for run, filter_ in runs]) < high

@@ -132,6 +132,7 @@ def test_a_clock_that_is_put_back_holds_nothing_up() -> None:
     assert any(node is not None for node in found)
 
 
+@pytest.mark.slow
 def test_a_year_of_drives_makes_no_larger_map() -> None:
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 900, rng)
