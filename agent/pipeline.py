@@ -40,6 +40,10 @@ from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 
+MOST_ROOM = 3
+"""So often a robot makes room before it gets a mission again: neither a server nor a robot behind it makes it
+drive for ever."""
+
 
 @dataclass(frozen=True)
 class Step:
@@ -103,7 +107,8 @@ class Pipeline:
         self._mission: Mission = Idle()
         self._navigator: Navigator | None = None
         self._guard = CommandGuard(self._caution)
-        self._lifted = self._put_elsewhere = self._made_room = False
+        self._lifted = self._put_elsewhere = False
+        self._room_made = 0
         self._image: NDArray[np.uint8] | None = None
 
     @property
@@ -187,7 +192,7 @@ class Pipeline:
         place of its own map.
         """
         self._mission = mission
-        self._put_elsewhere = self._made_room = False
+        self._put_elsewhere, self._room_made = False, 0
         self._map_making.end_search()
         if isinstance(mission, Explore | Carried):
             self._forget_fix()
@@ -266,9 +271,11 @@ class Pipeline:
     def _make_room(self, navigator: Navigator) -> None:
         """Drive out of the way of another robot, if this one has nothing else to do, and may."""
         aside, self._others.aside = self._others.aside, None
-        if aside is not None and navigator.arrived and self._settings.navigation.make_room and not self._held:
+        may = self._settings.navigation.make_room and self._room_made < MOST_ROOM and not self._held
+        if aside is not None and navigator.arrived and may:
+            made = self._room_made + 1
             self.set_mission(GoTo(aside))
-            self._made_room = True
+            self._room_made = made
 
     def _who_is_near(self) -> list[Question]:
         """Ask for the robots around this one, if it is time and it knows where it is."""
@@ -375,7 +382,7 @@ class Pipeline:
                 doing, detail = str(self._navigator.stage), self._navigator.detail
                 finished, given_up = self._navigator.arrived, self._navigator.given_up
                 progress = self._navigator.progress
-                detail += "; it makes room for another robot" if self._made_room else ""
+                detail += "; it makes room for another robot" if self._room_made else ""
         if self._blind:
             doing, detail = "standing still", self._blind
         if self._driven is not None:

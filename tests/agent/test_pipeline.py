@@ -228,6 +228,21 @@ def test_a_robot_that_has_parked_makes_room_and_others_do_not(walls, allowed):
     assert ("makes room" in step.status.detail) == allowed
 
 
+def test_no_server_makes_a_parked_robot_drive_for_ever(walls):
+    """It says again and again, with another node each time, that the robot is in the way."""
+    pipeline = Pipeline(MAP, BODY)
+    pipeline.set_mission(GoTo(NodeId("r2", 1, 1)))
+    for order in range(2):
+        driven = []
+        for tick in range(1, 20):
+            pipeline._navigator.stage = Stage.ARRIVED
+            pipeline._others.aside = NodeId("r2", 1, 10 + tick)
+            pipeline.step(still(walls, tick=20 * order + tick))
+            driven.append(pipeline.mission.node.number)
+        assert driven == [11, 12, *[13] * 17]
+        pipeline.set_mission(GoTo(NodeId("r2", 1, 1)))
+
+
 def test_exploration_that_was_interrupted_goes_on(walls, drive):
     """The robot stops for a while in the middle of its first drive; the rest is as without the stop."""
     _, steps, _ = drive
