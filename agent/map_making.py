@@ -63,7 +63,7 @@ class MapMaking:
         self.floor = self._new_floor()
         self._changes: list[ChangeBody] = []
         self._explorer: Explorer | None = None
-        self._passenger = CarriedMapping(self.mapper)
+        self._carried = CarriedMapping(self.mapper)
         self._resumption: Resumption | None = None
 
     @property
@@ -167,7 +167,7 @@ class MapMaking:
         else:
             self.floor.see(pose, observation.proximity)
         if self._explorer is None or not alone:
-            return self._act(self._passenger, observation), []
+            return self._act(self._carried, observation), []
         if held:
             return Command(), []
         self._explorer.see(observation, answers)
@@ -194,7 +194,7 @@ class MapMaking:
         if self.mapper.doubtful:
             return "standing still", self.mapper.doubt, False
         if not exploring:
-            return "mapping while carried", self._passenger.detail, False
+            return "mapping while carried", self._carried.detail, False
         if self._explorer is None:
             return "standing still", not_exploring(self._map_id.agent), False
         return str(self._explorer.phase), self._explorer.detail, self._explorer.finished

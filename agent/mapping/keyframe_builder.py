@@ -117,7 +117,7 @@ class KeyframeBuilder:
         return new
 
     def place(
-        self, anchor: View, leaves: list[View], tracking: Tracking, wayside: TrajectoryRecorder
+        self, anchor: View, leaves: list[View], tracking: Tracking, trajectory: TrajectoryRecorder
     ) -> Node | None:
         """Make nodes of an episode's views, edges between them and to the episode before, and loop closures.
 
@@ -125,12 +125,12 @@ class KeyframeBuilder:
             anchor: the view where the episode began.
             leaves: further views of the episode.
             tracking: the landmarks.
-            wayside: trajectory since the last node; it goes with the anchor, if that becomes a node.
+            trajectory: trajectory since the last node; it goes with the anchor, if that becomes a node.
 
         Returns:
             The anchor's node; None, and nothing is changed, if the anchor shows too little.
         """
-        placed = self._node(anchor, tracking, wayside)
+        placed = self._node(anchor, tracking, trajectory)
         if placed is None:
             return None
         self.join(placed)
@@ -217,7 +217,7 @@ class KeyframeBuilder:
         return number
 
     def _node(
-        self, view: View, tracking: Tracking, wayside: TrajectoryRecorder | None = None
+        self, view: View, tracking: Tracking, trajectory: TrajectoryRecorder | None = None
     ) -> AnchoredKeyframe | None:
         landmarks, tracks = self._landmarks(view, tracking)
         if len(landmarks) < LEAST_LANDMARKS:
@@ -225,7 +225,7 @@ class KeyframeBuilder:
         pose = self.map_from_anchor @ view.anchor_from_view
         d = self._description
         ranges = d.ranges(view.proximity)
-        segment = TrajectorySegment() if wayside is None else wayside.segment(view.stamp_ns, ranges)
+        segment = TrajectorySegment() if trajectory is None else trajectory.segment(view.stamp_ns, ranges)
         node = Node(
             self.new_id(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius, ranges, segment
         )

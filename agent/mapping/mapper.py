@@ -63,9 +63,9 @@ class Mapper:
         self._pending: tuple[RobotDescription, Lens, Pose2] | None = None
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
-        self._cartographer = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
-        self._retirement = NodeRetirement(self._cartographer.map, released)
-        self._wayside = TrajectoryRecorder(description)
+        self._keyframes = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
+        self._retirement = NodeRetirement(self._keyframes.map, released)
+        self._trajectory = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
         # A thread extracts features. Those of a further view are used in the next tick, which begins by
@@ -79,7 +79,7 @@ class Mapper:
     @property
     def map(self) -> HybridMap:
         """What was mapped so far."""
-        return self._cartographer.map
+        return self._keyframes.map
 
     @property
     def started(self) -> bool:
@@ -128,7 +128,7 @@ class Mapper:
     @property
     def map_from_robot(self) -> PoseGaussian:
         """Pose in the agent's map."""
-        return self._cartographer.map_from_anchor @ self._tracking.pose
+        return self._keyframes.map_from_anchor @ self._tracking.pose
 
     @property
     def description(self) -> RobotDescription:
@@ -177,21 +177,21 @@ class Mapper:
 
     def take_changes(self) -> tuple[ChangeBody, ...]:
         """What was changed in the map since the last call; the only way by which nodes and edges leave."""
-        return self._cartographer.take_changes()
+        return self._keyframes.take_changes()
 
     def drove(self, traverse: Traverse | None, refined: Node | None) -> None:
-        """Take in what was measured on a drive while nothing was mapped; see Cartographer."""
-        self._cartographer.drove(traverse, refined)
+        """Take in what was measured on a drive while nothing was mapped; see KeyframeBuilder."""
+        self._keyframes.drove(traverse, refined)
 
     def retire_superseded(self, now_ns: int) -> None:
         """Let a node go that newer ones have superseded for long, if there is one; call it once a tick.
 
         Not while a drive to a goal may use it.
         """
-        last = self._cartographer.last
+        last = self._keyframes.last
         node = self._retirement.next(now_ns, () if last is None else (last,))
         if node is not None:
-            self._cartographer.retire(node)
+            self._keyframes.retire(node)
 
     # One tick, and what ends an episode
 
@@ -203,7 +203,7 @@ class Mapper:
             self.lose()
             self._tracking.step(observation)
         elif self._anchor is not None and not self.doubtful:
-            self._wayside.step(observation, self._tracking.pose.mean)
+            self._trajectory.step(observation, self._tracking.pose.mean)
 
     def recalibrate(self, description: RobotDescription, lens: Lens, old_from_new: Pose2) -> None:
         """Know the robot's geometry better from the next node on.
@@ -217,7 +217,7 @@ class Mapper:
 
     def forget_clock(self) -> None:
         """The clock has jumped: see KeyframeBuilder."""
-        self._cartographer.forget_clock()
+        self._keyframes.forget_clock()
 
     def meet(self, request: EpisodeRequest, observation: Observation) -> None:
         """Do what a behaviour asks for, with the observation of the last step."""
@@ -240,7 +240,7 @@ class Mapper:
 
         With nodes it is astray and must `resume`; without any it may `begin` again.
         """
-        self._cartographer.lose(self._tracking.pose)
+        self._keyframes.lose(self._tracking.pose)
         self._take_up_pending()
         self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._leaves = None, []
@@ -262,12 +262,12 @@ class Mapper:
         anchor = self._tracking.take(observation, features, HERE)
         self.typical_depth = float(np.median(node.landmarks.depths[node.landmarks.has_depth]))
         self._begin_at(anchor)
-        self._cartographer.recognise(node, anchor.tracks, recognition)
+        self._keyframes.recognise(node, anchor.tracks, recognition)
 
     def _begin_at(self, anchor: View) -> None:
         self._tracking.reanchor()
         self._anchor = anchor
-        self._wayside.clear(anchor.stamp_ns)
+        self._trajectory.clear(anchor.stamp_ns)
         self._tracking.follow(anchor, self.typical_depth)
 
     def leaf(self, observation: Observation) -> None:
@@ -294,16 +294,16 @@ class Mapper:
             return False
         features = self._extract(observation.image, observation.left_out)
         self._tracking.remember(force=True)
-        node = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
+        node = self._keyframes.place(self._anchor, self._leaves, self._tracking, self._trajectory)
         if node is not None:
             self.typical_depth = float(np.median(node.landmarks.depths))
         anchor = self._tracking.take(observation, features.result(), HERE)
         moved = self._tracking.reanchor()
-        self._cartographer.move_anchor(moved)
+        self._keyframes.move_anchor(moved)
         if node is not None:
-            self._wayside.clear(anchor.stamp_ns)
+            self._trajectory.clear(anchor.stamp_ns)
         else:
-            self._wayside.move_anchor(moved.mean)
+            self._trajectory.move_anchor(moved.mean)
         self._anchor, self._leaves = anchor, []
         if self._take_up_pending():
             # Tracks and features of another lens are of no use to a filter of this one.
@@ -330,6 +330,6 @@ class Mapper:
             return False
         (self._description, self._lens, old_from_new), self._pending = self._pending, None
         self._sift = Sift(self._lens, self._settings.sift)
-        self._cartographer.recalibrate(self._description, old_from_new)
-        self._wayside.move_anchor(old_from_new)
+        self._keyframes.recalibrate(self._description, old_from_new)
+        self._trajectory.move_anchor(old_from_new)
         return True

@@ -1,4 +1,4 @@
-"""Wayside: what the robot keeps of its way between two nodes, for those who ask where it was when."""
+"""What the robot keeps of its way between two nodes, for those who ask where it was when."""
 
 from __future__ import annotations
 

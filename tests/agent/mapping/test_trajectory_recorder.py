@@ -30,22 +30,22 @@ def seen(tick: int, proximity: tuple[float, ...] = (1.0, 3.0)) -> Observation:
 
 
 def test_one_moment_a_second_with_the_readings(clocked):
-    wayside = TrajectoryRecorder(clocked)
-    wayside.clear(0)
+    recorder = TrajectoryRecorder(clocked)
+    recorder.clear(0)
     for tick in range(1, 46):
-        wayside.step(seen(tick), Pose2(0.01 * tick, 0.0, 0.002 * tick))
-    segment = wayside.segment(0, clocked.ranges(np.array([1.0, 3.0])))
+        recorder.step(seen(tick), Pose2(0.01 * tick, 0.0, 0.002 * tick))
+    segment = recorder.segment(0, clocked.ranges(np.array([1.0, 3.0])))
     assert segment.ages == pytest.approx([1.0, 2.0, 3.0, 4.0])
     assert segment.node_from_robot == pytest.approx(np.outer([10, 20, 30, 40], [0.01, 0.0, 0.002]))
     assert segment.distances == pytest.approx(np.tile([1.0 + clocked.radius, 3.0 + clocked.radius], (4, 1)))
 
 
 def test_a_missing_reading_carries_no_information(clocked):
-    wayside = TrajectoryRecorder(clocked)
-    wayside.clear(0)
+    recorder = TrajectoryRecorder(clocked)
+    recorder.clear(0)
     for tick, proximity in ((10, (2.0, 2.0)), (20, ()), (30, (2.0, 2.0))):
-        wayside.step(seen(tick, proximity), Pose2())
-    segment = wayside.segment(0, clocked.ranges(np.array([1.0, 3.0])))
+        recorder.step(seen(tick, proximity), Pose2())
+    segment = recorder.segment(0, clocked.ranges(np.array([1.0, 3.0])))
     # A ray that ends at the sensor has no information about what is behind.
     assert segment.distances[1] == pytest.approx([0.0, 0.0]) and (segment.distances[[0, 2]] > 2.0).all()
 
@@ -53,31 +53,31 @@ def test_a_missing_reading_carries_no_information(clocked):
 def test_a_robot_without_sensors_keeps_poses_and_one_without_a_clock_nothing(description):
     for clock, count in (("net", 3), ("", 0)):
         robot = replace(description, clock=clock)
-        wayside = TrajectoryRecorder(robot)
+        recorder = TrajectoryRecorder(robot)
         for tick in range(10, 40):
-            wayside.step(seen(tick), Pose2())
-        segment = wayside.segment(0, robot.ranges(np.zeros(0)))
+            recorder.step(seen(tick), Pose2())
+        segment = recorder.segment(0, robot.ranges(np.zeros(0)))
         assert (len(segment), segment.distances.shape) == (count, (count, 0))
 
 
 def test_a_long_wait_is_thinned_evenly(clocked):
-    wayside = TrajectoryRecorder(clocked)
+    recorder = TrajectoryRecorder(clocked)
     for tick in range(1, 2500):
-        wayside.step(seen(tick), Pose2())
-    segment = wayside.segment(0, clocked.ranges(np.array([1.0, 3.0])))
+        recorder.step(seen(tick), Pose2())
+    segment = recorder.segment(0, clocked.ranges(np.array([1.0, 3.0])))
     assert MOST / 2 <= len(segment) <= MOST
     gaps = np.diff(segment.ages)
     assert gaps.max() <= 16.1 and gaps.min() == pytest.approx(gaps.max(), abs=0.2)
 
 
 def test_moments_before_a_view_that_became_no_node_belong_to_the_next(clocked):
-    wayside = TrajectoryRecorder(clocked)
-    wayside.clear(0)
-    wayside.step(seen(10), Pose2(0.3, 0.1, 0.5))
+    recorder = TrajectoryRecorder(clocked)
+    recorder.clear(0)
+    recorder.step(seen(10), Pose2(0.3, 0.1, 0.5))
     moved = Pose2(1.0, -0.5, 2.0)
-    wayside.move_anchor(moved)
-    wayside.step(seen(20), Pose2(0.2, 0.0, 0.1))
-    segment = wayside.segment(1_500_000_000, clocked.ranges(np.array([1.0, 3.0])))
+    recorder.move_anchor(moved)
+    recorder.step(seen(20), Pose2(0.2, 0.0, 0.1))
+    segment = recorder.segment(1_500_000_000, clocked.ranges(np.array([1.0, 3.0])))
     assert segment.ages == pytest.approx([-0.5, 0.5])
     first = moved @ Pose2(*segment.node_from_robot[0])
     assert (first.vector, tuple(segment.node_from_robot[1])) == (
