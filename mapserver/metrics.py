@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 
 from mapweave.hybridmap.errors import Busy
@@ -22,8 +22,11 @@ from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
 from mapweave.mapserver.log.ingest_counters import IngestCounters
 from mapweave.mapserver.log.known_logs import Lag
 from mapweave.mapserver.merging.merger_counters import MergerCounters
+from mapweave.mapserver.metric_families import MetricFamilies
 from mapweave.mapserver.roster import NO_LAG, Presence
 
+_FAMILIES = MetricFamilies("mapweave_")
+_gauge, _counter = _FAMILIES.gauge, _FAMILIES.counter
 ACK_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 """s; asked for is a 99th percentile below 0.5."""
 RELOCALIZE_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
@@ -159,14 +162,14 @@ class _Reader(Collector):
         yield _gauge("build_info", "Version of the server.", {version("mapweave"): 1.0}, "version")
         ingest, merger, counts = s.ingest(), s.merger(), s.counts()
         for field, (name, words) in INGEST.items():
-            yield CounterMetricFamily(f"mapweave_{name}", words, getattr(ingest, field))
+            yield _counter(name, words, getattr(ingest, field))
         for field, (name, words) in MERGER.items():
-            yield CounterMetricFamily(f"mapweave_{name}", words, getattr(merger, field))
+            yield _counter(name, words, getattr(merger, field))
         for field, (name, words) in COUNTS.items():
             yield _gauge(name, words, float(counts[field]))
         admission = s.admission()
-        yield CounterMetricFamily(
-            "mapweave_questions_answered",
+        yield _counter(
+            "questions_answered",
             "Questions that take long and were answered.",
             admission["answered"],
         )
@@ -184,12 +187,8 @@ class _Reader(Collector):
         held_back = self._sources.held_back()
         quotas = {f"quota_{what}": held_back.get(what, 0) for what in QUOTAS}
         reasons = {"invalid_change": ingest.refused, "damaged_message": ingest.damaged, **quotas}
-        refusals = CounterMetricFamily(
-            "mapweave_refusals", "What the server did not take or answer, by reason.", labels=["reason"]
-        )
-        for reason, count in {**reasons, "busy": admission["busy"]}.items():
-            refusals.add_metric([reason], count)
-        return refusals
+        words = "What the server did not take or answer, by reason."
+        return _counter("refusals", words, {**reasons, "busy": admission["busy"]}, "reason")
 
     def _files(self) -> Iterator[Metric]:
         path = self._sources.store
@@ -228,17 +227,6 @@ class _Reader(Collector):
 
 QUOTAS = ("changes", "beacons", "maps", "nodes", "questions")
 """Kinds of what quotas hold back."""
-
-
-def _gauge(
-    name: str, words: str, value: float | Mapping[str, float], label: str | None = None
-) -> GaugeMetricFamily:
-    if isinstance(value, Mapping):
-        family = GaugeMetricFamily(f"mapweave_{name}", words, labels=[label or ""])
-        for of, number in value.items():
-            family.add_metric([of], number)
-        return family
-    return GaugeMetricFamily(f"mapweave_{name}", words, value)
 
 
 def _size(file: Path) -> int:

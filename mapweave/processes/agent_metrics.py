@@ -15,7 +15,6 @@ from itertools import accumulate
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest, start_http_server
 from prometheus_client.core import (
-    CounterMetricFamily,
     GaugeMetricFamily,
     HistogramMetricFamily,
     Metric,
@@ -30,7 +29,10 @@ from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.mission_order import MissionKind, MissionState
 from mapweave.hybridmap.query import Certainty
+from mapweave.mapserver.metric_families import MetricFamilies
 
+_FAMILIES = MetricFamilies("mapweave_agent_")
+_gauge, _counter = _FAMILIES.gauge, _FAMILIES.counter
 HOST = "127.0.0.1"
 """This machine alone: there are no logins here, and no encryption."""
 TICK_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -191,25 +193,3 @@ class AgentMetrics(Collector):
         outcomes = {one: float(answers.get(one, 0)) for one in (*map(str, Certainty), FAILED)}
         yield _counter("relocalizations", "Answers where a view was taken.", outcomes, "outcome")
         yield _counter("answers_refuted", "Answers that its own view did not bear out.", sources.refuted())
-
-
-def _gauge(
-    name: str, words: str, value: float | Mapping[str, float], label: str | None = None
-) -> GaugeMetricFamily:
-    if isinstance(value, Mapping):
-        family = GaugeMetricFamily(f"mapweave_agent_{name}", words, labels=[label or ""])
-        for of, number in value.items():
-            family.add_metric([of], number)
-        return family
-    return GaugeMetricFamily(f"mapweave_agent_{name}", words, value)
-
-
-def _counter(
-    name: str, words: str, value: float | Mapping[str, float], label: str | None = None
-) -> CounterMetricFamily:
-    if isinstance(value, Mapping):
-        family = CounterMetricFamily(f"mapweave_agent_{name}", words, labels=[label or ""])
-        for of, number in value.items():
-            family.add_metric([of], number)
-        return family
-    return CounterMetricFamily(f"mapweave_agent_{name}", words, value)
