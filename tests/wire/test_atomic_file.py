@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,8 +16,9 @@ from mapweave.storage.atomic_file import check_place, write_whole
 
 
 @pytest.fixture
-def small_files() -> Iterator[None]:
-    """A disk that takes 1000 bytes a file."""
+def small_files(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A disk that takes 1000 bytes a file. Python writes no bytecode meanwhile: it would keep a part of it."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
