@@ -8,6 +8,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed-$(EXTRA)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
+# Compiles what runs often where it is not compiled yet: no robot and no test waits for it.
+COMPILE := $(BIN)/python -c 'import mapweave.agent.runner; from mapweave.hybridmap import jit; jit.load()'
+
 .PHONY: setup demo test check docs bench slow scenarios sbom audit clean
 
 setup: $(STAMP)
@@ -23,7 +26,7 @@ ifeq ($(EXTRA),dev)
 	  "or more; with python3.11 on x86-64 it takes seconds, and make EXTRA=test does without the simulator"
 endif
 	@$(PIP) -e '.[$(EXTRA)]'
-	@$(BIN)/python -c 'import mapweave.agent.runner; from mapweave.hybridmap import jit; jit.load()'  # compiles once, not while a robot waits
+	@$(COMPILE)
 	@touch $(STAMP)
 
 demo: setup
@@ -33,9 +36,11 @@ demo: setup
 # `make test WORKERS=0` is one process.
 WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 2)
 test: setup
+	@$(COMPILE)
 	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 4 --dist worksteal
 
 slow: setup
+	@$(COMPILE)
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
 
 # About half an hour on two cores: every scenario, in real processes, and the longest tests.

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import pwd
+import select
 import shutil
 import signal
 import subprocess
 import time
+from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -85,9 +87,19 @@ class PostgresServer:
             time.sleep(0.02)
 
     def kill(self) -> None:
-        """As a loss of power ends it."""
-        os.killpg(self.process.pid, signal.SIGKILL)
+        """As a loss of power ends it: with every session, each of which has a process group of its own."""
+        postmaster = self.process.pid
+        self.process.send_signal(signal.SIGSTOP)  # starts no more
+        children = Path(f"/proc/{postmaster}/task/{postmaster}/children").read_text().split()
+        sessions = [os.pidfd_open(int(child)) for child in children]
+        self.process.kill()
+        for session in sessions:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(session, signal.SIGKILL)
         self.process.wait()
+        for session in sessions:
+            select.select([session], [], [])  # until it has ended
+            os.close(session)
 
     def stop(self) -> None:
         """End it, and all sessions."""
