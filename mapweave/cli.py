@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 from mapweave.commands import (
@@ -73,6 +74,7 @@ class PrintVersion(argparse.Action):
         parser.exit()
 
 
+@cache
 def parser() -> argparse.ArgumentParser:
     """All commands with their arguments."""
     top = CommandParser(

@@ -12,6 +12,7 @@ from mapweave.agent.mission import Explore
 from mapweave.agent.observation import Command
 from mapweave.agent.pipeline import Pipeline
 from tests.agent.ranged_body import BEARINGS, BODY, ROOM, live, on, still
+from tests.quick import first_quick
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def test_no_drive_backward_into_an_obstacle(walls, reckless):
     assert pipeline.step(still(walls, tick=1, proximity=near(0.0, 0.02))).command == Command(-0.3, 0.0)
 
 
-@pytest.mark.parametrize("speed", [0.3, -0.3])
+@pytest.mark.parametrize("speed", first_quick([0.3, -0.3], 1))
 def test_a_reckless_drive_ends_before_the_wall(walls, reckless, speed):
     _, _, poses = live(walls, reckless(Command(speed, 0.05)), 150)
     x, y = np.array([[p.x, p.y] for p in poses]).T

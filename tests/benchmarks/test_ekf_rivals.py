@@ -10,11 +10,12 @@ from benchmarks.ekf_speed.benchmark import Ours, Theirs, gap, plain, race
 from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
 from mapweave.hybridmap.camera import Camera
 from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, draw_run
+from tests.quick import first_quick
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.08)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", first_quick(SHAPES, 2))
 def test_same_estimates_over_a_whole_run(shape: str) -> None:
     """State and covariance to 1e-6 at each of 500 steps, landmarks coming into view and leaving it."""
     run = draw_run(np.random.default_rng([21, SHAPES.index(shape)]), shape, landmarks=12, camera=AHEAD)

@@ -20,6 +20,7 @@ from mapweave.registration.similarity import (
     scale_contradiction,
     wrong_pair,
 )
+from tests.quick import first_quick
 
 SIGMA = 0.1
 TRUTH = Similarity(3.0, -7.0, 2.1, 0.05)
@@ -124,7 +125,7 @@ def test_it_does_not_matter_which_point_is_held() -> None:
         assert other.sigmas[0] > fit.sigmas[0]
 
 
-@pytest.mark.parametrize("known", [None, TRUTH.scale])
+@pytest.mark.parametrize("known", first_quick([None, TRUTH.scale], 1))
 def test_each_wrong_pair_is_named(known: float | None) -> None:
     named = 0
     for seed in range(20):
@@ -144,7 +145,7 @@ def test_each_wrong_pair_is_named(known: float | None) -> None:
 
 
 @pytest.mark.parametrize("known", [None, TRUTH.scale])
-@pytest.mark.parametrize("sloppy", [1.0, 4.0])
+@pytest.mark.parametrize("sloppy", first_quick([1.0, 4.0], 1))
 def test_right_pairs_are_rarely_called_wrong(known: float | None, sloppy: float) -> None:
     """Also where a person clicks four times less exactly than assumed."""
     trials = 200

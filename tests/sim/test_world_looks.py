@@ -11,6 +11,7 @@ import pytest
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.world import World
 from mapweave.sim.worlds.catalog import make_design
+from tests.quick import first_quick
 from tests.sim.measured_world import ROBOT, SEEDS, corners_of, picture, world_of
 
 
@@ -24,7 +25,7 @@ def twin_poses(world: World) -> list[Pose2]:
     return poses
 
 
-@pytest.mark.parametrize("name", ["twins", "joined twins", "large twins"])
+@pytest.mark.parametrize("name", first_quick(["joined twins", "twins", "large twins"], 1))
 @pytest.mark.parametrize("seed", SEEDS)
 def test_twins_look_exactly_the_same(name: str, seed: int) -> None:
     """The same pose in the other room gives the same image to the last bit, unless one sees the corridor."""
@@ -98,7 +99,7 @@ def feature_counts(name: str, poses: int, along: bool) -> np.ndarray:
     return np.array(counts)
 
 
-@pytest.mark.parametrize("name", ["warehouse", "twins", "arena"])
+@pytest.mark.parametrize("name", first_quick(["warehouse", "twins", "arena"], 1))
 def test_there_is_enough_to_see(name: str) -> None:
     """From almost everywhere; for offices see their own test."""
     counts = feature_counts(name, 4, along=False)

@@ -17,7 +17,7 @@ from mapweave.storage.atomic_file import check_place, write_whole
 
 @pytest.fixture
 def small_files(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A disk that takes 1000 bytes a file. Python writes no bytecode meanwhile: it would keep a part of it."""
+    """A disk that takes 1000 bytes a file; Python would keep bytecode that is cut off there."""
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

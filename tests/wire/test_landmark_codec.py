@@ -34,6 +34,7 @@ from mapweave.wire.landmark_codec import (
     unpack_landmarks,
 )
 from tests.hybridmap.kernel_forms import in_numpy
+from tests.quick import first_quick
 from tests.wire.plain_decoder import Landmarks as PlainLandmarks
 
 data = st.data()
@@ -100,7 +101,7 @@ FRAMING = 80
 
 
 @pytest.mark.parametrize("photograph", ["coins", "page", "retina", "stereo_motorcycle"])
-@pytest.mark.parametrize("most", [800, 1500, 3000, 4500])
+@pytest.mark.parametrize("most", first_quick([800, 3000, 1500, 4500], 2))
 def test_a_node_of_a_photograph_keeps_its_byte_budget(photograph: str, most: int) -> None:
     """Real descriptors of images that no table was trained on; what is chosen fits, and little is wasted."""
     image = getattr(skimage.data, photograph)()

@@ -17,6 +17,7 @@ from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.report import causes
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from synthetic.room_drive import CAMERA, RoomDrive, drive, pairs
+from tests.quick import first_quick
 
 P = Parameter
 DECLARED = DriveGeometry(forward=0.08, height=0.25)
@@ -99,7 +100,7 @@ def test_a_right_geometry_has_no_causes():
 
 @pytest.mark.parametrize(
     ("parameter", "amount"),
-    [(P.FORWARD, 0.4), (P.PITCH, math.radians(3)), (P.DELAY, 0.06)],
+    first_quick([(P.PITCH, math.radians(3)), (P.FORWARD, 0.4), (P.DELAY, 0.06)], 1),
 )
 def test_the_surest_cause_is_the_true_one(parameter: Parameter, amount: float):
     vector = DECLARED.vector

@@ -24,6 +24,7 @@ from mapweave.wire.ros2.messages import decode
 from tests import ros2_peer as peer
 from tests.agent.drivers.contract import HEIGHT, WIDTH, RobotContract, drive, drive_until, drive_way, until
 from tests.agent.drivers.ros2_robot import Ros2Robot
+from tests.quick import first_quick
 
 Start = Callable[..., CheckedRobot]
 
@@ -110,7 +111,7 @@ def test_a_fisheye_lens_is_taken_from_camera_info(start: Start) -> None:
     ("odometry", "more"),
     [("joint_states", {"wheel_radius": 0.033}), ("wheel_ticks", {})],
 )
-@pytest.mark.parametrize("bridge", [None, "/bot1"])
+@pytest.mark.parametrize("bridge", first_quick([None, "/bot1"], 1))
 def test_other_odometry_compressed_images_and_stamped_commands(
     start: Start, odometry: str, more: dict[str, Any], bridge: str | None
 ) -> None:

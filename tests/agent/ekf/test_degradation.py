@@ -12,6 +12,7 @@ from mapweave.agent.observation import Odometry
 from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.pose import Pose2
 from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
+from tests.quick import first_quick
 
 FIRST, LAST, END = 150, 170, 300
 """The fault lasts from one step to the other; the run goes on until the end."""
@@ -76,7 +77,7 @@ def drive(run: MappingRun, fault: Fault) -> tuple[MappingFilter, list[Health], l
     return filter_, health, traces, distances
 
 
-@pytest.fixture(params=range(3))
+@pytest.fixture(params=first_quick(range(3), 1))
 def run(request: pytest.FixtureRequest) -> MappingRun:
     return draw_run(np.random.default_rng([21, request.param]), SHAPES[request.param], END)
 

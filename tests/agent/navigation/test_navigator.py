@@ -36,6 +36,7 @@ from tests.agent.scripted_fleet import (
     navigator,
     straight,
 )
+from tests.quick import first_quick
 
 # Blocked
 
@@ -167,7 +168,7 @@ def test_without_a_server_its_own_map_leads_the_way(home, own_map):
     assert "not in the map" in onboard_route(own_map, nodes[0], C).reason
 
 
-@pytest.mark.parametrize("seen", [True, False])
+@pytest.mark.parametrize("seen", first_quick([True, False], 1))
 def test_a_goal_without_features_is_reached_by_its_neighbours(home, seen):
     """The goal has no landmarks: the robot stands there by what it sees of A, looks again, has arrived.
 

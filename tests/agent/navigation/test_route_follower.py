@@ -27,6 +27,7 @@ from mapweave.registration.recognition import recognise
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 from tests.hand_held import photograph
+from tests.quick import first_quick
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
@@ -57,7 +58,7 @@ def follower_at_the_goal(node: Node) -> RouteFollower:
 
 
 @pytest.mark.parametrize(
-    "begin", [Pose2(-0.03, 0.0, 0.0), Pose2(-0.01, 0.02, -0.015), Pose2(0.02, -0.02, 0.02)]
+    "begin", first_quick([Pose2(-0.01, 0.02, -0.015), Pose2(-0.03, 0.0, 0.0), Pose2(0.02, -0.02, 0.02)], 1)
 )
 def test_drifted_tracks_do_not_park_the_robot_next_to_the_goal(walls, node, begin):
     """The robot's estimate is parked, 2 to 3 cm off. It detects the goal again, and drives the rest."""
@@ -74,7 +75,9 @@ def test_drifted_tracks_do_not_park_the_robot_next_to_the_goal(walls, node, begi
     assert abs(pose.heading) < np.radians(1.0)
 
 
-@pytest.mark.parametrize(("scale", "pitch", "roll"), [(1.25, 0.02, -0.015), (0.8, -0.02, 0.01)])
+@pytest.mark.parametrize(
+    ("scale", "pitch", "roll"), first_quick([(1.25, 0.02, -0.015), (0.8, -0.02, 0.01)], 1)
+)
 def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch, roll):
     """Tilted, and of a scale that is off by a quarter: the robot has only the photograph to go by."""
     held = photograph(node, scale, pitch, roll)

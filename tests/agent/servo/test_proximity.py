@@ -56,7 +56,7 @@ def test_no_collision_in_a_random_world(
             assert len(gap) == 0 or gap.min() > 0.0
 
 
-@pytest.mark.parametrize("aside", [0.0, 0.05, 0.12, 0.25])
+@pytest.mark.parametrize("aside", first_quick([0.05, 0.25, 0.0, 0.12], 2))
 @pytest.mark.parametrize("speeds", first_quick([[0.3, 0.1], [0.26, 0.26], [0.3, 0.3]], 1))
 def test_two_that_drive_at_each_other_do_not_touch(
     robot: RobotDescription, aside: float, speeds: tuple[float, float]

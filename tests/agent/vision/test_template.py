@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.vision.template import HALF_PX, SIGMA_PX, TemplateCriteria, TemplateMatcher
+from tests.quick import first_quick
 
 SPOTS = np.array([[x + 0.37, y - 0.21] for x in range(60, 280, 40) for y in range(50, 200, 35)])
 
@@ -71,7 +72,7 @@ def test_slopes_are_those_of_finite_differences(pictures, name):
         assert np.abs(result @ weights).max() < 2e-3, "nor does brightness"
 
 
-@pytest.mark.parametrize("name", ["camera", "coins", "page"])
+@pytest.mark.parametrize("name", first_quick(["camera", "coins", "page"], 1))
 def test_a_match_is_the_best_there_is(pictures, name):
     """Against a search through all shifts and sizes near by, which knows no derivatives."""
     image = pictures.photograph(name)

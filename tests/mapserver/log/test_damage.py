@@ -81,7 +81,7 @@ def total(store: Store) -> Traffic:
     )
 
 
-@pytest.mark.parametrize("seed", first_quick(range(14), 2))
+@pytest.mark.parametrize("seed", first_quick(range(14), 1))
 def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -125,7 +125,7 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     fleet.stop_server()
 
 
-@pytest.mark.parametrize("seed", first_quick(range(60), 4))
+@pytest.mark.parametrize("seed", first_quick(range(60), 2))
 def test_a_flipped_bit_anywhere_is_repaired_or_reported_in_one_line(
     whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -16,6 +16,7 @@ from mapweave.vision.calibration.projection import project
 from mapweave.vision.calibration.target import CalibrationTarget
 from mapweave.vision.calibration.views import BoardView, placement_of
 from mapweave.vision.lens import LensModel
+from tests.quick import first_quick
 from tests.vision.calibration.boards import FISHEYE, PINHOLE, SIZE, corner_views, pixels_of
 
 MODELS = [(LensModel.RADIAL_TANGENTIAL, PINHOLE), (LensModel.EQUIDISTANT, FISHEYE)]
@@ -76,7 +77,7 @@ def _rays(true: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return rays
 
 
-@pytest.mark.parametrize(("model", "true"), MODELS)
+@pytest.mark.parametrize(("model", "true"), first_quick(MODELS, 1))
 def test_outliers_are_left_out_and_the_lens_is_found(model: LensModel, true: np.ndarray) -> None:
     rng = np.random.default_rng(2)
     views = corner_views(rng, true, 30, NOISE_PX)
