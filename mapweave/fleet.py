@@ -206,9 +206,15 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
 
         Raises:
             NotConnected: no map server answers.
+            InvalidValue: no such robot was ever heard of.
         """
         reports = decode(self._question(self._keys.any_missions(), b"", ANSWERED), Missions).reports
-        return tuple(report for report in reports if robot in ("", report.order.robot))
+        found = tuple(report for report in reports if robot in ("", report.order.robot))
+        if robot and not found:
+            known = [entry.robot for entry in self.status().robots]
+            if robot not in known:
+                raise InvalidValue(f"there is no robot {robot}; there are: {', '.join(known) or 'none'}")
+        return found
 
     def go(self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = ()) -> MissionReport:
         """Send a robot to a node (`r0.1.17`), a place, a position in the merged map (`3.1,-2.0`) or `home`.

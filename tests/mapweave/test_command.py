@@ -111,6 +111,7 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
 
             assert shell("map", "fetch", str(tmp_path / "m.mapweave"))[0] == 0
             assert len(read_map_file(tmp_path / "m.mapweave", "merged").poses) >= 2
+            assert "there is no robot r9; there are: r0" in complaint(capfd, "missions", "r9", *network)
             assert "r0.7.1 is not in the merged map" in complaint(capfd, "go", "r0", "r0.7.1", *network)
             code, printed = shell("go", "r0", "r0.1.999")
             assert code == NO and "refused: there is no node r0.1.999" in printed
