@@ -179,6 +179,11 @@ class MapMaking:
         changes, self._changes = tuple(self._changes), []
         return changes
 
+    @property
+    def explored(self) -> bool:
+        """Whether the robot stands because there is nothing left to explore."""
+        return self._explorer is not None and self._explorer.finished and self.located
+
     def account(self, exploring: bool) -> tuple[str, str, bool]:
         """For people.
 

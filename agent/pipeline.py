@@ -240,8 +240,11 @@ class Pipeline:
         self._take_over(driven)
         self._feel(observation)
         observation = self._others.mark(observation, answers, lambda: self.mapper.landmarks)
+        stands_elsewhere = self._in_the_air(observation) or self._put_elsewhere
+        if not stands_elsewhere:
+            self._make_room()
         match self._mission:
-            case _ if self._in_the_air(observation) or self._put_elsewhere:
+            case _ if stands_elsewhere:
                 pass
             case Idle() if self.mapper.started:
                 # Mapping that goes on later needs the motion of the wheels until then.
@@ -254,7 +257,6 @@ class Pipeline:
                 )
                 self._others.description = self._map_making.description
             case GoTo() if self._navigator is not None:
-                self._make_room(self._navigator)
                 command, questions = self._navigator.step(observation, answers, self._held)
                 self.mapper.drove(self._navigator.traverse, self._navigator.refined)
         questions = [*questions, *self._who_is_near()]
@@ -268,11 +270,18 @@ class Pipeline:
         self._command = safe if own else None
         return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
 
-    def _make_room(self, navigator: Navigator) -> None:
-        """Drive out of the way of another robot, if this one has nothing else to do, and may."""
+    def _make_room(self) -> None:
+        """Drive out of the way of another robot, if this one has done its mission, and may."""
         aside, self._others.aside = self._others.aside, None
+        match self._mission:
+            case Explore():
+                done = self._map_making.explored
+            case GoTo() if self._navigator is not None:
+                done = self._navigator.arrived
+            case _:
+                done = False
         may = self._settings.navigation.make_room and self._room_made < MOST_ROOM and not self._held
-        if aside is not None and navigator.arrived and may:
+        if aside is not None and done and may:
             made = self._room_made + 1
             self.set_mission(GoTo(aside))
             self._room_made = made

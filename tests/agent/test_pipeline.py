@@ -10,11 +10,10 @@ import pytest
 
 from mapweave.agent.global_localization import pose_consistency
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.mission import Carried, Explore, GoTo, Idle, Mission, WhereAmI, WhoIsNear
-from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.mission import Carried, Explore, GoTo, Idle, WhereAmI, WhoIsNear
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, Step
-from mapweave.agent.settings import AgentSettings, NavigatorSettings
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -203,44 +202,6 @@ def test_a_robot_that_was_stopped_on_its_way_says_where_it_stands(walls):
         assert start == node
         assert pose.x == pytest.approx(1.0 + 0.01 * tick, abs=0.03), "its wheels know how it is pushed"
     assert [question for tick in range(100, 200) for question in asked(tick, lifted=True)] == []
-
-
-@pytest.mark.parametrize("allowed", [True, False])
-def test_a_robot_that_has_parked_makes_room_and_others_do_not(walls, allowed):
-    navigation = NavigatorSettings(make_room=allowed)
-    goal, aside = NodeId("r2", 1, 1), NodeId("r2", 1, 9)
-
-    def asked(mission: Mission, stage: Stage) -> Pipeline:
-        pipeline = Pipeline(MAP, BODY, AgentSettings(navigation=navigation))
-        pipeline.set_mission(GoTo(goal))
-        pipeline._navigator.stage = stage
-        pipeline.set_mission(mission) if not isinstance(mission, GoTo) else None
-        pipeline._others.aside = aside
-        pipeline.step(still(walls, tick=1))
-        return pipeline
-
-    parked = asked(GoTo(goal), Stage.ARRIVED)
-    assert parked.mission == GoTo(aside if allowed else goal)
-    assert asked(GoTo(goal), Stage.LOST).mission == GoTo(goal), "it is on its way"
-    assert asked(GoTo(goal), Stage.GIVEN_UP).mission == GoTo(goal), "it has failed"
-    assert asked(Idle(), Stage.ARRIVED).mission == Idle(), "it was stopped"
-    step = parked.step(still(walls, tick=2))
-    assert ("makes room" in step.status.detail) == allowed
-
-
-def test_no_server_makes_a_parked_robot_drive_for_ever(walls):
-    """It says again and again, with another node each time, that the robot is in the way."""
-    pipeline = Pipeline(MAP, BODY)
-    pipeline.set_mission(GoTo(NodeId("r2", 1, 1)))
-    for order in range(2):
-        driven = []
-        for tick in range(1, 20):
-            pipeline._navigator.stage = Stage.ARRIVED
-            pipeline._others.aside = NodeId("r2", 1, 10 + tick)
-            pipeline.step(still(walls, tick=20 * order + tick))
-            driven.append(pipeline.mission.node.number)
-        assert driven == [11, 12, *[13] * 17]
-        pipeline.set_mission(GoTo(NodeId("r2", 1, 1)))
 
 
 def test_exploration_that_was_interrupted_goes_on(walls, drive):
