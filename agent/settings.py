@@ -109,8 +109,8 @@ class NavigatorSettings:
         blocked_first: how long it avoids an edge that was blocked for the first time, s: people walk on.
         blocked_longest: each further time it avoids it twice as long, up to this, s: walls stay.
         patience: a goal is given up when no further edge on the way was driven to for so long, s.
-        make_room: whether a robot that has parked at its goal, or has explored all, makes room for another one
-            in whose way it stands: it drives to a node off that way, and stays there.
+        make_room: whether a robot that has parked at its goal, or has explored all, makes room for another
+            one in whose way it stands: it drives to a node off that way, and stays there.
     """
 
     speed: Positive = 0.26

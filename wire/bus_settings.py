@@ -17,7 +17,10 @@ RETRY_LONGEST = 1.0
 NEXT_ENDPOINT = 2.0
 """s that a client with several endpoints spends on one of them. A router gives a handshake as long."""
 LEASE = 2.5
-"""After what silence a participant counts as dead, s."""
+"""After what silence a router counts as dead, s: its clients go to another one."""
+CLIENT_LEASE = 10.0
+"""After what silence a client counts as dead, s; one whose process ends leaves at once. With 2.5 s a router
+dropped robots of a busy computer, and all that came back at once were dropped again."""
 QUEUE_LIMIT = 16384
 """Messages that may wait for this bus's handlers."""
 ROUTER_QUEUE = 16

@@ -31,6 +31,9 @@ from mapweave.wire.zenoh_entities import Declared, Owner, Service, Subscription,
 log = logging.getLogger(__name__)
 
 _D = TypeVar("_D", bound=Declared)
+SILENT, UNANSWERED = 20.0, 10.0
+"""After so long without any message a client asks its router for a sign of life, and connects again if none
+comes for so long, s. A router that is gone is noticed earlier, by Zenoh."""
 REFUSALS = "off,zenoh_link_tls=warn,zenoh_transport=warn"
 """What of Zenoh's own log a router with keys shows."""
 
@@ -56,7 +59,7 @@ class ZenohBus:
         self._session: zenoh.Session | None = None
         self._in_use = 0
         self._in_use_changed = threading.Condition()
-        self._connecting = threading.Thread(target=self._connect, name="zenoh-connect", daemon=True)
+        self._connecting = threading.Thread(target=self._keep_connected, name="zenoh-connect", daemon=True)
         self._links: list[object] = []
         self._publishers = Publishers()
         if self._settings.mode == "router":
@@ -107,6 +110,7 @@ class ZenohBus:
                     consolidation=zenoh.ConsolidationMode.NONE,
                 ):
                     if (reply := read_reply(one)) is not None:
+                        self.owner.heard()
                         replies.append(reply)
                         if enough(reply):
                             break
@@ -147,14 +151,7 @@ class ZenohBus:
         with self.owner.lock:
             if self._closed.is_set():
                 raise NotConnected("this bus is closed")
-            session, self._session = self._session, None
-            for entity in self.owner.declared:
-                entity.detach()
-            with self._in_use_changed:
-                self._in_use_changed.wait_for(lambda: self._in_use == 0)
-            self._publishers = Publishers()
-            if session is not None:
-                session.close()  # type: ignore[no-untyped-call]
+            self._close_session()
             session = _open_router(settings)
             try:
                 for entity in self.owner.declared:
@@ -218,6 +215,17 @@ class ZenohBus:
                 declared.declare(self._session)
         return declared
 
+    def _close_session(self) -> None:
+        """Take everything back from the session, to be declared in the next; with the owner's lock held."""
+        session, self._session = self._session, None
+        for entity in self.owner.declared:
+            entity.detach()
+        with self._in_use_changed:
+            self._in_use_changed.wait_for(lambda: self._in_use == 0)
+        self._publishers = Publishers()
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
     def _watch_links(self, session: zenoh.Session) -> None:
         """Log who connects, and who is denied everything."""
         access = self._settings.access
@@ -245,6 +253,43 @@ class ZenohBus:
 
         self._links = [session.info.declare_link_events_listener(report)]
 
+    def _keep_connected(self) -> None:
+        """Connect, and again whenever the router keeps the connection and has forgotten who is behind it.
+
+        With Zenoh 1.10 that happens when a busy router breaks off a handshake at its end, because it took
+        longer than `ACCEPT_TIMEOUT`: the link lives, and nothing that the client declares or sends is heard.
+        """
+        self._connect()
+        while not self._closed.wait(SILENT / 10):
+            session = self._session
+            if session is None or time.monotonic() - self.owner.heard_at < SILENT or not self.connected():
+                continue
+            if self._is_answered(session):
+                self.owner.heard()
+            elif not self._closed.is_set() and self.connected():
+                log.warning("the router keeps the connection and answers nothing: connecting again")
+                with self.owner.lock:
+                    if not self._closed.is_set():
+                        self._close_session()
+                self._connect()
+
+    def _is_answered(self, session: zenoh.Session) -> bool:
+        """Whether the router says who is alive; only what this client watches is it allowed to ask."""
+        with self.owner.lock:
+            watched = next((one.key for one in self.owner.declared if isinstance(one, Watcher)), None)
+        if watched is None:
+            return True
+        try:
+            # A client itself answers with what it knows; only the router's word ends that before its time.
+            answers = session.liveliness().get(watched, timeout=UNANSWERED)
+            while not self._closed.wait(0.05):
+                answer = answers.try_recv()
+                if answer is not None and answer.err is not None:
+                    return False
+        except zenoh.ZError:
+            log.debug("the router has said who is alive under %s", watched)
+        return True
+
     def _connect(self) -> None:
         """Try until there is a router, then declare what was asked for in the meantime."""
         config = _config(self._settings)
@@ -267,6 +312,7 @@ class ZenohBus:
                         for declared in self.owner.declared:
                             declared.declare(session)
                         self._session = session
+                        self.owner.heard()
                         return
                     except NotConnected:
                         # The interpreter is ending; then no caller waits for this bus.

@@ -8,6 +8,7 @@ from typing import Any
 
 from mapweave.wire.access_rules import access_control
 from mapweave.wire.bus_settings import (
+    CLIENT_LEASE,
     LEASE,
     NEXT_ENDPOINT,
     RETRY_FIRST,
@@ -18,10 +19,11 @@ from mapweave.wire.bus_settings import (
 from mapweave.wire.credentials import Credentials
 from mapweave.wire.keys import Keys
 
-ACCEPT_PENDING = 1000
+ACCEPT_PENDING = 8192
 """Connections of which a router does not know yet who they are."""
-ACCEPT_TIMEOUT = 2.0
-"""s; a silent new connection is dropped after this time. A handshake takes two round trips."""
+ACCEPT_TIMEOUT = 10.0
+"""s; a silent new connection is dropped after this time. A handshake that a busy router breaks off at its end
+leaves a client that believes itself connected, and of which the router knows nothing."""
 MAX_SESSIONS = 16384
 """Robots, people and routers that a router takes at once. With Zenoh's own 1000 the thousandth robot
 tries to connect for ever and is given no reason."""
@@ -54,11 +56,11 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "scouting/gossip/enabled": False,
         # There is no scouting, so opening a router need not wait half a second for it.
         "scouting/delay": 1,
-        # With Zenoh's own 100 and 10 s, a hundred idle connections keep all others out for 10 s.
+        # With Zenoh's own 100, a hundred idle connections keep all others out.
         "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT * 1e3),
         "transport/unicast/open_timeout": round(attempt * 1e3),
-        "transport/link/tx/lease": round(LEASE * 1e3),
+        "transport/link/tx/lease": round((LEASE if routes else CLIENT_LEASE) * 1e3),
         "transport/link/tx/queue/size/data": ROUTER_QUEUE if routes else 2,
         "transport/shared_memory/enabled": False,
     }

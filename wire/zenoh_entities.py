@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -28,12 +29,18 @@ class Owner:
         lock: of `declared`.
         declared: in the order of declaration.
         open_requests: questions without an answer yet.
+        heard_at: when something last came from the network, s on the monotonic clock.
     """
 
     dispatcher: Dispatcher
     lock: threading.RLock = field(default_factory=threading.RLock)
     declared: list[Declared] = field(default_factory=list)
     open_requests: set[ZenohRequest] = field(default_factory=set)
+    heard_at: float = 0.0
+
+    def heard(self) -> None:
+        """Note that something has come."""
+        self.heard_at = time.monotonic()
 
 
 class Declared:
@@ -113,6 +120,7 @@ class Subscription(Declared):
         return session.declare_subscriber(self.key, self._receive)
 
     def _receive(self, sample: zenoh.Sample) -> None:
+        self._owner.heard()
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
         message = Sample(str(sample.key_expr), sample.payload.to_bytes(), attachment)
         self._owner.dispatcher.message(self._handler, message, self.wanted)
@@ -129,6 +137,7 @@ class Service(Declared):
         return session.declare_queryable(self.key, self._receive)
 
     def _receive(self, query: zenoh.Query) -> None:
+        self._owner.heard()
         # A reply goes out on one key that the question's pattern matches.
         key = answered(str(query.key_expr), self.key)
         self._owner.dispatcher.question(self._handler, ZenohRequest(self._owner, key, query), self.wanted)
@@ -153,6 +162,7 @@ class Watcher(Declared):
             self._owner.dispatcher.presence(self._handler, key, False, self.wanted)
 
     def _receive(self, sample: zenoh.Sample) -> None:
+        self._owner.heard()
         key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
         # History and news may both contain the same token.
         if alive != (key in self._seen):

@@ -12,7 +12,8 @@ from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 
 LEAVING = 4.0
-"""s; a dead agent has left the network by then (the lease of the bus is 2.5 s)."""
+"""s; an agent whose process has ended has left the network by then. One that hangs, or has lost the network,
+leaves after 10 s."""
 SETTLING = 0.5
 """s; liveliness of an agent that starts at the same time arrives within this time."""
 
