@@ -53,7 +53,9 @@ def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
     assert waited.open, "nothing has been heard yet"
     link.report(Status("gave up", "a wall", 7, 0, Pose2(), False), 2)
     eventually(lambda: house.person.missions()[-1].state is MissionState.FAILED)
-    assert house.person.missions("r0")[-1].reason == "a wall" and house.person.missions("r9") == ()
+    assert house.person.missions("r0")[-1].reason == "a wall"
+    with pytest.raises(InvalidValue, match="there is no robot r9; there are: r0"):
+        house.person.missions("r9")
     assert house.entry("r0").status.mission.reason == "a wall"
     link.close()
 
