@@ -17,10 +17,10 @@ RETRY_LONGEST = 1.0
 NEXT_ENDPOINT = 2.0
 """s that a client with several endpoints spends on one of them. A router gives a handshake as long."""
 LEASE = 2.5
-"""After what silence a router counts as dead, s: its clients go to another one."""
-CLIENT_LEASE = 10.0
-"""After what silence a client counts as dead, s; one whose process ends leaves at once. With 2.5 s a router
-dropped robots of a busy computer, and all that came back at once were dropped again."""
+"""After what silence a participant counts as dead, s: clients of a silent router go to another one."""
+AGENT_LEASE = 10.0
+"""The same for agents, s; one whose process ends leaves at once. With 2.5 s a router dropped robots of a busy
+computer, and all that came back at once were dropped again."""
 QUEUE_LIMIT = 16384
 """Messages that may wait for this bus's handlers."""
 ROUTER_QUEUE = 16
@@ -55,6 +55,7 @@ class BusSettings:
         timestamps: whether what is published gets a time, without which nothing is kept for late subscribers.
         attempt: of a client to open a connection, s: so long a host that does not answer holds up the end of
             the process, and, up to `NEXT_ENDPOINT`, the next endpoint. Zenoh's own default is 10.
+        lease: after what silence others count this one as dead, s.
         credentials: prove who this is; None on this machine alone.
         access: who is admitted by a router, and to what; None: all clients to everything.
         fleet: of the rules of `access`.
@@ -67,6 +68,7 @@ class BusSettings:
     session: str = ""
     timestamps: bool = False
     attempt: float = 10.0
+    lease: float = LEASE
     credentials: Credentials | None = None
     access: Access | None = None
     fleet: str = "demo"

@@ -8,8 +8,6 @@ from typing import Any
 
 from mapweave.wire.access_rules import access_control
 from mapweave.wire.bus_settings import (
-    CLIENT_LEASE,
-    LEASE,
     NEXT_ENDPOINT,
     RETRY_FIRST,
     RETRY_LONGEST,
@@ -60,7 +58,7 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT * 1e3),
         "transport/unicast/open_timeout": round(attempt * 1e3),
-        "transport/link/tx/lease": round((LEASE if routes else CLIENT_LEASE) * 1e3),
+        "transport/link/tx/lease": round(settings.lease * 1e3),
         "transport/link/tx/queue/size/data": ROUTER_QUEUE if routes else 2,
         "transport/shared_memory/enabled": False,
     }

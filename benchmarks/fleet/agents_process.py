@@ -29,7 +29,7 @@ from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.bus_settings import AGENT_LEASE, BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -106,7 +106,9 @@ class Agent:
         name = name_of(number)
         keys = Keys(FLEET)
         slow = orders.disturbance == "slow"
-        self._bus = (MuteBus if slow else ZenohBus)(BusSettings(endpoints=(orders.endpoint,)))
+        self._bus = (MuteBus if slow else ZenohBus)(
+            BusSettings(endpoints=(orders.endpoint,), lease=AGENT_LEASE)
+        )
         if not self._bus.wait_connected(CONNECTING):
             raise SystemExit(f"{name} does not get a connection")
         journal = SlowTimedJournal if slow else TimedJournal

@@ -99,11 +99,12 @@ def network_of(arguments: argparse.Namespace, settings: Settings, name: str = ""
 
 
 def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
-    """A client connection; it opens in the background and survives a router that comes and goes."""
+    """An agent's connection; it opens in the background and survives a router that comes and goes."""
+    from mapweave.wire.bus_settings import AGENT_LEASE
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
-    return ZenohBus(client_settings(network)), Keys(network.fleet)
+    return ZenohBus(replace(client_settings(network), lease=AGENT_LEASE)), Keys(network.fleet)
 
 
 def client_settings(network: NetworkSettings) -> BusSettings:
