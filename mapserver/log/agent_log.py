@@ -47,6 +47,7 @@ class AgentLog:
         ahead: changes that came and are not settled, by sequence number.
         refusals: the newest that were refused.
         damaged: parts of the settled changes that were found damaged on the disk.
+        unverified: settled changes that one of these may have undone, see `Store.verify`.
         pulling: whether a pull is under way.
         pull_at: when the next one is due.
         chunk: changes to ask for at once; smaller after an answer that could not be read.
@@ -61,6 +62,7 @@ class AgentLog:
     ahead: dict[int, Entry] = field(default_factory=dict)
     refusals: tuple[Refusal, ...] = ()
     damaged: list[Gap] = field(default_factory=list)
+    unverified: Gap | None = None
     pulling: bool = False
     pull_at: float = NEVER
     chunk: int = MAX_ROWS
@@ -141,7 +143,7 @@ class AgentLog:
     @property
     def complete(self) -> bool:
         """Whether nothing is missing, as far as is known."""
-        return self.newest <= self.watermark and not self.damaged
+        return self.newest <= self.watermark and not self.damaged and self.unverified is None
 
     def plan(self, now: float) -> None:
         """Note when to pull next, if that is not known yet."""
@@ -160,7 +162,7 @@ class AgentLog:
         self.pulling = True
         rows = min(self.chunk, most)
         if self.newest <= self.watermark:
-            _, first, last = self.damaged[0]
+            _, first, last = [*self.damaged, *filter(None, [self.unverified])][0]
             return LogRequest(first, min(last, first + rows - 1))
         first = self.watermark + 1
         end = min((sequence - 1 for sequence in self.ahead), default=self.newest)
@@ -169,6 +171,10 @@ class AgentLog:
     def was_damaged(self, sequence: int) -> bool:
         """Whether a settled change was found damaged on the disk."""
         return any(first <= sequence <= last for _, first, last in self.damaged)
+
+    def is_unverified(self, sequence: int) -> bool:
+        """Whether a settled change, and those behind it, are the next to be verified."""
+        return self.unverified is not None and self.unverified.first == sequence
 
     def pulled(self, now: float, *, gained: bool) -> None:
         """A pull is over. After one that gained nothing the pause doubles."""

@@ -35,6 +35,7 @@ from mapweave.mapserver.log.intake import Intakes
 from mapweave.mapserver.log.known_logs import KnownLogs, Lag
 from mapweave.mapserver.log.pulled import Piece, Pieces, Pulled
 from mapweave.mapserver.log.puller import Puller
+from mapweave.mapserver.log.recovery import recover
 from mapweave.mapserver.log.store import News, Store
 from mapweave.mapserver.quotas import Quotas
 from mapweave.wire.bus import Bus, Closing, Sample
@@ -271,10 +272,9 @@ class Ingest:
             return None
         if piece.covered < first:
             agent_log.pulled(time.monotonic(), gained=False)
-        elif agent_log.was_damaged(first):
+        elif agent_log.was_damaged(first) or agent_log.is_unverified(first):
             agent_log.pulled(time.monotonic(), gained=True)
-            entries = [Entry.read(agent_log.map, *row) for row in piece.rows]
-            self._restore(agent_log, first, piece.covered, entries)
+            self._recover(agent_log, first, piece)
         else:
             self._take_piece(piece)
         return agent_log
@@ -339,17 +339,15 @@ class Ingest:
             if run.full:
                 self._rest(run.log, run.full)
 
-    def _restore(self, agent_log: AgentLog, first: int, covered: int, entries: list[Entry]) -> None:
-        """Put damaged changes in their places again and pass them on."""
+    def _recover(self, agent_log: AgentLog, first: int, piece: Piece) -> None:
+        """Put damaged changes in their places again, or verify others, and pass on what that changes."""
         try:
-            changes = self._store.restore(agent_log.map, first, covered, entries)
+            changes, restored = recover(self._store, agent_log, first, piece)
         except InvalidFile as error:
             self._commit_failed(agent_log, error)
             return
         self._failure = ""
-        agent_log.damaged = self._store.damaged(agent_log.map)
-        log.warning("changes %d to %d of %s are whole again", first, covered, agent_log.map)
-        self._counters.add(restored=len(entries))
+        self._counters.add(restored=restored)
         self._pass_on(changes)
 
     def _log(self, map_id: MapId, log_id: int) -> AgentLog | None:

@@ -32,6 +32,10 @@ CREATE TABLE damaged (
     agent TEXT NOT NULL, epoch INTEGER NOT NULL, first INTEGER NOT NULL, last INTEGER NOT NULL,
     crc INTEGER NOT NULL, PRIMARY KEY (agent, epoch, first)
 ) WITHOUT ROWID;
+CREATE TABLE unverified (
+    agent TEXT NOT NULL, epoch INTEGER NOT NULL, first INTEGER NOT NULL, last INTEGER NOT NULL,
+    crc INTEGER NOT NULL, PRIMARY KEY (agent, epoch)
+) WITHOUT ROWID;
 CREATE TABLE node (
     agent TEXT NOT NULL, epoch INTEGER NOT NULL, number INTEGER NOT NULL, landmarks INTEGER NOT NULL,
     crc INTEGER NOT NULL, PRIMARY KEY (agent, epoch, number)
@@ -56,7 +60,7 @@ TABLES = {statement.split()[2]: statement.strip() for statement in SCHEMA.split(
 
 
 class Gap(NamedTuple):
-    """Changes of a log that are lost, both ends included; some of them the robot may never have had."""
+    """A part of a log, both ends included; some of its changes the robot may have dropped."""
 
     map: MapId
     first: int
@@ -98,7 +102,7 @@ def repair(connection: sqlite3.Connection) -> None:
     except BaseException:
         connection.execute("ROLLBACK")
         raise
-    for table in ("manual_constraint", "annotation", "refused", "node", "result", "damaged"):
+    for table in ("manual_constraint", "annotation", "refused", "node", "result", "damaged", "unverified"):
         if bad[table]:
             log.error("the store had %d damaged rows of table %s; they are left out", bad[table], table)
 

@@ -50,10 +50,10 @@ class KnownLogs(Mapping[MapId, AgentLog]):
     def restore(self, store: Store, positions: Mapping[MapId, Position], settings: PullSettings) -> None:
         """Add those of a store, as far as they are settled."""
         for map_id, (log_id, watermark) in sorted(positions.items()):
-            refusals, damaged = tuple(store.refusals(map_id)), store.damaged(map_id)
-            self.add(
-                AgentLog(map_id, log_id, settings, watermark, watermark, refusals=refusals, damaged=damaged)
-            )
+            agent_log = AgentLog(map_id, log_id, settings, watermark, watermark)
+            agent_log.refusals = tuple(store.refusals(map_id))
+            agent_log.damaged, agent_log.unverified = store.damaged(map_id), store.unverified(map_id)
+            self.add(agent_log)
 
     def add(self, agent_log: AgentLog) -> None:
         """Add a log, or put it in the place of another of the same name."""

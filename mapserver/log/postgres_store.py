@@ -29,6 +29,7 @@ KEYS = {
     "log": ("agent", "epoch"),
     "change": ("agent", "epoch", "sequence"),
     "damaged": ("agent", "epoch", "first"),
+    "unverified": ("agent", "epoch"),
     "node": ("agent", "epoch", "number"),
     "refused": ("agent", "epoch", "sequence"),
     "manual_constraint": ("number",),
@@ -40,6 +41,7 @@ VALUES = {
     "log": ("log_id", "watermark"),
     "change": ("stamp_ns", "kind", "number", "wire_bytes", "body"),
     "damaged": ("last",),
+    "unverified": ("first", "last"),
     "node": ("landmarks",),
     "refused": ("reason", "message"),
     "manual_constraint": ("body",),
@@ -52,6 +54,7 @@ TYPES = {
     **dict.fromkeys(("body", "message", "value"), "BYTEA NOT NULL"),
 }
 """Of columns that are no numbers."""
+TABLES_THERE = "SELECT tablename FROM pg_tables WHERE schemaname = 'mapweave'"
 SCHEMA_LOCK = 0x4D575354
 """Advisory lock of who makes the tables: 'MWST'."""
 
@@ -127,6 +130,10 @@ class PostgresStore(SqlStore):
                 self._put("result", (ID, fresh_id().to_bytes(8, "big")))
             else:
                 self._check_version(self._writer.connection)
+                there = {row[0] for row in self._writer.connection.execute(TABLES_THERE)}
+                # A store of an earlier program lacks some.
+                for table in KEYS.keys() - there:
+                    self._writer.connection.execute(_table(table))
 
     def _check_version(self, connection: psycopg.Connection) -> None:
         version = _version(connection)
@@ -252,11 +259,14 @@ def _statements() -> Iterator[str]:
     yield "CREATE SCHEMA IF NOT EXISTS mapweave"
     yield "CREATE TABLE schema_version (version BIGINT NOT NULL)"
     yield f"INSERT INTO schema_version VALUES ({VERSION})"
-    for table, keys in KEYS.items():
-        columns = [f"{name} {TYPES.get(name, 'BIGINT NOT NULL')}" for name in (*keys, *VALUES[table])]
-        yield f"CREATE TABLE {table} ({', '.join(columns)}, PRIMARY KEY ({', '.join(keys)}))"
+    yield from map(_table, KEYS)
     # Bodies are as small as they get already.
     yield "ALTER TABLE change ALTER COLUMN body SET STORAGE EXTERNAL"
+
+
+def _table(table: str) -> str:
+    columns = [f"{name} {TYPES.get(name, 'BIGINT NOT NULL')}" for name in (*KEYS[table], *VALUES[table])]
+    return f"CREATE TABLE {table} ({', '.join(columns)}, PRIMARY KEY ({', '.join(KEYS[table])}))"
 
 
 def _insert(table: str) -> str:

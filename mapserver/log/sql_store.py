@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from abc import abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -30,6 +30,11 @@ from mapweave.wire.log_messages import Refusal
 log = logging.getLogger(__name__)
 
 READ_AT_ONCE = 256
+RETIREMENTS: dict[str, Callable[[NodeId], NodeRetired | EdgeRetired]] = {
+    NodePut.__name__: NodeRetired,
+    EdgePut.__name__: EdgeRetired,
+}
+"""By the kind of change that they undo."""
 PRUNED_AT_ONCE = 256
 """Elements of one map: a log is read through once for so many."""
 
@@ -193,12 +198,50 @@ class SqlStore(Store):
                         self._put("damaged", (*map_id, covered + 1, gap.last))
             for entry in entries:
                 self._take(map_id, entry, changes, refusals, restored=True)
+            if len(entries) <= covered - first and first > 1:
+                before = self.unverified(map_id)
+                self._put("unverified", (*map_id, 1, max(first - 1, before.last if before else 0)))
         self._count_again()
         for refusal in refusals:
             log.warning("refused %s %d: %s", map_id, refusal.sequence, refusal.reason)
         if any(self._may_undo(change) for change in changes):
             return self.replay(map_id, changes[0].sequence - 1)
         return iter(changes)
+
+    def unverified(self, map_id: MapId) -> Gap | None:
+        """Stored changes that a lost one may have undone; see `Store`."""
+        rows = self._read("SELECT first, last FROM unverified WHERE agent = ? AND epoch = ?", map_id)
+        return Gap(map_id, *rows[0]) if rows else None
+
+    def verify(self, map_id: MapId, first: int, covered: int, kept: Collection[int]) -> list[Change]:
+        """Delete unverified changes that the robot has dropped; see `Store`."""
+        there = (
+            "SELECT sequence, stamp_ns, kind, number FROM change "
+            "WHERE agent = ? AND epoch = ? AND sequence BETWEEN ? AND ? ORDER BY sequence"
+        )
+        put = "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND kind = ? AND number = ? LIMIT 1"
+        retired: dict[tuple[str, int], Change] = {}
+        with self._transaction():
+            dropped = [row for row in self._read(there, (*map_id, first, covered)) if row[0] not in kept]
+            for sequence, *_ in dropped:
+                self._write(
+                    "DELETE FROM change WHERE agent = ? AND epoch = ? AND sequence = ?", (*map_id, sequence)
+                )
+            for sequence, stamp_ns, kind, number in dropped:
+                if kind in RETIREMENTS and not self._read(put, (*map_id, kind, number)):
+                    body = RETIREMENTS[kind](NodeId(*map_id, number))
+                    retired[kind, number] = Change(map_id, sequence, stamp_ns, body)
+            for kind, number in retired:
+                if kind == NodePut.__name__:
+                    self._write(
+                        "DELETE FROM node WHERE agent = ? AND epoch = ? AND number = ?", (*map_id, number)
+                    )
+            unverified = self.unverified(map_id)
+            self._write("DELETE FROM unverified WHERE agent = ? AND epoch = ?", map_id)
+            if unverified is not None and covered < unverified.last:
+                self._put("unverified", (*map_id, covered + 1, unverified.last))
+        self._count_again()
+        return list(retired.values())
 
     def landmarks(self, node: NodeId) -> int | None:
         """How many landmarks a node has; None if there is no such node."""

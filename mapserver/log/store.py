@@ -159,6 +159,8 @@ class Store(Protocol):
     def restore(self, map_id: MapId, first: int, covered: int, entries: Sequence[Entry]) -> Iterator[Change]:
         """Put changes that were damaged in their places again, as the robot's log has them.
 
+        Where the robot has dropped some of them, what comes before is unverified: a retirement may be lost.
+
         Args:
             map_id: whose log.
             first: of a damaged part.
@@ -171,6 +173,25 @@ class Store(Protocol):
 
         Raises:
             InvalidFile: the disk does not take it; nothing is restored.
+        """
+
+    def unverified(self, map_id: MapId) -> Gap | None:
+        """Stored changes that a lost one may have undone; None if there are none, see `verify`."""
+
+    def verify(self, map_id: MapId, first: int, covered: int, kept: Collection[int]) -> list[Change]:
+        """Delete unverified changes that the robot has dropped, since others undid them.
+
+        Args:
+            map_id: whose log.
+            first: of the unverified changes.
+            covered: the robot has nothing else up to here.
+            kept: which of them the robot has.
+
+        Returns:
+            The retirement of each node and edge that no stored change puts now.
+
+        Raises:
+            InvalidFile: the disk does not take it; nothing is deleted.
         """
 
     def landmarks(self, node: NodeId) -> int | None:

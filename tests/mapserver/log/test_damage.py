@@ -81,6 +81,10 @@ def total(store: Store) -> Traffic:
     )
 
 
+def all_is_whole(store: Store) -> bool:
+    return not store.damaged() and not any(map(store.unverified, store.maps()))
+
+
 @pytest.mark.parametrize("seed", first_quick(range(14), 1))
 def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
@@ -111,7 +115,7 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     assert served == {key: data for key, data in expected.items() if key not in hit}
     assert fleet.store.traffic() == total(fleet.store)
     fleet.start_robots()
-    eventually(lambda: not fleet.store.damaged())
+    eventually(lambda: all_is_whole(fleet.store))
     fleet.ingest.close()
     assert fleet.store.traffic() == total(fleet.store), "what is healed is counted"
     assert fleet.lacks() == 0
@@ -122,6 +126,29 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     caplog.clear()
     fleet.start_server()
     assert fleet.served() == maps and "damaged" not in caplog.text
+    fleet.stop_server()
+
+
+@pytest.mark.parametrize("seed", first_quick(range(20), 3))
+def test_what_a_lost_change_retired_stays_retired(whole: Path, fleet: Fleet, seed: int) -> None:
+    """Robots have dropped such changes together with what they undid: nobody has them any more."""
+    _, maps = truth(whole)
+    rng = np.random.default_rng(2000 + seed)
+    disk = sqlite3.connect(fleet.path)
+    query = "SELECT agent, sequence FROM change WHERE kind IN ('NodeRetired', 'EdgeRetired') OR ?"
+    rows = disk.execute(query, (seed % 2,)).fetchall()
+    for k in rng.choice(len(rows), int(rng.integers(1, 9)), replace=False):
+        disk.execute("UPDATE change SET crc = crc + 1 WHERE agent = ? AND sequence = ?", rows[k])
+    disk.commit()
+    disk.close()
+    fleet.start_server()
+    fleet.start_robots()
+    eventually(lambda: all_is_whole(fleet.store) and fleet.lacks() == 0)
+    fleet.stop_robots()
+    fleet.stop_server()
+    assert fleet.served() == maps
+    fleet.start_server()
+    assert fleet.served() == maps
     fleet.stop_server()
 
 
@@ -147,7 +174,7 @@ def test_a_flipped_bit_anywhere_is_repaired_or_reported_in_one_line(
     assert served.items() <= expected.items()
     assert len(served) == len(expected) or "damaged" in caplog.text, "something is missing without a word"
     fleet.start_robots()
-    eventually(lambda: not fleet.store.damaged() and fleet.lacks() == 0)
+    eventually(lambda: all_is_whole(fleet.store) and fleet.lacks() == 0)
     for replicator, _, _ in fleet.robots:
         assert replicator.wait_acknowledged(30)
     fleet.stop_robots()
@@ -213,7 +240,7 @@ def test_a_damaged_key_misleads_no_reader(whole: Path, fleet: Fleet, bit: int) -
     assert [(gap.map, gap.first, gap.last) for gap in fleet.store.damaged()] == [(one, sequence, sequence)]
     assert len(fleet.seen) == sum(map(len, logs.values())) - 1
     fleet.start_robots()
-    eventually(lambda: not fleet.store.damaged())
+    eventually(lambda: all_is_whole(fleet.store))
     fleet.stop_robots()
     fleet.stop_server()
     assert fleet.served() == maps

@@ -75,6 +75,7 @@ def content(store: Store) -> list[object]:
         store.maps(), store.positions(), store.present(), store.refused(), store.damaged(),
         store.constraints(), store.annotations(), store.result("poses"), store.kept("r0"), store.traffic(),
         *((store.watermark(m), store.log_id(m), store.refusals(m, 3)) for m in (MAP, OTHER)),
+        *(store.unverified(m) for m in (MAP, OTHER)),
         *(store.traffic(m) for m in (MAP, OTHER)),
         *([(c.sequence, c.stamp_ns, encode_body(c.body)) for c in store.replay(m, 2)] for m in (MAP, OTHER)),
         *(store.landmarks(NodeId(*m, k)) for m in (MAP, OTHER) for k in (1, 2)),
@@ -118,6 +119,19 @@ def test_both_stores_give_the_same_for_the_same(
             for store in self.stores:
                 store.prune(nodes, edges, {"poses": b"pruned"})
 
+        @rule(map_id=st.sampled_from([MAP, OTHER]), first=st.integers(1, 5), more=st.integers(0, 3))
+        def lose(self, map_id: MapId, first: int, more: int) -> None:
+            for store in self.stores:
+                assert list(store.restore(map_id, first, first + more, [])) == []
+
+        @rule(
+            map_id=st.sampled_from([MAP, OTHER]), first=st.integers(1, 5), more=st.integers(0, 3),
+            kept=st.sets(st.integers(1, 7)),
+        )  # fmt: skip
+        def verify(self, map_id: MapId, first: int, more: int, kept: set[int]) -> None:
+            one, other = (store.verify(map_id, first, first + more, kept) for store in self.stores)
+            assert one == other
+
         @rule()
         def reopen(self) -> None:
             ids = [store.id for store in self.stores]
@@ -140,6 +154,18 @@ def test_both_stores_give_the_same_for_the_same(
     run_state_machine_as_test(
         Both, settings=settings(max_examples=examples, stateful_step_count=8, deadline=None)
     )
+
+
+def test_a_store_of_an_earlier_program_gets_the_tables_that_it_lacks(postgres: PostgresServer) -> None:
+    address = postgres.database()
+    store = open_store(address)
+    store.apply(MAP, 5, [entry(1)])
+    store.close()
+    with psycopg.connect(address) as connection:
+        connection.execute("DROP TABLE mapweave.unverified")
+    store = open_store(address)
+    assert store.watermark(MAP) == 1 and store.unverified(MAP) is None
+    store.close()
 
 
 def test_two_servers_share_a_store(postgres: PostgresServer) -> None:

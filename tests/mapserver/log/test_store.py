@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.sqlite_store import SqliteStore
@@ -262,6 +263,35 @@ def test_what_is_pruned_is_gone_and_is_not_taken_again(
         assert store.apply(MAP, 5, log).changes == (), "a robot that sends all again changes nothing"
         store.close()
         store = open_store(place)
+    store.close()
+
+
+def test_what_a_lost_retirement_undid_goes_when_the_robot_has_dropped_it(place: Path | str) -> None:
+    store = open_store(place)
+    bodies: list[ChangeBody] = [
+        node_put(1, 3),
+        node_put(2, 5),
+        edge_put(11, 1, 2),
+        node_put(2, 4),
+        node_put(3, 2),
+        edge_put(11, 1, 3),
+    ]
+    store.apply(MAP, 5, [entry(k, body) for k, body in enumerate(bodies, 1)], 8)
+    assert store.unverified(MAP) is None
+    whole = store.restore(MAP, 7, 7, [entry(7, node_put(4, 1))])
+    assert [change.sequence for change in whole] == [7] and store.unverified(MAP) is None
+    assert list(store.restore(MAP, 8, 8, [])) == []
+    assert store.unverified(MAP) == Gap(MAP, 1, 7), "the robot has no change 8 any more"
+    # Node 2 is retired; of edge 11 the later form is there.
+    assert [change.body for change in store.verify(MAP, 1, 4, {1})] == [NodeRetired(NodeId(*MAP, 2))]
+    for _ in range(2):
+        assert store.unverified(MAP) == Gap(MAP, 5, 7) and store.unverified(OTHER) is None
+        assert sequences(store) == [1, 5, 6, 7] and store.landmarks(NodeId(*MAP, 2)) is None
+        store.close()
+        store = open_store(place)
+    assert [change.body for change in store.verify(MAP, 5, 7, {5, 7})] == [EdgeRetired(EdgeId(*MAP, 11))]
+    assert store.unverified(MAP) is None and sequences(store) == [1, 5, 7]
+    assert store.kept("r0") == {MAP: (3, 6)} and store.traffic(MAP).edge_puts == 0
     store.close()
 
 
