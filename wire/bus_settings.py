@@ -15,7 +15,7 @@ RETRY_FIRST = 0.1
 RETRY_LONGEST = 1.0
 """Longest pause between attempts to connect, s."""
 NEXT_ENDPOINT = 2.0
-"""s that a client with several endpoints spends on one of them. A router gives a handshake as long."""
+"""s that a client with several endpoints spends on one of them."""
 LEASE = 2.5
 """After what silence a participant counts as dead, s: clients of a silent router go to another one."""
 AGENT_LEASE = 10.0

@@ -9,11 +9,12 @@ from collections.abc import Callable
 
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.wire.bus import Bus
+from mapweave.wire.bus_settings import AGENT_LEASE
 from mapweave.wire.keys import Keys
 
 LEAVING = 4.0
 """s; an agent whose process has ended has left the network by then. One that hangs, or has lost the network,
-leaves after 10 s."""
+leaves after `AGENT_LEASE`."""
 SETTLING = 0.5
 """s; liveliness of an agent that starts at the same time arrives within this time."""
 
@@ -78,4 +79,7 @@ class Claim:
             return self._changed.wait_for(free, patience)
 
     def _refusal(self) -> DeviceError:
-        return DeviceError(f"another agent drives {self._robot}; stop it, or give this robot another name")
+        return DeviceError(
+            f"another agent drives {self._robot}; stop it, or give this robot another name. One that hangs, or "
+            f"has lost the network, is gone after {AGENT_LEASE:g} s"
+        )

@@ -85,7 +85,8 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path:
         second = agent("second")
         assert second.process.wait(40) == 1
         assert second.said.read_text().splitlines()[-1] == (
-            "mapweave: another agent drives r0; stop it, or give this robot another name"
+            "mapweave: another agent drives r0; stop it, or give this robot another name. "
+            "One that hangs, or has lost the network, is gone after 10 s"
         )
         assert not (tmp_path / "second.log").exists()
         assert not (tmp_path / "second").exists()

@@ -25,6 +25,8 @@ class TwoWheels:
         self._lock = threading.Lock()
         self._since = time.monotonic()
         self.speeds = (0.0, 0.0)
+        self.commanded: list[tuple[float, float]] = []
+        """All speeds so far."""
         self._way = (0.0, 0.0)
         self.stopped_at = self._since
 
@@ -35,6 +37,7 @@ class TwoWheels:
             if (left, right) == (0.0, 0.0) != self.speeds:
                 self.stopped_at = self._since
             self.speeds = (left, right)
+            self.commanded.append(self.speeds)
 
     def way(self) -> tuple[float, float]:
         """m, of each wheel so far."""
