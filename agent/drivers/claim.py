@@ -80,6 +80,6 @@ class Claim:
 
     def _refusal(self) -> DeviceError:
         return DeviceError(
-            f"another agent drives {self._robot}; stop it, or give this robot another name. One that hangs, or "
-            f"has lost the network, is gone after {AGENT_LEASE:g} s"
+            f"another agent drives {self._robot}; stop it, or give this robot another name. "
+            f"One that hangs, or has lost the network, is gone after {AGENT_LEASE:g} s"
         )

@@ -131,7 +131,7 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
 
 @pytest.mark.parametrize("seed", first_quick(range(20), 3))
 def test_what_a_lost_change_retired_stays_retired(whole: Path, fleet: Fleet, seed: int) -> None:
-    """Robots have dropped such changes together with what they undid: nobody has them any more."""
+    """Robots have dropped such changes together with what they undid: no disk has them any more."""
     _, maps = truth(whole)
     rng = np.random.default_rng(2000 + seed)
     disk = sqlite3.connect(fleet.path)
