@@ -224,7 +224,7 @@ class ZenohBus:
             self._in_use_changed.wait_for(lambda: self._in_use == 0)
         self._publishers = Publishers()
         if session is not None:
-            session.close()  # type: ignore[no-untyped-call]
+            _end(session)
 
     def _watch_links(self, session: zenoh.Session) -> None:
         """Log who connects, and who is denied everything."""
@@ -314,12 +314,22 @@ class ZenohBus:
                         self._session = session
                         self.owner.heard()
                         return
-                    except NotConnected:
-                        # The interpreter is ending; then no caller waits for this bus.
-                        if threading.main_thread().is_alive():
-                            raise
-            session.close()  # type: ignore[no-untyped-call]
-            return
+                    except NotConnected as error:
+                        log.warning("connected, and then: %s; trying again", error)
+                        for declared in self.owner.declared:
+                            declared.detach()
+            _end(session)
+            # While the interpreter is ending no caller waits for this bus.
+            if not threading.main_thread().is_alive():
+                return
+            self._closed.wait(RETRY_LONGEST)
+
+
+def _end(session: zenoh.Session) -> None:
+    try:
+        session.close()  # type: ignore[no-untyped-call]
+    except zenoh.ZError as error:
+        log.debug("closing a session: %s", error)
 
 
 def _open_router(settings: BusSettings) -> zenoh.Session:

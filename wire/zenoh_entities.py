@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -95,7 +96,8 @@ class Declared:
         """Take it back from a session that ends, to be declared in the next; with the owner's lock held."""
         entity, self._entity = self._entity, None
         if entity is not None:
-            entity.undeclare()
+            with suppress(zenoh.ZError):  # a session that has ended has taken it back
+                entity.undeclare()
 
     def wanted(self) -> bool:
         """Whether handlers may still be called."""

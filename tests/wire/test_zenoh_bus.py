@@ -7,13 +7,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
+import zenoh
 
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire.bus import Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
+from mapweave.wire.zenoh_entities import Subscription
 from tests.waiting import eventually, free_port
 from tests.wire.fleets import ZenohFleet
 
@@ -33,6 +36,30 @@ def test_a_client_may_come_before_its_router() -> None:
         assert client.wait_connected(30)
         eventually(lambda: router.publish("a", b"found") or got)
         assert {s.payload for s in got} == {b"found"}
+    finally:
+        client.close()
+        router.close()
+
+
+def test_a_client_whose_session_breaks_while_it_declares_connects_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    declare, broken = Subscription._declare_in, iter([True])
+
+    def declare_in(subscription: Subscription, session: zenoh.Session) -> Any:
+        if next(broken, False):
+            raise zenoh.ZError("the transport is closed")
+        return declare(subscription, session)
+
+    monkeypatch.setattr(Subscription, "_declare_in", declare_in)
+    endpoints = (f"tcp/127.0.0.1:{free_port()}",)
+    client = ZenohBus(BusSettings(endpoints=endpoints))
+    got: list[Sample] = []
+    client.subscribe("a", got.append)
+    router = ZenohBus(BusSettings(mode="router", listen=endpoints))
+    try:
+        eventually(lambda: router.publish("a", b"found") or got)
+        assert "the transport is closed; trying again" in caplog.text
     finally:
         client.close()
         router.close()
