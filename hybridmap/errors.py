@@ -4,6 +4,10 @@
 class MapweaveError(Exception):
     """Anything a user can mend. Caught once, in the command line, and printed as one line."""
 
+    def __str__(self) -> str:
+        """One line, whatever a library or a file has contributed to the words."""
+        return " ".join(line.strip() for line in super().__str__().splitlines())
+
 
 class InvalidValue(MapweaveError):
     """A value is out of range, not finite, or of the wrong shape."""

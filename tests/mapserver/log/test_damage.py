@@ -198,6 +198,20 @@ def test_a_damaged_schema_that_is_no_text_is_reported_in_one_line(whole: Path, f
     assert "\n" not in str(caught.value)
 
 
+def test_a_damaged_schema_with_a_line_break_is_reported_in_one_line(fleet: Fleet) -> None:
+    """SQLite quotes it as it is; found by fuzzing a journal."""
+    path = fleet.folder / "r0"
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+    connection.close()
+    data = path.read_bytes()
+    assert data.count(b"server TEXT NOT NULL") == 1
+    path.write_bytes(data.replace(b"server TEXT NOT NULL", b'server TEXT NOT "\nLL'))
+    with pytest.raises(InvalidFile, match="agent journal is damaged") as caught:
+        Journal(path)
+    assert "\n" not in str(caught.value)
+
+
 def test_the_state_of_a_log_may_be_lost(whole: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
     """Its robot may not be there: its map is served all the same, and its log goes on when it comes."""
     logs, maps = truth(whole)
