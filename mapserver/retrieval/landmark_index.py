@@ -17,6 +17,7 @@ import numpy as np
 from mapweave.mapserver.retrieval.coarse_quantizer import SAMPLE, CoarseQuantizer, Codes, Ids, Vectors
 from mapweave.mapserver.retrieval.flat_landmarks import FlatLandmarks
 from mapweave.mapserver.retrieval.inverted_file import Block, InvertedFile
+from mapweave.mapserver.retrieval.shared_lock import SharedLock
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ class LandmarkIndexSettings:
     exact: int = 30_000
     growth: float = 4.0
     probes: int = 8
-    patience: int = 1_000_000
+    patience: int = 100_000
 
 
 class AddedRows(NamedTuple):
@@ -72,12 +73,12 @@ class LandmarkIndex:
     """Codes with ids. Ids rise: what comes later has greater ones.
 
     Attributes:
-        lock: of all that is in it; may be taken again by who holds it.
+        lock: of all that is in it.
     """
 
     def __init__(self, settings: LandmarkIndexSettings | None = None) -> None:
         """Start empty."""
-        self.lock = threading.RLock()
+        self.lock = SharedLock()
         self._settings = settings or LandmarkIndexSettings()
         self._flat: FlatLandmarks | None = FlatLandmarks()
         self._cells: InvertedFile | None = None
@@ -106,7 +107,7 @@ class LandmarkIndex:
         """Take in (N, 32) codes with (N,) ids."""
         if not len(codes):
             return
-        with self.lock:
+        with self.lock.writing():
             self._end = int(ids[-1]) + 1
             if self._learner is not None:
                 self._missed.append(AddedRows(codes, ids))
@@ -118,7 +119,7 @@ class LandmarkIndex:
 
     def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
         """Forget the ids from first to last, that one left out; quickly, if all their codes are known."""
-        with self.lock:
+        with self.lock.writing():
             if self._learner is not None:
                 self._missed.append(RemovedRows(first, last, codes))
             if self._flat is not None:
@@ -128,7 +129,7 @@ class LandmarkIndex:
 
     def nearest(self, codes: Codes, k: int) -> tuple[Vectors, Ids]:
         """(N, k) squared distances and ids of the nearest landmarks, nearest first; id -1 is none."""
-        with self.lock:
+        with self.lock.reading():
             return self._landmarks.nearest(codes, max(min(k, len(self)), 1), self._settings.probes)
 
     def within(self, codes: Codes, reach: float) -> tuple[Ids, Vectors, Ids] | None:
@@ -137,14 +138,14 @@ class LandmarkIndex:
         Returns:
             None if there are too many landmarks for that.
         """
-        with self.lock:
+        with self.lock.reading():
             if self._flat is None:
                 return None
             return self._flat.within(codes, reach, MOST_WITHIN)
 
     def keep_up(self) -> None:
         """Wait for the training of cells if too many landmarks have come since: they are kept twice."""
-        with self.lock:
+        with self.lock.reading():
             missed = sum(len(change.ids) for change in self._missed if isinstance(change, AddedRows))
         if missed > self._settings.patience:
             self.settle()
@@ -161,12 +162,12 @@ class LandmarkIndex:
 
     def contents(self, size: int = AT_ONCE) -> tuple[CoarseQuantizer | None, Iterator[Block]]:
         """What the cells are about, None without cells, and the landmarks in just these, see `blocks`."""
-        with self.lock:
+        with self.lock.reading():
             return self.means, self._in_turn(self._landmarks.blocks(size))
 
     def _in_turn(self, blocks: Iterator[Block]) -> Iterator[Block]:
         while True:
-            with self.lock:
+            with self.lock.reading():
                 block = next(blocks, None)
             if block is None:
                 return
@@ -178,7 +179,7 @@ class LandmarkIndex:
         for block in blocks:
             cells.put(block)
             end = max(end, int(block.ids.max(initial=-1)) + 1)
-        with self.lock:
+        with self.lock.writing():
             if len(cells) <= self._settings.exact:
                 self._flat = FlatLandmarks()
                 for block in cells.blocks(AT_ONCE):
@@ -204,7 +205,7 @@ class LandmarkIndex:
         try:
             cells = self._new(n, end)
             while True:
-                with self.lock:
+                with self.lock.writing():
                     missed, self._missed = self._missed, []
                     if not missed:
                         self._swap(cells)
@@ -213,7 +214,7 @@ class LandmarkIndex:
                 _catch_up(cells, missed)
         except Exception:  # the old cells go on serving, more slowly
             log.exception("the place index could not be made faster")
-            with self.lock:
+            with self.lock.writing():
                 self._learner, self._missed = None, []
 
     def _new(self, n: int, end: int) -> InvertedFile:

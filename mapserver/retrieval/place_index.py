@@ -49,8 +49,8 @@ class PlaceIndexSettings:
 class PlaceIndex:
     """Nodes by the descriptors of their landmarks. A node is searchable as soon as it is added.
 
-    One thread may fill it while others search. It is locked for a search, or for a few nodes that come. Who
-    announces nodes does not wait for that: they are taken in by the next who locks it.
+    One thread may fill it while others search, each at the same time as others. Who announces nodes waits for
+    no search: they are taken in by the next who searches while no other does, or who fills.
     """
 
     def __init__(self, settings: PlaceIndexSettings | None = None) -> None:
@@ -112,7 +112,7 @@ class PlaceIndex:
         rest = iter(nodes)
         while some := list(islice(rest, AT_ONCE)):
             self._landmarks.keep_up()
-            with self._current():
+            with self._current(fills=True):
                 self._take(some)
 
     def remove(self, node_id: NodeId, codes: NDArray[np.uint8] | None = None) -> None:
@@ -122,7 +122,7 @@ class PlaceIndex:
             node_id: which.
             codes: (N, 32) of its landmarks, if they are known: they give its cells.
         """
-        with self._current():
+        with self._current(fills=True):
             slot = self._slots.pop(node_id, None)
             if slot is not None:
                 seal = self._prints.pop(slot)
@@ -237,16 +237,25 @@ class PlaceIndex:
         return {candidate.id: value for candidate, value in zip(known, values, strict=True) if value}
 
     @contextmanager
-    def _current(self) -> Iterator[None]:
-        """Lock the index, with all nodes in it that were announced."""
-        with self._lock:
-            while self._announced:
-                node = self._announced.popleft()
-                try:
-                    self._take([node])
-                except Exception:  # it is put once more by who merges
-                    log.exception("node %s cannot be found yet", node.id)
+    def _current(self, fills: bool = False) -> Iterator[None]:
+        """Lock the index to search or to fill it, with the nodes in it that were announced."""
+        if fills or self._announced:
+            with self._lock.writing(wait=fills) as alone:
+                if alone:
+                    self._take_announced()
+                if fills:
+                    yield
+                    return
+        with self._lock.reading():
             yield
+
+    def _take_announced(self) -> None:
+        while self._announced:
+            node = self._announced.popleft()
+            try:
+                self._take([node])
+            except Exception:  # it is put once more by who merges
+                log.exception("node %s cannot be found yet", node.id)
 
     def settle(self) -> None:
         """Wait until cells that are being learned are in use."""

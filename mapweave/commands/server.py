@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,9 @@ from mapweave.extras import need
 
 DATA = Path("out/server")
 DEMO_HTTP = "8080"
+TURN = 0.001
+"""s, for which a thread has the interpreter while another waits. A question lets go of it twenty times, and then waited
+for merging for Python's own 5 ms each time."""
 LARGE = 20_000_000
 """Bytes of a store whose reading is announced, since it takes long."""
 
@@ -89,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     # Lines have dates, so that a log shows when two maps came apart.
     log_with_time(arguments.log_format)
+    sys.setswitchinterval(TURN)
     for part in ("mapweave.mapserver", "mapweave.wire"):
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)

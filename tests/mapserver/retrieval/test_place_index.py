@@ -1,6 +1,7 @@
 """The place index against exhaustive search."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -296,13 +297,23 @@ def test_who_announces_a_node_does_not_wait_for_a_search(
 ) -> None:
     _, nodes, _ = building
     index = filled(nodes[:5])
-    with index.landmarks.lock:
+    with index.landmarks.lock.reading():
         announcing = threading.Thread(target=lambda: [index.announce(node) for node in nodes[5:]])
         announcing.start()
         announcing.join(10.0)
         assert not announcing.is_alive()
     assert nodes[-1].id in index and len(index) == len(nodes)
     assert index.overlaps(nodes[0], {}.get) == filled(nodes).overlaps(nodes[0], {}.get)
+
+
+def test_a_search_waits_for_no_other(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    index, (view, _) = filled(nodes[:5]), take_view(world, tour[0], np.random.default_rng(4))
+    index.announce(nodes[5])
+    with index.landmarks.lock.reading(), ThreadPoolExecutor(1) as pool:
+        assert pool.submit(index.query, view, 1).result(10.0)[0][0] == nodes[0].id
+        assert not pool.submit(lambda: nodes[5].id in index).result(10.0), "taken in when no search runs"
+    assert nodes[5].id in index
 
 
 def test_a_node_that_cannot_be_taken_in_spoils_no_search(
