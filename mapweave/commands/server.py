@@ -27,8 +27,8 @@ from mapweave.extras import need
 DATA = Path("out/server")
 DEMO_HTTP = "8080"
 TURN = 0.001
-"""s, for which a thread has the interpreter while another waits. A question lets go of it twenty times, and then waited
-for merging for Python's own 5 ms each time."""
+"""s, for which a thread has the interpreter while another waits. A question lets go of it twenty times, and
+waited 5 ms for the merge each time, which is Python's own."""
 LARGE = 20_000_000
 """Bytes of a store whose reading is announced, since it takes long."""
 
