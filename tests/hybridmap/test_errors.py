@@ -1,4 +1,4 @@
-"""What users are told."""
+"""Errors, as users read them."""
 
 from hypothesis import given
 from hypothesis import strategies as st
