@@ -143,11 +143,13 @@ class WholeBag:
             Exception: whatever a damaged file leads to.
         """
         from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
 
         from mapweave.wire.ros2.messages import typestore
 
         self._reader = AnyReader([path], default_typestore=typestore())
         self._reader.open()
+        self._standard = typestore() if self._reader.is2 else get_typestore(Stores.ROS1_NOETIC)
         weakref.finalize(owner, self._reader.close)
         self.topics: dict[str, tuple[str, int]] = {}
         for connection in self._reader.connections:
@@ -163,8 +165,34 @@ class WholeBag:
         connections = [c for c in self._reader.connections if c.topic == topic]
         if not connections:
             return
+        for kind in {connection.msgtype for connection in connections}:
+            self._check_fields(kind)
         for connection, arrived, data in self._reader.messages(connections):
             yield arrived, self._reader.deserialize(data, connection.msgtype)
+
+    def _check_fields(self, kind: str) -> None:
+        """A bag has its own definitions of the types: they may lack what the standard has.
+
+        Raises:
+            DeviceError: a field is missing, or of another type.
+        """
+        checked, left = set[str](), [kind]
+        while left:
+            if (one := left.pop()) in checked or one not in self._standard.fielddefs:
+                continue
+            checked.add(one)
+            given = dict(self._reader.typestore.fielddefs[one][1])
+            for name, form in self._standard.fielddefs[one][1]:
+                if given.get(name) != form:
+                    raise DeviceError(f"in this bag, {one} has no field {name} as ROS defines it")
+                left += _names_in(form)
+
+
+def _names_in(form: Any) -> list[str]:
+    """The types of messages in the type of a field, see `rosbags.typesys.base.Nodetype`."""
+    if isinstance(form, str):
+        return [form] if "/" in form else []
+    return [name for part in form for name in _names_in(part)] if isinstance(form, tuple) else []
 
 
 def parts_of(path: Path) -> list[Path]:

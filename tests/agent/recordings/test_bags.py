@@ -157,6 +157,21 @@ def test_a_single_mcap_file_is_read_without_its_folder(drive: Drive, tmp_path: P
     assert len(recording) == COUNT
 
 
+def test_a_bag_whose_own_types_lack_a_field_is_refused_in_one_line(drive: Drive, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive", drive)
+    (file,) = (tmp_path / "drive").glob("*.mcap")
+    data = file.read_bytes()
+    for field, other in (
+        (b"string child_frame_id", b"string child_frame_ix"),
+        (b"uint32 width", b"string width"),
+    ):
+        assert field in data
+        file.write_bytes(data.replace(field, other))
+        name = field.decode().split()[1]
+        with pytest.raises(DeviceError, match=f"in this bag, .* has no field {name} as ROS defines it"):
+            open_recording(file, RecordingOptions(camera_height=0.3))
+
+
 def test_topics_are_named_by_the_person_or_guessed(drive: Drive, tmp_path: Path) -> None:
     write_bag(tmp_path / "drive", drive, odom="/ground_truth/odom")
     height = 0.3
