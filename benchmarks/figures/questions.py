@@ -250,7 +250,7 @@ LIFE = Question(
         ),
         Row(
             "views answered rightly from the first drive, from the active nodes, from all nodes",
-            "{recall_first:.0%}, {recall_after:.0%}, {recall_all_nodes:.0%}",
+            "{recall_after_1:.0%}, {recall_after:.0%}, {recall_all_nodes:.0%}",
             "life",
         ),
     ),
