@@ -11,6 +11,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -30,6 +31,9 @@ INTERVAL = 0.25
 SQLITE = "sqlite"
 PATIENCE = 20.0
 """s for a process to end in order."""
+NO_DATABASE = "the map store cannot be used"
+RESTART = 2.0
+"""s after which a server that found no database is started again, as its systemd unit has it."""
 
 
 class FleetProcesses:
@@ -60,6 +64,7 @@ class FleetProcesses:
         self._commands |= {name: self._server(name) for name in SERVERS}
         self._commands |= {name: self._router(name) for name in ROUTERS}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._ended_at: dict[str, float] = {}
 
     def __enter__(self) -> FleetProcesses:
         """Nothing runs yet."""
@@ -87,6 +92,7 @@ class FleetProcesses:
         if name == DATABASE and self._postgres is not None:
             self._postgres.start()
             return
+        self._ended_at.pop(name, None)
         with (self.folder / f"{name}.log").open("ab") as output:
             self._running[name] = subprocess.Popen(
                 self._commands[name], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT,
@@ -119,11 +125,17 @@ class FleetProcesses:
             raise ChildFailed(f"{name} ended with status {process.returncode}: {self._last_line(name)}")
 
     def check(self) -> None:
-        """Raise ChildFailed if a process has ended by itself, other than a robot that is done."""
+        """Raise ChildFailed if a process has ended by itself, other than a robot that is done.
+
+        A server that began while the database was down is started again.
+        """
         done = (self.folder / ENOUGH).exists()
-        for name, process in self._running.items():
-            status = process.poll()
-            if status is not None and not (done and status == 0 and name in self.agents):
+        for name, process in tuple(self._running.items()):
+            status, now = process.poll(), time.monotonic()
+            if status == 1 and name in SERVERS and NO_DATABASE in self._last_line(name):
+                if now > self._ended_at.setdefault(name, now) + RESTART:
+                    self.start(name)
+            elif status is not None and not (done and status == 0 and name in self.agents):
                 raise ChildFailed(f"{name} ended with status {status}: {self._last_line(name)}")
 
     def done(self) -> bool:
