@@ -49,8 +49,9 @@ export class Painter {
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     for (const overlay of this.overlays) overlay(c, v, this.model);
     this.marks(c);
-    this.names(c);
-    for (const robot of this.robots) this.drawRobot(c, robot);
+    const labels = this.labels(c);
+    this.names(c, labels);
+    labels.forEach((label, k) => this.drawRobot(c, this.robots[k], label));
     this.rule(c);
   }
   refresh() {
@@ -152,7 +153,7 @@ export class Painter {
     }
   }
   // Names of nodes where they fit; of components where there are several.
-  names(c) {
+  names(c, labels) {
     const { model: m, viewport: v } = this, taken = [];
     const free = (u, w, wide) => {
       const box = [u, w - 11, u + wide, w + 3];
@@ -161,7 +162,7 @@ export class Painter {
       return taken.push(box);
     };
     c.textBaseline = "alphabetic";
-    for (const robot of this.robots) free(...Object.values(this.label(c, robot)));
+    for (const { left, base, wide } of labels) free(left, base, wide);
     c.font = "12px system-ui, sans-serif";
     if (m.components.length > 1) {
       m.components.forEach(({ anchor }, k) => {
@@ -181,13 +182,25 @@ export class Painter {
       if (taken.length < 400 && free(u + 9, w - 4, 6.2 * text.length)) c.fillText(text, u + 9, w - 4);
     }
   }
-  label(c, robot) {
+  // Robots' labels: above, or below, or the name alone, where no other robot's is.
+  labels(c) {
+    const taken = [];
+    for (const robot of this.robots) {
+      const choices = [[words(robot), -10], [words(robot), 20], [robot.name, -10], [robot.name, 20]]
+        .map(([text, below]) => this.label(c, robot, text, below));
+      const clear = one => !taken.some(other => Math.abs(other.base - one.base) < 14
+        && other.left < one.left + one.wide && one.left < other.left + other.wide);
+      taken.push((taken.length < 200 && choices.find(clear)) || choices[2]);
+    }
+    return taken;
+  }
+  label(c, robot, text, below) {
     const { viewport: v } = this, [u, w] = v.toScreen(robot.x, robot.y);
     c.font = "600 12px system-ui, sans-serif";
-    const wide = c.measureText(words(robot)).width, beyond = u + 14 + wide > v.width && u < v.width;
-    return { left: beyond ? u - 14 - wide : u + 14, base: w - 10, wide };
+    const wide = c.measureText(text).width, beyond = u + 14 + wide > v.width && u < v.width;
+    return { text, left: beyond ? u - 14 - wide : u + 14, base: w + below, wide };
   }
-  drawRobot(c, robot) {
+  drawRobot(c, robot, { text, left, base }) {
     const { viewport: v } = this, colour = robot.alive ? colours.robot : colours.soft;
     const [u, w] = v.toScreen(robot.x, robot.y);
     c.save();
@@ -203,9 +216,9 @@ export class Painter {
     c.fillStyle = colour; c.fill();
     c.strokeStyle = robot.name === this.robot ? colours.select : colours.ground; c.lineWidth = 2; c.stroke();
     c.restore();
-    const { left, base } = this.label(c, robot);
-    c.lineWidth = 3; c.strokeStyle = colours.ground; c.strokeText(words(robot), left, base);
-    c.fillStyle = colour; c.fillText(words(robot), left, base);
+    c.font = "600 12px system-ui, sans-serif";
+    c.lineWidth = 3; c.strokeStyle = colours.ground; c.strokeText(text, left, base);
+    c.fillStyle = colour; c.fillText(text, left, base);
   }
   // A ruler of a round length.
   rule(c) {

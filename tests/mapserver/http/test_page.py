@@ -101,3 +101,19 @@ def test_a_busy_server_is_asked_again(page: Browser, services: StubServices, ima
     eventually(lambda: "waiting" in page.run(RESULT))
     services.refusal = None
     eventually(lambda: page.run(KIND) == "found")
+
+
+@pytest.mark.parametrize(("robots", "gap"), [(2, 0.0), (4, 40.0)])
+def test_labels_of_robots_do_not_lie_on_each_other(page: Browser, robots: int, gap: float) -> None:
+    """Robots so many px apart."""
+    overlaps = page.run(f"""
+        const p = mapweave.painter;
+        p.robots = [...Array({robots}).keys()].map(k => {{
+          const [x, y] = p.viewport.toPlane(100 + {gap} * k, 200);
+          return {{ name: `r${{k}}`, doing: "driving", alive: true, x, y, heading: 0 }};
+        }});
+        const labels = p.labels(p.canvas.getContext("2d"));
+        return labels.map((a, k) => labels.slice(k + 1).filter(b => Math.abs(a.base - b.base) < 12
+          && a.left < b.left + b.wide && b.left < a.left + a.wide).length)
+    """)
+    assert overlaps == [0] * robots
