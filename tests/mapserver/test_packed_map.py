@@ -88,8 +88,9 @@ def test_the_same_map_is_packed_once(served: Served) -> None:
 def test_a_crowd_costs_two_packs_at_most(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     served.go_on.clear()
     with ThreadPoolExecutor(20) as pool:
-        asked = [pool.submit(served.ask, MAP) for _ in range(20)]
+        asked = [pool.submit(served.ask, MAP)]
         eventually(lambda: served.packs == 1)
+        asked += [pool.submit(served.ask, MAP) for _ in range(19)]
         services = served.server._services._map
         eventually(lambda: len(services._waiting) == 19)
         monkeypatch.setattr(packed_map, "MAX_WAITING", 19)
