@@ -62,8 +62,9 @@ class Fuzzing:
         try:
             self._target.run(data, self._work)
             self.counts["accepted"] += 1
-        except MapweaveError:
-            pass
+        except MapweaveError as error:
+            if "\n" in str(error):
+                self._found("crashes", data, error)
         except TimeoutError as error:
             self._found("hangs", data, error)
         except AcceptedInvalid as error:

@@ -15,12 +15,21 @@ from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.pose import Pose2
 
 
+class TwoLines(InvalidMessage):
+    """An error that does not keep to one line."""
+
+    def __str__(self) -> str:
+        return "one\ntwo"
+
+
 def test_what_is_wrong_is_found_and_sorted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "SLOW", 0.05)
 
     def decode(data: bytes, _: Path) -> None:
         if data == b"refuse":
             raise InvalidMessage("one line")
+        if data == b"two lines":
+            raise TwoLines
         if data == b"crash":
             raise KeyError("x")
         if data == b"invalid":
@@ -29,13 +38,13 @@ def test_what_is_wrong_is_found_and_sorted(tmp_path: Path, monkeypatch: pytest.M
             pass
 
     fuzzing = process.Fuzzing(SimpleNamespace(run=decode), tmp_path)
-    for data in (b"fine", b"refuse", b"crash", b"crash", b"invalid", b"hang"):
+    for data in (b"fine", b"refuse", b"crash", b"crash", b"two lines", b"invalid", b"hang"):
         fuzzing.one(data)
     fuzzing.write()
     counts = json.loads((tmp_path / "counts.json").read_text())
     assert counts.pop("peak_rss_mb") > 0
-    assert counts == {"inputs": 6, "accepted": 1, "crashes": 1, "hangs": 1, "accepted_invalid": 1}
-    assert {path.read_bytes() for path in tmp_path.glob("crashes-????????????")} == {b"crash"}
+    assert counts == {"inputs": 7, "accepted": 1, "crashes": 2, "hangs": 1, "accepted_invalid": 1}
+    assert {path.read_bytes() for path in tmp_path.glob("crashes-????????????")} == {b"crash", b"two lines"}
 
 
 def test_an_invalid_value_is_noticed() -> None:
