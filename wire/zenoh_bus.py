@@ -315,7 +315,8 @@ class ZenohBus:
                         self.owner.heard()
                         return
                     except NotConnected as error:
-                        log.warning("connected, and then: %s; trying again", error)
+                        if threading.main_thread().is_alive():
+                            log.warning("connected, and then: %s; trying again", error)
                         for declared in self.owner.declared:
                             declared.detach()
             _end(session)
