@@ -358,7 +358,9 @@ class Ingest:
             self._acks.refuse(map_id, log_id, reason)
             return None
         if agent_log is None or (agent_log.log_id != log_id and agent_log.watermark == 0):
+            unverified = agent_log.unverified if agent_log is not None else None
             agent_log = AgentLog(map_id, log_id, self._settings.pull)
+            agent_log.unverified = unverified
             self._logs.add(agent_log)
         if agent_log.log_id == log_id:
             if forgotten := self._logs.heard(agent_log):

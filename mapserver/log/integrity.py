@@ -165,8 +165,15 @@ def _between(
 
 
 def _restart_logs(connection: sqlite3.Connection) -> None:
-    """A map of which it is not known any more how far its log came is pulled from the beginning."""
-    query = "SELECT DISTINCT agent, epoch FROM change EXCEPT SELECT agent, epoch FROM log"
-    for agent, epoch in connection.execute(query).fetchall():
+    """A map of which it is not known any more how far its log came is pulled from the beginning.
+
+    A retirement behind what is left of the log may be lost with the position, so all of it is unverified.
+    """
+    query = (
+        "SELECT agent, epoch, max(sequence) FROM change GROUP BY agent, epoch "
+        "HAVING NOT EXISTS (SELECT 1 FROM log WHERE log.agent = change.agent AND log.epoch = change.epoch)"
+    )
+    for agent, epoch, last in connection.execute(query).fetchall():
         insert(connection, "log", (agent, epoch, "0", 0))
+        insert(connection, "unverified", (agent, epoch, 1, last))
         log.error("the position of %s.%s was damaged; its log is pulled from the beginning", agent, epoch)

@@ -129,8 +129,11 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
     fleet.stop_server()
 
 
+@pytest.mark.parametrize("position_lost", [False, True])
 @pytest.mark.parametrize("seed", first_quick(range(20), 3))
-def test_what_a_lost_change_retired_stays_retired(whole: Path, fleet: Fleet, seed: int) -> None:
+def test_what_a_lost_change_retired_stays_retired(
+    whole: Path, fleet: Fleet, seed: int, position_lost: bool
+) -> None:
     """Robots have dropped such changes together with what they undid: no disk has them any more."""
     _, maps = truth(whole)
     rng = np.random.default_rng(2000 + seed)
@@ -139,6 +142,8 @@ def test_what_a_lost_change_retired_stays_retired(whole: Path, fleet: Fleet, see
     rows = disk.execute(query, (seed % 2,)).fetchall()
     for k in rng.choice(len(rows), int(rng.integers(1, 9)), replace=False):
         disk.execute("UPDATE change SET crc = crc + 1 WHERE agent = ? AND sequence = ?", rows[k])
+    if position_lost:
+        disk.execute("UPDATE log SET crc = crc + 1")
     disk.commit()
     disk.close()
     fleet.start_server()
