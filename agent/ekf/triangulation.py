@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,10 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
 
 STEPS = 4
-"""Gauss-Newton steps after the linear solution that they start from."""
+"""Most Gauss-Newton steps after the linear solution that they start from."""
+
+SMALL_STEP = 0.01
+"""A step of less than this many standard deviations, for every track, is the last."""
 
 NEAREST = 1e-3
 """An observation from which the landmark would be nearer than this share of its depth is not used."""
@@ -66,20 +70,22 @@ def triangulate(
             f"triangulate: poses {poses.shape} and pixels {pixels.shape} do not belong together"
         )
     depth_by, right_by = _camera_motion(poses, poses[-1] if reference is None else reference, camera)
-    measured = (np.moveaxis(pixels, 0, 1) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    seen: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=2))
-    measured = np.where(seen[:, :, None], measured, 0.0)
+    right, down = ((pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(right) & np.isfinite(down))
+    right, down = np.where(seen, right, 0.0), np.where(seen, down, 0.0)
     enough = seen.sum(axis=1) >= 2
     solver = _Solver(depth_by, right_by, np.array([camera.fx, camera.fy]) / pixel_sigma)
-    # The linear solution is the step from (a, b, w) = 0 with the measured slopes in place of the expected.
-    rays = solver.step(np.zeros((len(seen), 3)), measured, measured, np.where(seen, 1.0, 0.0), linear=True)
+    rays = solver.start(right, down, seen)
     for _ in range(STEPS):
-        expected, weight = solver.expect(rays, seen)
-        rays = rays + solver.step(rays, measured, expected, weight)
-    expected, weight = solver.expect(rays, seen)
-    residual = (measured - expected) * (weight > 0)[:, :, None] * solver.precision
-    freedom = 2.0 * (weight > 0).sum(axis=1) - 3.0
-    total = np.square(residual).sum(axis=(1, 2))
+        rays = rays + solver.step(rays, right, down, seen)
+        if solver.largest_step < SMALL_STEP:
+            break
+    expected_right, expected_down, weight = solver.expect(rays, seen)
+    used = weight > 0
+    off_right = (right - expected_right) * used * solver.precision[0]
+    off_down = (down - expected_down) * used * solver.precision[1]
+    total = _over_images(off_right, off_right) + _over_images(off_down, off_down)
+    freedom = 2.0 * used.sum(axis=1) - 3.0
     chi2 = np.where(freedom > 0, total / np.where(freedom > 0, freedom, 1.0), np.nan)
     rays[~enough] = np.nan
     solver.covariances[~enough] = np.nan
@@ -87,11 +93,14 @@ def triangulate(
 
 
 class _Solver:
-    """Normal equations of all tracks.
+    """Normal equations of all tracks, summed over their observations without writing out the Jacobians.
+
+    Slopes right / depth and down / depth are arrays (N, T) each.
 
     Attributes:
         precision: (2,) of a slope.
         covariances: (N, 3, 3) of the last step.
+        largest_step: of any track in the last step, in standard deviations.
     """
 
     def __init__(self, depth_by: Array, right_by: Array, precision: Array) -> None:
@@ -99,37 +108,63 @@ class _Solver:
         self.right_by = right_by
         self.precision = precision
         self.covariances: Array = np.zeros((0, 3, 3))
+        self.largest_step = math.inf
 
-    def expect(self, rays: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Slopes (N, T, 2) expected, and 1 / depth (N, T), 0 for observations that are not used."""
+    def expect(self, rays: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+        """Slopes right and down expected, and 1 / depth, 0 for observations that are not used."""
         rotated = np.stack([np.ones(len(rays)), rays[:, 0], rays[:, 2]], axis=1)
         depth = rotated @ self.depth_by
         used = seen & (depth > NEAREST)
         weight = used / np.where(used, depth, 1.0)
-        expected = np.stack([rotated @ self.right_by, np.broadcast_to(rays[:, 1:2], depth.shape)], axis=-1)
-        return expected * weight[:, :, None], weight
+        return (rotated @ self.right_by) * weight, rays[:, 1:2] * weight, weight
 
-    def step(self, rays: Array, measured: Array, guess: Array, weight: Array, linear: bool = False) -> Array:
-        """Solve the normal equations: the rays (linear) or their correction, (N, 3)."""
-        n, t = weight.shape
-        d, r, g = self.depth_by, self.right_by, guess
-        jacobian = np.zeros((n, 2, t, 3))
-        jacobian[:, 0, :, 0] = r[1] - g[:, :, 0] * d[1]
-        jacobian[:, 0, :, 2] = r[2] - g[:, :, 0] * d[2]
-        jacobian[:, 1, :, 0] = -g[:, :, 1] * d[1]
-        jacobian[:, 1, :, 1] = 1.0
-        jacobian[:, 1, :, 2] = -g[:, :, 1] * d[2]
-        jacobian *= (weight[:, None] * self.precision[:, None])[..., None]
-        if linear:
-            goal = np.stack([g[:, :, 0] * d[0] - r[0], g[:, :, 1] * d[0]], axis=1) * weight[:, None]
-        else:
-            goal = np.swapaxes((measured - guess) * (weight > 0)[:, :, None], 1, 2)
-        flat = jacobian.reshape(n, 2 * t, 3)
-        transposed = np.swapaxes(flat, 1, 2)
+    def start(self, right: Array, down: Array, seen: NDArray[np.bool_]) -> Array:
+        """The linear solution, (N, 3): the step from (a, b, w) = 0 with the slopes as measured."""
+        weight = seen.astype(np.float64)
+        off_right = (right * self.depth_by[0] - self.right_by[0]) * weight
+        return self._solve(right, down, weight, off_right, down * self.depth_by[0] * weight)
+
+    def step(self, rays: Array, right: Array, down: Array, seen: NDArray[np.bool_]) -> Array:
+        """The correction of the rays by one Gauss-Newton step, (N, 3)."""
+        expected_right, expected_down, weight = self.expect(rays, seen)
+        used = weight > 0
+        off_right, off_down = (right - expected_right) * used, (down - expected_down) * used
+        return self._solve(expected_right, expected_down, weight, off_right, off_down)
+
+    def _solve(self, right: Array, down: Array, weight: Array, off_right: Array, off_down: Array) -> Array:
+        """Least squares for what is `off`, linearized at the slopes right and down."""
+        _, depth_by_a, depth_by_w = self.depth_by
+        _, right_by_a, right_by_w = self.right_by
+        by_right, by_down = self.precision
+        scaled = weight * by_right
+        right_a = (right_by_a - right * depth_by_a) * scaled
+        right_w = (right_by_w - right * depth_by_w) * scaled
+        down_b = weight * by_down
+        down_a, down_w = -down * depth_by_a * down_b, -down * depth_by_w * down_b
+        off_right, off_down = off_right * by_right, off_down * by_down
+        information = np.empty((len(right), 3, 3))
+        information[:, 0, 0] = _over_images(right_a, right_a) + _over_images(down_a, down_a)
+        information[:, 2, 2] = _over_images(right_w, right_w) + _over_images(down_w, down_w)
+        information[:, 1, 1] = _over_images(down_b, down_b)
+        information[:, 0, 1] = information[:, 1, 0] = _over_images(down_a, down_b)
+        information[:, 1, 2] = information[:, 2, 1] = _over_images(down_w, down_b)
+        mixed = _over_images(right_a, right_w) + _over_images(down_a, down_w)
+        information[:, 0, 2] = information[:, 2, 0] = mixed
         # The small prior only keeps tracks without parallax solvable: sigma 1e3 in slope and 1/m.
-        self.covariances = np.asarray(np.linalg.inv(transposed @ flat + 1e-6 * np.eye(3)), np.float64)
-        weighted = (goal * self.precision[:, None]).reshape(n, 2 * t, 1)
-        return (self.covariances @ (transposed @ weighted))[:, :, 0]
+        self.covariances = np.asarray(np.linalg.inv(information + 1e-6 * np.eye(3)), np.float64)
+        gradient = np.stack([
+            _over_images(right_a, off_right) + _over_images(down_a, off_down),
+            _over_images(down_b, off_down),
+            _over_images(right_w, off_right) + _over_images(down_w, off_down),
+        ], axis=1)  # fmt: skip
+        step: Array = (self.covariances @ gradient[:, :, None])[:, :, 0]
+        self.largest_step = math.sqrt(max(float(np.sum(step * gradient, axis=1).max(initial=0.0)), 0.0))
+        return step
+
+
+def _over_images(one: Array, other: Array) -> Array:
+    """Sum of products (N,) of two arrays (N, T)."""
+    return np.asarray(np.einsum("nt,nt->n", one, other), np.float64)
 
 
 def _camera_motion(poses: Array, reference: Array, camera: Camera) -> tuple[Array, Array]:

@@ -57,14 +57,17 @@ class TrackHistory:
             a track was not seen.
         """
         pixels = np.full((len(self._poses), len(ids), 2), np.nan)
-        order = np.argsort(ids)
-        sorted_ids = ids[order]
-        for row, (track_ids, at) in enumerate(zip(self._ids, self._pixels, strict=True)):
-            if not len(ids):
-                break
-            place = np.clip(np.searchsorted(sorted_ids, track_ids), 0, len(ids) - 1)
-            hit = sorted_ids[place] == track_ids
-            pixels[row, order[place[hit]]] = at[hit]
+        if len(ids) and self._poses:
+            # One table for all images: a search in each costs several times as much.
+            lowest, highest = int(ids.min()), int(ids.max())
+            column_of = np.full(highest - lowest + 1, -1, np.int64)
+            column_of[ids - lowest] = np.arange(len(ids))
+            seen = np.concatenate(self._ids)
+            row = np.repeat(np.arange(len(self._ids)), [len(track_ids) for track_ids in self._ids])
+            asked = np.flatnonzero((seen >= lowest) & (seen <= highest))
+            column = column_of[seen[asked] - lowest]
+            hit = asked[column >= 0]
+            pixels[row[hit], column[column >= 0]] = np.concatenate(self._pixels)[hit]
         poses = np.array([p.vector for p in self._poses]).reshape(-1, 3)
         return poses, pixels
 
