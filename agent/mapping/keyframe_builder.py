@@ -93,6 +93,7 @@ class KeyframeBuilder:
         self._last: AnchoredKeyframe | None = None
         self._next_number = next_number
         self._new: list[ChangeBody] = []
+        self._to_close: tuple[Node, NodeId | None] | None = None
         self._rng = np.random.default_rng(0)
 
     def recalibrate(self, description: RobotDescription, old_from_new: Pose2) -> None:
@@ -119,7 +120,7 @@ class KeyframeBuilder:
     def place(
         self, anchor: View, leaves: list[View], tracking: Tracking, trajectory: TrajectoryRecorder
     ) -> Node | None:
-        """Make nodes of an episode's views, edges between them and to the episode before, and loop closures.
+        """Make nodes of an episode's views, and edges between them and to the episode before.
 
         Args:
             anchor: the view where the episode began.
@@ -146,14 +147,29 @@ class KeyframeBuilder:
         Args:
             placed: at the current anchor.
         """
-        loops = self._close_loops(placed.node)
-        joined: list[Edge] = []
-        if self._last is not None and self._last.evidence and loops:
-            self._settle(placed, loops)
-        elif self._last is not None:
-            joined = [self._edge(self._last, placed, self._last.node_from_anchor)]
-        self._write(placed.node, *joined, *loops)
+        self.close_loops()
+        last = self._last
+        if last is not None and last.evidence:
+            loops = self._loops(placed.node, None)
+            if loops:
+                self._settle(placed, loops)
+            joined = loops or [self._edge(last, placed, last.node_from_anchor)]
+            self._write(placed.node, *joined)
+        else:
+            joined = [] if last is None else [self._edge(last, placed, last.node_from_anchor)]
+            self._write(placed.node, *joined)
+            self._to_close = placed.node, None if last is None else last.node.id
         self._last = placed
+
+    def close_loops(self) -> None:
+        """Put loop closures of the newest node into the map, if that is not done yet.
+
+        A tick of its own: what makes a node takes long enough.
+        """
+        if self._to_close is not None:
+            (node, before), self._to_close = self._to_close, None
+            if node.id in self.map.nodes:
+                self._write(*self._loops(node, before))
 
     def recognise(self, node: Node, view_tracks: NDArray[np.int64], recognition: Recognition) -> None:
         """The next episode begins at a view that shows a node of this map, however the robot came there.
@@ -294,14 +310,19 @@ class KeyframeBuilder:
         more = np.diag([position**2, position**2, heading**2])
         return PoseGaussian(moved.mean, moved.covariance + more)
 
-    def _close_loops(self, node: Node) -> list[Edge]:
-        """Recognise places of the own map (paper, section 5): each gives a new edge."""
+    def _loops(self, node: Node, before: NodeId | None) -> list[Edge]:
+        """Recognise earlier places of the own map (paper, section 5): each gives a new edge.
+
+        Args:
+            node: from which.
+            before: an earlier node to which it has an edge already.
+        """
         nearby = []
         for candidate in self.map.nodes.values():
             between = candidate.map_from_robot.mean.inverse() @ node.map_from_robot.mean
             reach = float(np.hypot(between.x, between.y))
-            joined = self._last is not None and candidate.id == self._last.node.id and not self._last.evidence
-            if not joined and reach < LOOP_REACH and abs(between.heading) < LOOP_TURN:
+            earlier = candidate.id < node.id and candidate.id != before
+            if earlier and reach < LOOP_REACH and abs(between.heading) < LOOP_TURN:
                 nearby.append((reach, candidate))
         edges: list[Edge] = []
         for _, candidate in sorted(nearby, key=lambda pair: pair[0])[:LOOP_TRIES]:

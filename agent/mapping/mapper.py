@@ -197,6 +197,7 @@ class Mapper:
 
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
+        self._keyframes.close_loops()
         self._use_extracted()
         self._tracking.step(observation)
         if self._tracking.acceptance.carried_off or self._tracking.disputed:

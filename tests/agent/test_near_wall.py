@@ -68,5 +68,5 @@ def test_a_loop_must_agree_with_the_way_there(monkeypatch, off, closed):
         node_from_robot=result, pairs=np.zeros((0, 2), np.int64), evidence={"sigma_xy": 0.02, "inliers": 29.0}
     )
     monkeypatch.setattr(keyframe_builder, "register", lambda *arguments: recognition)
-    edges = made._close_loops(node(5, later))
+    edges = made._loops(node(5, later), None)
     assert bool(edges) == closed
