@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.vision.image_quality import LEAST_CORNERS, strongest_corners
-from mapweave.agent.vision.visual_odometry import visual_motion
+from mapweave.agent.vision.visual_odometry import VisualMotion, visual_motion
 from mapweave.hybridmap.pose import Array
 
 WINDOW = 1.0
@@ -58,6 +58,7 @@ ENOUGH = 0.04
 class _Moment(NamedTuple):
     """One tick: wheels (2,) m, left and right, and the image with its reduced form."""
 
+    number: int
     commanded: Array
     measured: Array
     image: NDArray[np.uint8] | None
@@ -98,6 +99,8 @@ class EncoderMonitor:
         self._wheels_from_body = np.array([[1.0, -half], [1.0, half]])
         fastest = description.max_forward + half * description.max_turn
         self._most = JUMP[0] * fastest * tick + JUMP[1]
+        self._motions: dict[tuple[int, int], VisualMotion | None] = {}
+        self._count = 0
         self._suspicions = 0
         self._wait = 0
 
@@ -120,7 +123,8 @@ class EncoderMonitor:
         small = None
         if image is not None:
             small = np.asarray(cv2.resize(image, SMALL_PX, interpolation=cv2.INTER_AREA), np.float32)
-        self._moments.append(_Moment(commanded, measured, image, small))
+        self._count += 1
+        self._moments.append(_Moment(self._count, commanded, measured, image, small))
         self._wait = max(self._wait - 1, 0)
         jump = float(np.abs(measured).max())
         if jump > self._most * max(ticks, 1.0):
@@ -211,18 +215,27 @@ class EncoderMonitor:
 
     def _seen(self) -> _Seen | None:
         """How the robot has moved by its images; None if they show too little."""
-        images = [moment.image for moment in self._moments][:: self._stride]
-        for end in (images[0], images[-1]):
+        moments = list(self._moments)[:: self._stride]
+        for end in (moments[0].image, moments[-1].image):
             # On a bare wall the noise is followed, and that stands.
             if end is None or len(strongest_corners(end)) < LEAST_CORNERS:
                 return None
         turn = expansion = gross = 0.0
-        for before, now in pairwise(images):
-            if before is None or now is None:
-                return None
-            motion = visual_motion(before, now, self._description.camera)
+        for before, now in pairwise(moments):
+            motion = self._motion(before, now)
             if motion is None:
                 return None
             turn, expansion = turn + motion.turn, expansion + motion.expansion
             gross += abs(motion.turn)
         return _Seen(turn, expansion, gross)
+
+    def _motion(self, before: _Moment, now: _Moment) -> VisualMotion | None:
+        """Motion by two images. It is kept: a second verdict judges most of the images of the first."""
+        oldest = self._moments[0].number
+        self._motions = {pair: motion for pair, motion in self._motions.items() if pair[0] >= oldest}
+        if before.image is None or now.image is None:
+            return None
+        pair = before.number, now.number
+        if pair not in self._motions:
+            self._motions[pair] = visual_motion(before.image, now.image, self._description.camera)
+        return self._motions[pair]
