@@ -20,8 +20,10 @@ from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.map_event import History, MapEvent
+from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.live_map import LiveMap, Pair
 from mapweave.mapserver.http.login import Access, Person
@@ -56,6 +58,9 @@ class Shown(Protocol):
     def merged(self) -> MergedMap:
         """The newest merged map; the same object as long as nothing has changed."""
 
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+
     def robots(self) -> FleetStatus:
         """The robots, and where they are."""
 
@@ -83,6 +88,7 @@ class Live:
         self._rated: MergedMap | None = None
         self._rest_until = 0.0
         self._probabilities: Mapping[Pair, float] = {}
+        self._floors: Mapping[MapId, str] = {}
         self._events: dict[MapEvent, int] = {}
         self._state = ""
         self._viewers = 0
@@ -160,11 +166,11 @@ class Live:
 
     def _look(self) -> bool:
         """Take over what is new; returns whether the links' probabilities are due."""
-        merged = self._server.merged()
+        merged, floors = self._server.merged(), self._server.annotations().floors
         with self._turn:
-            if merged is not self._shown:
-                self._shown = merged
-                self._map.show(merged, self._probabilities)
+            if merged is not self._shown or floors != self._floors:
+                self._shown, self._floors = merged, floors
+                self._map.show(merged, self._probabilities, floors)
         for event in self._server.history():
             self._events.setdefault(event, len(self._events))
         status = self._server.status()
@@ -194,7 +200,7 @@ class Live:
         with self._turn:
             self._probabilities = probabilities
             if self._shown is merged:
-                self._map.show(merged, probabilities)
+                self._map.show(merged, probabilities, self._floors)
 
 
 async def _until_gone(viewer: WebSocket) -> None:

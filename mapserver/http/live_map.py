@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from mapweave.hybridmap.node import EdgeKind, NodeId
+from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.mapserver.http.row_table import RowTable
 from mapweave.mapserver.http.serving import json_bytes
+from mapweave.merge.floors import labels_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 NODE_COLUMNS = (
@@ -44,20 +45,28 @@ class LiveMap:
         self._components: list[dict[str, Any]] = []
         self._whole: tuple[int, str] = (-1, "")
 
-    def show(self, merged: MergedMap, probabilities: Mapping[Pair, float]) -> None:
+    def show(
+        self, merged: MergedMap, probabilities: Mapping[Pair, float], floors: Mapping[MapId, str]
+    ) -> None:
         """Hold a merged map.
 
         Args:
             merged: the map.
             probabilities: of its links, as far as they are known.
+            floors: labels of maps.
         """
         self._merged = merged
         version = self.version + 1
         changed = self._show_nodes(merged, version)
         changed |= self._show_edges(merged, probabilities, version)
         components = [
-            {"anchor": str(graph.anchor), "nodes": len(graph.nodes), "maps": sorted(map(str, graph.maps))}
-            for graph in merged.graphs
+            {
+                "anchor": str(graph.anchor),
+                "nodes": len(graph.nodes),
+                "maps": sorted(map(str, graph.maps)),
+                "floor": " and ".join(labels_of(merged, floors, number)),
+            }
+            for number, graph in enumerate(merged.graphs)
         ]
         if changed or components != self._components or not self.version:
             self._components, self.version = components, version

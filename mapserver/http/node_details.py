@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.superseded import Superseded
+from mapweave.merge.floors import floor_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.codec import encode_body
 
@@ -36,6 +38,7 @@ class NodeDetails:
     Attributes:
         node: the node itself: id, image size and the pixels of its landmarks.
         map: that it belongs to.
+        floor: on which it is; empty if that is not known.
         stamp_ns: when its image was taken.
         map_from_robot: pose in its own map.
         merged_from_robot: pose in the merged map; None if its map is not part of it.
@@ -50,6 +53,7 @@ class NodeDetails:
 
     node: Node
     map: MapId
+    floor: str
     stamp_ns: int
     map_from_robot: PoseGaussian
     merged_from_robot: PoseGaussian | None
@@ -62,8 +66,13 @@ class NodeDetails:
     neighbours: tuple[Neighbour, ...]
 
 
-def node_details(merged: MergedMap, node_id: NodeId) -> NodeDetails:
+def node_details(merged: MergedMap, node_id: NodeId, floors: Mapping[MapId, str]) -> NodeDetails:
     """Everything about a node.
+
+    Args:
+        merged: the map.
+        node_id: the node.
+        floors: labels of maps.
 
     Raises:
         InvalidValue: there is none.
@@ -83,6 +92,7 @@ def node_details(merged: MergedMap, node_id: NodeId) -> NodeDetails:
     return NodeDetails(
         node,
         node_id.map,
+        floor_of(merged, floors, node_id),
         node.stamp_ns,
         node.map_from_robot,
         None if placement is None else placement.merged_from_robot,

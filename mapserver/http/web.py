@@ -296,7 +296,12 @@ class Questions:
 
     async def _node(self, request: Request) -> Mapping[str, Any]:
         node = NodeId.parse(request.path_params["node"])
-        return await run_in_threadpool(lambda: json_values(node_details(self._server.merged(), node)))
+
+        def details() -> Mapping[str, Any]:
+            floors = self._server.annotations().floors
+            return json_values(node_details(self._server.merged(), node, floors))
+
+        return await run_in_threadpool(details)
 
     async def _map(self, _: Request) -> Response:
         data = await self._result(self._server.map_file)

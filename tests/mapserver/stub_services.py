@@ -11,9 +11,10 @@ import numpy as np
 
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotations
-from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.hybridmap.explanation import Explanation, FleetExplanation
 from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.mission_order import MissionKind, MissionReport
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, ExplainRequest, RelocalizeAnswer, View, Whereabouts
@@ -51,6 +52,8 @@ class StubServices:
         self.events: tuple[MapEvent, ...] = ()
         self.map: MergedMap | None = None
         self.fleet = FleetStatus()
+        self.said = Annotations()
+        self.ways: list[tuple[str, tuple[str, ...]]] = []
         self.read_only = False
 
     def merged(self) -> MergedMap:
@@ -66,7 +69,13 @@ class StubServices:
         return self.events
 
     def annotations(self) -> Annotations:
-        return Annotations()
+        return self.said
+
+    def give(
+        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str, via: tuple[str, ...]
+    ) -> MissionReport:
+        self.ways.append((goal, via))
+        raise InvalidValue(f"{robot} stays where it is")
 
     def metrics(self) -> bytes:
         return b"mapweave_nodes 12.0\n"

@@ -9,6 +9,8 @@ export const placeNamed = name => annotations.find(one => one.body.kind === "pla
 // The node at a place, or the one that its area, edge or plan hangs on.
 export const nodeOf = ({ body }) => body.node || body.area?.anchor || body.edge?.[0] || body.pairs?.[0].node || body.a;
 
+const kindOf = ({ body }) => body.kind === "floor" ? `floor ${body.label}` : body.kind;
+
 export async function loadAnnotations(select) {
   if (!offered) return;
   const answer = await ask("annotations");
@@ -21,7 +23,7 @@ export async function loadAnnotations(select) {
   for (const one of annotations) {
     const item = add(list, "li");
     button(item, one.name, () => select(nodeOf(one) || ""));
-    item.append(` ${one.body.kind}`);
+    item.append(` ${kindOf(one)}`);
   }
   return annotations.filter(one => one.body.kind === "place").map(one => one.name);
 }

@@ -28,6 +28,7 @@ export async function showNode(name, { select, why, send, edit }) {
   const fate = node.superseded;
   facts(box, [
     ["map", node.map],
+    ["floor", node.floor],
     ["in the merged map", node.merged_from_robot ? pose(node.merged_from_robot) : "nowhere"],
     ["in its own map", pose(node.map_from_robot)],
     ["landmarks", `${node.landmarks}, ${node.with_depth} with a depth, ${node.faded.length} faded`],

@@ -132,12 +132,12 @@ function fit() { viewport.fit(model.bounds()); viewport.touched = false; painter
 function listComponents() {
   const list = byId("components");
   list.textContent = "";
-  model.components.forEach(({ anchor, nodes, maps }, k) => {
+  model.components.forEach(({ anchor, nodes, maps, floor }, k) => {
     const item = add(list, "li");
     add(item, "span", "", "swatch").style.background = hue(anchor);
     button(item, `component ${k}`, () => { viewport.fit(model.bounds(model.members[k])); painter.ask(); });
     const some = maps.length > 6 ? `${maps.slice(0, 6).join(", ")} and ${maps.length - 6} more` : maps.join(", ");
-    item.append(` ${nodes} node${nodes === 1 ? "" : "s"} of ${some}`);
+    item.append(` ${floor ? `floor ${floor}, ` : ""}${nodes} node${nodes === 1 ? "" : "s"} of ${some}`);
   });
 }
 function listNames() {

@@ -36,7 +36,7 @@ export function listRobots(robots, select) {
     if (robot.over_quota) add(item, "span", ", over its quota", "bad");
     if (robot.accusation) add(item, "span", " not trusted", "bad").title = robot.accusation;
     const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
-      robot.component < 0 ? "not on the map" : ""];
+      robot.component < 0 ? "not on the map" : "", robot.place && `at ${robot.place}`, robot.floor && `floor ${robot.floor}`];
     item.append(" " + parts.filter(Boolean).join(", "));
     if (focus === robot.robot) choice.focus();
   }
@@ -87,6 +87,8 @@ export function updateRobot(robots) {
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
     ["on the map", pose ? `${pose[0].toFixed(2)}, ${pose[1].toFixed(2)} m, ${degrees(pose[2])}${spread}` : "not known"],
+    ["place", robot.place],
+    ["floor", robot.floor],
     ["nodes", status && `${status.status.nodes}, ${status.placed} placed by the server`],
     ["last node on the server", robot.newest],
     ["links with other maps", robot.newest && robot.links],

@@ -21,7 +21,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.annotation import Annotation, Annotations, Floor
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.http.live import MOST_VIEWERS, Live
@@ -140,7 +142,8 @@ def test_a_viewer_gets_the_map_and_what_changes(served: Web, services: StubServi
         assert first.until("map")["whole"]
         assert same(first.nodes(), expected(merged))
         (component,) = first.last["map"]["components"]
-        assert component == {"anchor": "r0.1.1", "nodes": len(merged.poses), "maps": ["r0.1", "r1.1"]}
+        maps = ["r0.1", "r1.1"]
+        assert component == {"anchor": "r0.1.1", "nodes": len(merged.poses), "maps": maps, "floor": ""}
         (event,) = first.until("events")["history"]
         assert event["kind"] == "joined" and event["words"].startswith("r0.1 and r1.1")
         assert set(first.links()) == {frozenset(map(str, link.pair)) for link in merged.links}
@@ -166,6 +169,15 @@ def test_a_viewer_gets_the_map_and_what_changes(served: Web, services: StubServi
         services.map = merged
         while not same(first.nodes(), expected(merged)):
             first.until("map")
+
+
+def test_a_component_has_its_floor_as_soon_as_it_is_labelled(served: Web, services: StubServices) -> None:
+    with viewer(served) as watching:
+        assert watching.until("map")["components"][0]["floor"] == ""
+        label = Annotation("r1.1", Floor(NodeId("r1", 1, 2), "ground"), False, "anna", 1)
+        services.said = Annotations((label,))
+        # The merged map is the same; differences with the links' probabilities come, too.
+        eventually(lambda: watching.until("map")["components"][0]["floor"] == "ground")
 
 
 def test_robots_come_twice_a_second(served: Web, services: StubServices) -> None:
