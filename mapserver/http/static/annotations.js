@@ -27,7 +27,7 @@ export async function loadAnnotations(select) {
   }
   return annotations.filter(one => one.body.kind === "place").map(one => one.name);
 }
-export function drawAnnotations(c, viewport, model) {
+export function drawAnnotations(c, viewport, model, labels) {
   for (const { name, body } of annotations) {
     const edge = body.edge || (body.kind === "portal" ? [body.a, body.b] : null);
     const colour = { closure: colours.bad, preference: colours.good }[body.kind] || colours.accent;
@@ -55,11 +55,8 @@ export function drawAnnotations(c, viewport, model) {
       label = viewport.toScreen(model.x[row], model.y[row]);
       c.beginPath(); c.arc(...label, 6, 0, 7); c.stroke();
     } else continue;
-    c.font = "600 13px system-ui, sans-serif"; c.textAlign = "center";
-    c.lineWidth = 3; c.strokeStyle = colours.ground;
     // An edge is named by its nodes unless a person has named it, a floor by its map.
-    const words = body.edge?.join(" ") === name ? body.kind : body.kind === "floor" ? `floor ${body.label}` : name;
-    c.strokeText(words, label[0], label[1] - 10); c.fillText(words, label[0], label[1] - 10);
-    c.textAlign = "left";
+    const words = body.edge?.join(" ") === name || body.kind === "floor" ? kindOf({ body }) : name;
+    labels.beside(...label, [words], "name", colour);
   }
 }

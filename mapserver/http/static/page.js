@@ -173,7 +173,7 @@ painter.overlays.push(drawAnnotations, (c, v) => {
   drawing.draw(c, v);
   planEditor.drawMarks(c, v);
   if (isOpen("edit") && (drawing.shape || planEditor.open) && byId("canvas").matches(":focus-visible")) crosshair(c, v);
-}, (c, v) => {
+}, (c, v, _, labels) => {
   for (const { merged_from_robot, component, probability } of page.photo) {
     if (!merged_from_robot || component < 0) continue;
     const [x, y, heading] = model.placed(merged_from_robot.mean, component), [u, w] = v.toScreen(x, y);
@@ -183,8 +183,7 @@ painter.overlays.push(drawAnnotations, (c, v) => {
     c.globalAlpha = 0.25; c.beginPath(); c.moveTo(0, 0); c.arc(0, 0, 46, -0.5, 0.5); c.fill();
     c.globalAlpha = 1; c.beginPath(); c.arc(0, 0, 6, 0, 7); c.fill();
     c.restore();
-    c.font = "600 12px system-ui, sans-serif"; c.fillStyle = colours.accent;
-    c.fillText(`photo, ${(100 * probability).toFixed(0)} %`, u + 10, w + 16);
+    labels.beside(u, w, [`photo, ${(100 * probability).toFixed(0)} %`], "name", colours.accent);
   }
 });
 

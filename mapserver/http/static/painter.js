@@ -1,6 +1,8 @@
 // Draws the map. Nodes and edges go into a bitmap that is larger than the window: panning moves it, and it is
 // drawn again when the window leaves it, when the zoom has come to rest, or when the map has changed.
 import { colours, edgeColour, hue } from "./colours.js";
+import { byId } from "./dom.js";
+import { Labels } from "./labels.js";
 import { SUPERSEDED } from "./map_model.js";
 
 const BORDER = 0.35;      // of the window's size, on each side of the bitmap
@@ -8,6 +10,7 @@ const CHUNK = 400;        // lines in one path: long paths take much longer
 const REST = 120;         // ms without a further zoom
 const QUICK = 12;         // ms: a bitmap that takes no longer is drawn at once
 const NAMED = 38;         // px a metre, from which on nodes have names
+const RULE = 90;          // px, longest ruler
 const SIGMAS = 2;         // of the ellipse about a robot
 
 const words = robot => robot.name + (robot.doing ? `: ${robot.doing}` : "");
@@ -16,13 +19,16 @@ export class Painter {
   constructor(canvas, model, viewport) {
     Object.assign(this, { canvas, model, viewport, robots: [], underlays: [], overlays: [], selected: -1, link: -1, robot: "" });
     this.bitmap = document.createElement("canvas");
-    this.drawn = null; this.cost = 0; this.waiting = 0; this.asked = false;
+    this.drawn = null; this.cost = 0; this.waiting = 0; this.asked = false; this.kept = [];
   }
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas, ratio = window.devicePixelRatio || 1;
     Object.assign(this.viewport, { width, height });
     this.ratio = ratio;
     this.canvas.width = Math.round(width * ratio); this.canvas.height = Math.round(height * ratio);
+    // The buttons and the ruler.
+    const { offsetLeft: left, offsetTop: top, offsetWidth: wide, offsetHeight: high } = byId("tools");
+    this.kept = [[left, top, left + wide, top + high], [width - 14 - RULE, height - 32, width, height]];
     this.drawn = null;
     this.ask();
   }
@@ -47,11 +53,14 @@ export class Painter {
         this.bitmap.width * zoom, this.bitmap.height * zoom);
     }
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
-    for (const overlay of this.overlays) overlay(c, v, this.model);
+    const labels = this.labels = new Labels(c, v, colours.ground);
+    for (const box of this.kept) labels.keep(...box);
+    this.label(labels);
+    for (const overlay of this.overlays) overlay(c, v, this.model, labels);
     this.marks(c);
-    const labels = this.labels(c);
-    this.names(c, labels);
-    labels.forEach((label, k) => this.drawRobot(c, this.robots[k], label));
+    this.names(labels);
+    for (const robot of this.robots) this.drawRobot(c, robot);
+    labels.draw();
     this.rule(c);
   }
   refresh() {
@@ -152,55 +161,30 @@ export class Painter {
       c.beginPath(); c.arc(u, w, 10, 0, 7); c.stroke();
     }
   }
-  // Names of nodes where they fit; of components where there are several.
-  names(c, labels) {
-    const { model: m, viewport: v } = this, taken = [];
-    const free = (u, w, wide) => {
-      const box = [u, w - 11, u + wide, w + 3];
-      if (box[0] < 0 || box[2] > v.width || box[1] < 0 || box[3] > v.height) return false;
-      if (taken.some(t => t[0] < box[2] && t[2] > box[0] && t[1] < box[3] && t[3] > box[1])) return false;
-      return taken.push(box);
-    };
-    c.textBaseline = "alphabetic";
-    for (const { left, base, wide } of labels) free(left, base, wide);
-    c.font = "12px system-ui, sans-serif";
-    if (m.components.length > 1) {
-      m.components.forEach(({ anchor }, k) => {
-        const box = m.boxes[k], [dx, dy] = m.offset(k);
-        const text = `component ${k}`, [u, w] = v.toScreen(box[0] + dx, box[3] + dy);
-        if (!free(u, w - 14, c.measureText(text).width)) return;
-        c.fillStyle = hue(anchor);
-        c.fillText(text, u, w - 14);
+  // Names of components where there are several, and of nodes.
+  names(labels) {
+    const { model: m, viewport: v } = this;
+    if (m.components.length > 1)
+      m.components.forEach(({ anchor, floor }, k) => {
+        const box = m.boxes[k], [dx, dy] = m.offset(k), [u, w] = v.toScreen(box[0] + dx, box[3] + dy);
+        labels.at(u, w - 14, `component ${k}${floor ? `, floor ${floor}` : ""}`, "component", hue(anchor));
       });
-    }
     if (v.scale < NAMED) return;
     const [left, bottom] = v.toPlane(0, v.height), [right, top] = v.toPlane(v.width, 0);
-    c.fillStyle = colours.soft; c.font = "11px system-ui, sans-serif";
     for (const row of m.order) {
       if (m.x[row] < left || m.x[row] > right || m.y[row] < bottom || m.y[row] > top) continue;
       const text = m.name(row), [u, w] = v.toScreen(m.x[row], m.y[row]);
-      if (taken.length < 400 && free(u + 9, w - 4, 6.2 * text.length)) c.fillText(text, u + 9, w - 4);
+      labels.at(u + 9, w - 4, text, "node", colours.soft, 6.2 * text.length);
     }
   }
-  // Robots' labels: above, or below, or the name alone, where no other robot's is.
-  labels(c) {
-    const taken = [];
-    for (const robot of this.robots) {
-      const choices = [[words(robot), -10], [words(robot), 20], [robot.name, -10], [robot.name, 20]]
-        .map(([text, below]) => this.label(c, robot, text, below));
-      const clear = one => !taken.some(other => Math.abs(other.base - one.base) < 14
-        && other.left < one.left + one.wide && one.left < other.left + other.wide);
-      taken.push((taken.length < 200 && choices.find(clear)) || choices[2]);
-    }
-    return taken;
+  // Robots come first: no text lies on one, and each has its name, with what it does where there is room.
+  label(labels) {
+    const placed = this.robots.map(robot => [robot, ...this.viewport.toScreen(robot.x, robot.y)]);
+    for (const [, u, w] of placed) labels.keep(u - 10, w - 7, u + 10, w + 7);
+    for (const [robot, u, w] of placed)
+      labels.beside(u, w, [words(robot), robot.name], "robot", robot.alive ? colours.robot : colours.soft);
   }
-  label(c, robot, text, below) {
-    const { viewport: v } = this, [u, w] = v.toScreen(robot.x, robot.y);
-    c.font = "600 12px system-ui, sans-serif";
-    const wide = c.measureText(text).width, beyond = u + 14 + wide > v.width && u < v.width;
-    return { text, left: beyond ? u - 14 - wide : u + 14, base: w + below, wide };
-  }
-  drawRobot(c, robot, { text, left, base }) {
+  drawRobot(c, robot) {
     const { viewport: v } = this, colour = robot.alive ? colours.robot : colours.soft;
     const [u, w] = v.toScreen(robot.x, robot.y);
     c.save();
@@ -216,13 +200,10 @@ export class Painter {
     c.fillStyle = colour; c.fill();
     c.strokeStyle = robot.name === this.robot ? colours.select : colours.ground; c.lineWidth = 2; c.stroke();
     c.restore();
-    c.font = "600 12px system-ui, sans-serif";
-    c.lineWidth = 3; c.strokeStyle = colours.ground; c.strokeText(text, left, base);
-    c.fillStyle = colour; c.fillText(text, left, base);
   }
   // A ruler of a round length.
   rule(c) {
-    const { viewport: v } = this, aim = 90 / v.scale, power = 10 ** Math.floor(Math.log10(aim));
+    const { viewport: v } = this, aim = RULE / v.scale, power = 10 ** Math.floor(Math.log10(aim));
     const length = [5, 2, 1].map(k => k * power).find(one => one <= aim) * v.scale;
     const right = v.width - 14, base = v.height - 14;
     c.strokeStyle = c.fillStyle = colours.soft; c.lineWidth = 1.5;

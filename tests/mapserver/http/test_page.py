@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
+from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace
@@ -104,16 +106,27 @@ def test_a_busy_server_is_asked_again(page: Browser, services: StubServices, ima
 
 
 @pytest.mark.parametrize(("robots", "gap"), [(2, 0.0), (4, 40.0)])
-def test_labels_of_robots_do_not_lie_on_each_other(page: Browser, robots: int, gap: float) -> None:
-    """Robots so many px apart."""
-    overlaps = page.run(f"""
-        const p = mapweave.painter;
-        p.robots = [...Array({robots}).keys()].map(k => {{
-          const [x, y] = p.viewport.toPlane(100 + {gap} * k, 200);
-          return {{ name: `r${{k}}`, doing: "driving", alive: true, x, y, heading: 0 }};
-        }});
-        const labels = p.labels(p.canvas.getContext("2d"));
-        return labels.map((a, k) => labels.slice(k + 1).filter(b => Math.abs(a.base - b.base) < 12
-          && a.left < b.left + b.wide && b.left < a.left + a.wide).length)
+def test_labels_do_not_lie_on_each_other(
+    page: Browser, services: StubServices, robots: int, gap: float
+) -> None:
+    """Robots so many px apart, amid places at one node."""
+    node = NodeId("r0", 1, 1)
+    places = [Annotation(f"place {k}", Place(node), False, "anna", 1) for k in range(6)]
+    label = Annotation("r0.1", Floor(node, "ground"), False, "anna", 1)
+    services.said = Annotations((*places, label))
+    page.run("document.dispatchEvent(new Event('mapchanged'))")
+    eventually(lambda: page.run("return document.querySelectorAll('#places li').length") == 7)
+    texts, overlaps = page.run(f"""
+        const p = mapweave.painter, row = p.model.rowOf("r0.1.1"), x = p.model.x[row], y = p.model.y[row];
+        p.viewport.show(x, y);
+        p.robots = [...Array({robots}).keys()].map(k => ({{ name: `r${{k}}`, doing: "driving", alive: true,
+          x: x + {gap} * k / p.viewport.scale, y, heading: 0 }}));
+        p.frame();
+        const labels = p.labels.texts;
+        return [labels.map(one => one.text), labels.map((a, k) => labels.slice(k + 1)
+          .filter(b => Math.abs(a.base - b.base) < 12 && a.left < b.left + b.wide && b.left < a.left + a.wide)
+          .length)]
     """)
-    assert overlaps == [0] * robots
+    assert overlaps == [0] * len(texts)
+    assert {"floor ground", *(one.name for one in places)} <= set(texts)
+    assert all({f"r{k}", f"r{k}: driving"} & set(texts) for k in range(robots))
