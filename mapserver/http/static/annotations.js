@@ -5,6 +5,7 @@ import { colours } from "./colours.js";
 
 let annotations = [], offered = true;
 
+export const placeNames = () => annotations.filter(one => one.body.kind === "place").map(one => one.name);
 export const placeNamed = name => annotations.find(one => one.body.kind === "place" && one.name === name);
 // The node at a place, or the one that its area, edge or plan hangs on.
 export const nodeOf = ({ body }) => body.node || body.area?.anchor || body.edge?.[0] || body.pairs?.[0].node || body.a;
@@ -25,7 +26,7 @@ export async function loadAnnotations(select) {
     button(item, one.name, () => select(nodeOf(one) || ""));
     item.append(` ${kindOf(one)}`);
   }
-  return annotations.filter(one => one.body.kind === "place").map(one => one.name);
+  return placeNames();
 }
 export function drawAnnotations(c, viewport, model, labels) {
   for (const { name, body } of annotations) {

@@ -3,6 +3,8 @@
 import { add, button, byId } from "./dom.js";
 import { change, callMe, onPermission, permission } from "./changes.js";
 import { EDITORS } from "./editors.js";
+import { placeNamed } from "./annotations.js";
+import { nodeNamed, wordsOf } from "./names.js";
 
 const PLAN = "plan";  // has a form of its own, see plan_editor.js
 const MOST_NAMES = 40; // in the field of nodes; of more it says how many
@@ -10,7 +12,7 @@ const MOST_NAMES = 40; // in the field of nodes; of more it says how many
 export class EditPanel {
   // `planning` is called when another kind is chosen, `moved` when the map is to be drawn again.
   constructor(model, selection, drawing, { planning, moved }) {
-    Object.assign(this, { model, selection, drawing, planning, moved, kind: "", checked: "", forms: new Map(), number: 0 });
+    Object.assign(this, { model, selection, drawing, planning, moved, kind: "", checked: "", lacks: "", forms: new Map(), number: 0 });
     selection.changed = () => this.selected();
     drawing.changed = () => this.drawn();
     const kinds = byId("edit-kind"), groups = new Map();
@@ -96,8 +98,8 @@ export class EditPanel {
   selected() {
     const { selection } = this, { names, area } = selection;
     byId("edit-nodes").value = names.length > MOST_NAMES ? "" : names.join(" ");
-    byId("edit-nodes").placeholder = names.length > MOST_NAMES ? `${names.length} nodes` : "r0.1.17 r1.1.5";
-    byId("edit-nodes").setCustomValidity("");
+    byId("edit-nodes").placeholder = names.length > MOST_NAMES ? `${names.length} nodes` : "r0.1.17 kitchen 3.1,-2";
+    this.lacks = "";
     byId("edit-within").disabled = !area;
     byId("edit-clear").disabled = !area && !names.length;
     byId("edit-answer").textContent = "";
@@ -106,7 +108,7 @@ export class EditPanel {
   }
   counts() {
     const { selection, model, editor } = this, { names, area } = selection;
-    let words = area && !selection.corners().length ? `${area.anchor}, on which the area hangs, is not on the map any more.` : area ? `An area of ${selection.size().toFixed(1)} m\u00b2 at ${area.anchor}: ${selection.words()}.`
+    let words = this.lacks ? this.lacks : area && !selection.corners().length ? `${area.anchor}, on which the area hangs, is not on the map any more.` : area ? `An area of ${selection.size().toFixed(1)} m\u00b2 at ${area.anchor}: ${selection.words()}.`
       : names.length ? `${selection.words()}.` : "Nothing is selected. Click nodes on the map, type them, or draw an area.";
     if (editor?.whole?.(this.values()) && names.length === 1) {
       const row = model.rowOf(names[0]), map = model.nodes.map[row];
@@ -121,12 +123,22 @@ export class EditPanel {
     }
     // A status that has not changed is not read out again.
     if (byId("edit-counts").textContent !== words) byId("edit-counts").textContent = words;
+    byId("edit-counts").className = this.lacks ? "bad" : "";
+    byId("edit-check").disabled = Boolean(this.lacks);
+    byId("edit-nodes").setAttribute("aria-invalid", Boolean(this.lacks));
   }
   typed() {
-    const input = byId("edit-nodes"), names = input.value.split(/[\s,]+/).filter(Boolean);
-    const unknown = names.find(name => this.model.rowOf(name) === undefined);
-    input.setCustomValidity(unknown ? `There is no node ${unknown} on this map.` : "");
-    if (unknown) input.reportValidity(); else this.selection.set(names);
+    const input = byId("edit-nodes"), text = input.value, words = wordsOf(text);
+    const area = words.length === 1 && placeNamed(words[0])?.body.area;
+    if (area) { this.selection.take(area); return; }
+    const found = words.map(word => nodeNamed(word, this.model)), lacks = found.find(one => one.lacks)?.lacks || "";
+    // What was selected before must not be changed in the place of what is typed.
+    this.selection.set(lacks ? [] : found.map(one => one.node));
+    if (!lacks) return;
+    input.value = text;
+    this.lacks = lacks;
+    byId("edit-clear").disabled = false;
+    this.counts();
   }
   drawn() {
     const { shape } = this.drawing;

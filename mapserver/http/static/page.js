@@ -1,7 +1,7 @@
 // The page: what comes over the WebSocket goes to the map and the panels, what is chosen on one shows on all.
 import { add, button, byId, draw } from "./dom.js";
 import { colours, edgeColour, followTheme, hue } from "./colours.js";
-import { drawAnnotations, loadAnnotations, nodeOf, placeNamed } from "./annotations.js";
+import { drawAnnotations, loadAnnotations } from "./annotations.js";
 import { permit } from "./changes.js";
 import { listCorrections } from "./corrections.js";
 import { Drawing } from "./drawing.js";
@@ -14,6 +14,7 @@ import { listen } from "./input.js";
 import { listenForPhotos } from "./photo.js";
 import { isOpen, listenToTabs, openTab } from "./panels.js";
 import { MapModel } from "./map_model.js";
+import { nodeNamed } from "./names.js";
 import { crosshair } from "./plan_pane.js";
 import { drawPlans, loadPlans } from "./plans.js";
 import { Painter } from "./painter.js";
@@ -112,18 +113,17 @@ function next(step) {
   byId("canvas").focus();
 }
 function find(text) {
-  const place = placeNamed(text), name = place ? nodeOf(place) : text;
-  const robot = page.robots.find(one => one.robot === name);
+  const robot = page.robots.find(one => one.robot === text), { node, lacks } = nodeNamed(text, model);
+  if (node) { selectNode(node); return; }
   if (robot) { selectRobot(robot.robot); return; }
-  if (model.rowOf(name) !== undefined) { selectNode(name); return; }
-  const map = model.numbers?.get(name);
+  const map = model.numbers?.get(text);
   if (map !== undefined) {
     viewport.fit(model.bounds(model.order.filter(row => model.nodes.map[row] === map)));
     painter.ask();
     return;
   }
-  if (/^[^.]+\.\d+\.\d+$/.test(name)) { selectNode(name); return; }
-  byId("announcement").textContent = byId("query").title = `There is no ${text} on this map.`;
+  if (/^[^.]+\.\d+\.\d+$/.test(text)) { selectNode(text); return; }
+  byId("announcement").textContent = byId("query").title = lacks;
   byId("query").setCustomValidity(byId("query").title);
   byId("query").reportValidity();
 }

@@ -18,6 +18,8 @@ export class Selection {
   set(names) { this.names = [...new Set(names)]; this.area = null; this.changed(); }
   toggle(name) { this.set(this.names.includes(name) ? this.names.filter(one => one !== name) : [...this.names, name]); }
   clear() { this.set([]); }
+  // An area as a place has it.
+  take(area) { Object.assign(this, { names: [], area }); this.changed(); }
   // Corners on the plane. The area belongs to the component with most nodes in it.
   enclose(corners) {
     const { model } = this, counts = new Map();
@@ -28,9 +30,8 @@ export class Selection {
     const [component] = [...counts].sort((a, b) => b[1] - a[1])[0] || [model.nodes.component[model.nearest(u, v, Infinity)]];
     const anchor = model.nearest(u, v, Infinity, model.members[component]);
     if (anchor < 0) return;
-    Object.assign(this, { names: [], area: { anchor: model.name(anchor), corners: corners.map(([x, y]) =>
-      model.toNode(anchor, x, y).map(m => +m.toFixed(4))) } });
-    this.changed();
+    this.take({ anchor: model.name(anchor), corners: corners.map(([x, y]) =>
+      model.toNode(anchor, x, y).map(m => +m.toFixed(4))) });
   }
   // Corners of the area on the plane; none while its anchor is not on the map.
   corners() {

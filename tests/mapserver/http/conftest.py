@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.server import MapServer
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from synthetic.maps import write_store
+from tests.browser import Browser
+from tests.mapserver.http.person import logs
 from tests.mapserver.stub_services import StubServices
 
 
@@ -19,3 +26,17 @@ def services() -> StubServices:
 def served(services: StubServices) -> Iterator[Web]:
     with Web(("127.0.0.1", 0), services) as served:
         yield served
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[MapServer]:
+    path = write_store(tmp_path / "s0.sqlite", logs())
+    with MapServer(MemoryBus(MemoryHub()), Keys("demo"), path, "s0") as server:
+        assert server.settle(60.0)
+        yield server

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.annotation import Annotation, Closure, Floor, Pin, Place, Preference
+from mapweave.hybridmap.annotation import Closure, Floor, Pin, Place, Preference
 from mapweave.hybridmap.area import inside
-from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredArea, RetiredMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
@@ -27,128 +23,14 @@ from mapweave.merge.settings import MergeSettings
 from mapweave.opened_map import open_map
 from mapweave.read_only_server import ReadOnlyServer
 from mapweave.storage.map_file import write_map_file
-from mapweave.wire.keys import Keys
-from mapweave.wire.memory import MemoryBus, MemoryHub
-from synthetic.maps import map_tours, write_store
-from synthetic.world import room
 from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.mapserver.http.person import annotation, last, opened
 from tests.mapserver.test_corrections import FIRST, LAST, TRUE, A, B
 from tests.waiting import eventually, free_port
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-AT = """
-const m = mapweave.model, box = mapweave.painter.canvas.getBoundingClientRect(), row = m.rowOf('{}');
-const [u, v] = mapweave.viewport.toScreen(m.x[row], m.y[row]);
-return [box.left + u, box.top + v];
-"""
 SCALE = 0.02
 PLAN_FROM_MERGED = Pose2(4.0, 4.0, 0.4)
-
-
-def logs() -> dict[MapId, list[ChangeBody]]:
-    """Two robots drive through one hall; the last view of one and the first of the other show the same."""
-    world, rng = room(0, 0, 6, 5, 300, np.random.default_rng(1)), np.random.default_rng(3)
-    walks = {
-        A: [Pose2(2.5 - 0.6 * (2 - k), 2.5, 1.0 * k) for k in range(3)],
-        B: [Pose2(2.7 + 0.6 * k, 2.4, 2.05 + 1.0 * k) for k in range(3)],
-    }
-    return map_tours(world, walks, rng, 0.01, 0.01)
-
-
-class Person:
-    """A person at the page."""
-
-    def __init__(self, page: Browser) -> None:
-        self.page = page
-
-    def text(self, name: str) -> str:
-        return str(self.page.run(f"return document.getElementById('{name}').textContent"))
-
-    def press(self, name: str) -> None:
-        self.page.run(f"document.getElementById('{name}').click()")
-
-    def fill(self, name: str, value: object) -> None:
-        self.page.run(
-            f"const one = document.getElementById('{name}'); one.value = {json.dumps(str(value))};"
-            "for (const kind of ['input', 'change']) one.dispatchEvent(new Event(kind, { bubbles: true }))"
-        )
-
-    def mouse(self, *points: tuple[float, float], modifiers: int = 0) -> None:
-        """Press at the first point, and let go at the last one."""
-        kinds = ["mousePressed", *["mouseMoved"] * (len(points) - 1), "mouseReleased"]
-        for kind, (x, y) in zip(kinds, [*points, points[-1]], strict=True):
-            self.page.devtools(
-                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1,
-                modifiers=modifiers,
-            )  # fmt: skip
-
-    def key(self, key: str, text: str = "") -> None:
-        for kind in ("keyDown", "keyUp"):
-            self.page.devtools(
-                "Input.dispatchKeyEvent", type=kind, key=key, **({"text": text} if kind == "keyDown" else {})
-            )
-
-    def at(self, node: NodeId) -> tuple[float, float]:
-        x, y = self.page.run(AT.format(node))
-        return x, y
-
-    def edit(self, kind: str, because: str, **fields: object) -> str:
-        """Fill in a form and have it checked; returns what the server says."""
-        self.fill("edit-kind", kind)
-        for name, value in fields.items():
-            self.fill(f"edit-{kind}-{name}", value)
-        self.fill("edit-because", because)
-        self.press("edit-check")
-        eventually(lambda: self.text("edit-answer") not in ("", "Asking ..."))
-        return self.text("edit-answer")
-
-    def apply(self) -> str:
-        self.press("edit-apply")
-        eventually(lambda: "only checked" not in self.text("edit-answer") != "Asking ...")
-        return self.text("edit-answer")
-
-    def take_back(self, server: MapServer) -> None:
-        """The newest correction."""
-        listed = "return document.getElementById('corrections').children.length"
-        before = count(server)
-        eventually(lambda: self.page.run(listed) == before)
-        self.page.run("document.querySelector('#corrections li button').click()")
-        eventually(lambda: self.page.run(listed) == before + 1)
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[MapServer]:
-    path = write_store(tmp_path / "s0.sqlite", logs())
-    with MapServer(MemoryBus(MemoryHub()), Keys("demo"), path, "s0") as server:
-        assert server.settle(60.0)
-        yield server
-
-
-def opened(browser: Browser, port: int) -> Person:
-    browser.look(1280, 800)
-    browser.open(f"http://127.0.0.1:{port}/")
-    eventually(lambda: browser.run("return window.mapweave ? mapweave.model.order.length : 0"))
-    person = Person(browser)
-    person.press("tab-edit")
-    return person
-
-
-def count(server: MapServer) -> int:
-    return len(server.constraints().made) + len(server.annotations().made)
-
-
-def last(server: MapServer) -> Any:
-    return server.constraints().made[-1].about
-
-
-def annotation(server: MapServer) -> Annotation:
-    return server.annotations().made[-1]
 
 
 def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, tmp_path: Path) -> None:

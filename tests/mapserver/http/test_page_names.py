@@ -1,0 +1,104 @@
+"""Names on the page in a real browser: typed for nodes, replaced, restored; floors and time windows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.server import MapServer
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.mapserver.http.person import Person, annotation, opened
+from tests.mapserver.test_corrections import FIRST, LAST, A
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+NAMES = "return mapweave.selection.names"
+DISABLED = "return ['edit-check', 'edit-apply'].map(name => document.getElementById(name).disabled)"
+PLACES = "return [...document.querySelectorAll('#places li')].map(one => one.textContent)"
+
+
+@pytest.fixture
+def person(browser: Browser, server: MapServer) -> Iterator[Person]:
+    with Web(("127.0.0.1", 0), server) as served:
+        yield opened(browser, served.port)
+
+
+def name_place(person: Person, name: str, nodes: str) -> None:
+    person.fill("edit-nodes", nodes)
+    said = person.edit("place", "it is so", name=name)
+    assert "only checked" in said, said
+    person.apply()
+    eventually(lambda: f"{name} place" in person.page.run(PLACES))
+
+
+def test_a_name_that_is_not_known_leaves_nothing_to_apply(person: Person, server: MapServer) -> None:
+    page = person.page
+    person.fill("edit-nodes", str(LAST))
+    assert "only checked" in person.edit("retire", "dark")
+    assert page.run(DISABLED) == [False, False]
+    for word, says in (
+        ("kitchen", "There is no kitchen on this map."),
+        ("90,90", "Nothing is mapped within 2 m"),
+    ):
+        person.fill("edit-nodes", word)
+        assert says in person.text("edit-counts")
+        assert page.run(NAMES) == [] and page.run(DISABLED) == [True, True]
+        assert page.run("return document.getElementById('edit-nodes').value") == word
+    person.fill("edit-nodes", str(LAST))
+    assert page.run(NAMES) == [str(LAST)] and page.run(DISABLED) == [False, True]
+    assert not server.constraints().made
+
+
+def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer) -> None:
+    page = person.page
+    name_place(person, "east", str(FIRST))
+    name_place(person, "east wing", str(LAST))
+    (x, y) = server.merged().pose(LAST).vector[:2]
+    component = server.merged().component_of(LAST)
+    typed = [
+        ("east wing", [LAST]),
+        ("east", [FIRST]),
+        ("east wing, east", [LAST, FIRST]),
+        (f"{A}.1 east", None),
+    ]
+    if component == 0:
+        typed.append((f"{x:.3f},{y:.3f}", [LAST]))
+    for text, nodes in typed:
+        person.fill("edit-nodes", text)
+        assert page.run(NAMES) == list(map(str, nodes or [f"{A}.1", FIRST]))
+    # The name of an area alone is the area.
+    page.run("document.getElementById('draw-rectangle').click()")
+    (u, v), (r, s) = person.at(LAST), person.at(LAST)
+    person.mouse((u - 30, v - 30), (r, s), (r + 30, s + 30))
+    eventually(lambda: page.run("return mapweave.selection.area !== null"))
+    area = page.run("return mapweave.selection.area")
+    person.edit("place", "it is so", name="the hall")
+    person.apply()
+    eventually(lambda: "the hall place" in page.run(PLACES))
+    person.fill("edit-nodes", "the hall")
+    assert page.run("return mapweave.selection.area.anchor") == area["anchor"]
+    # The search takes the same words.
+    person.fill("query", f"{x:.3f},{y:.3f}" if component == 0 else "east wing")
+    page.run("document.getElementById('search').requestSubmit()")
+    eventually(
+        lambda: page.run("return document.querySelector('#selected h2')?.textContent") == f"Node {LAST}"
+    )
+    person.fill("query", "90,90")
+    page.run("document.getElementById('search').requestSubmit()")
+    assert "Nothing is mapped within 2 m of 90,90" in person.text("announcement")
+
+
+def test_floors_are_named_wherever_a_place_is_shown(person: Person, server: MapServer) -> None:
+    page = person.page
+    person.fill("edit-nodes", str(LAST))
+    person.edit("floor", "stairs", label="ground")
+    person.apply()
+    assert annotation(server).name == str(LAST.map)
+    eventually(lambda: f"{LAST.map} floor ground" in page.run(PLACES))
+    eventually(lambda: "floor ground, " in person.text("components"))
+    page.run(f"document.getElementById('query').value = '{LAST}'")
+    page.run("document.getElementById('search').requestSubmit()")
+    facts = "return [...document.querySelectorAll('#selected dt, #selected dd')].map(one => one.textContent)"
+    eventually(lambda: page.run(facts)[2:4] == ["floor", "ground"])
