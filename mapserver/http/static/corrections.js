@@ -1,4 +1,5 @@
-// What people have corrected and said, newest first, each of which can be taken back: GET /constraints and /annotations.
+// What people have corrected and said, newest first, with what came after it: GET /constraints and /annotations. What
+// holds can be taken back, and of annotations what held before can be restored.
 import { add, ask, button, byId } from "./dom.js";
 import { change, onPermission } from "./changes.js";
 
@@ -12,17 +13,28 @@ function undoing(made, number) {
   return before && !before.removed ? { name, body: before.body, because: before.because }
     : removed ? null : { name, body: { kind }, removed: true };
 }
+// Entries, each with the one that came after it about the same, and the last one about it.
+function chained(made, about) {
+  const next = new Map(), last = new Map();
+  return made.slice().reverse().map(one => {
+    const key = about(one), after = next.get(key);
+    next.set(key, one);
+    if (!after) last.set(key, one);
+    return { ...one, after, last: last.get(key) };
+  }).reverse();
+}
 export async function listCorrections() {
   const [{ constraints }, { annotations }] = await Promise.all([ask("constraints"), ask("annotations")]);
   // Without an answer the list stays.
   if (!constraints || !annotations) return;
-  const last = new Map(annotations.map(({ name, body }, number) => [`${body.kind} ${name}`, number]));
   entries = [
-    ...constraints.map(({ number, words, time, stamp_ns, in_force }) =>
-      ({ words, time, stamp_ns, holds: in_force, undo: in_force ? ["constraints", { undo: number }] : null })),
-    ...annotations.map(({ name, body, words, time, stamp_ns, in_force }, number) => {
-      const content = last.get(`${body.kind} ${name}`) === number ? undoing(annotations, number) : null;
-      return { words, time, stamp_ns, holds: in_force, undo: content && ["annotations", content] };
+    ...chained(constraints, one => JSON.stringify(one.about)).map(one =>
+      ({ ...one, undo: one.in_force ? ["constraints", { undo: one.number }] : null })),
+    ...chained(annotations, one => `${one.body.kind} ${one.name}`).map((one, number) => {
+      const { name, body, because, removed, after, last } = one;
+      const same = last.in_force && JSON.stringify(last.body) === JSON.stringify(body);
+      const content = !after ? undoing(annotations, number) : removed || same ? null : { name, body, because };
+      return { ...one, undo: content && ["annotations", content] };
     }),
   ].sort((a, b) => b.stamp_ns - a.stamp_ns);
   show();
@@ -30,12 +42,13 @@ export async function listCorrections() {
 function show() {
   list.textContent = "";
   byId("corrected").hidden = !entries.length;
-  for (const { words, time, holds, undo } of entries) {
+  for (const { words, time, in_force: holds, after, undo } of entries) {
     const item = add(list, "li", "", holds ? "" : "soft");
     add(item, "small", `${time} UTC `);
     item.append(words + " ");
+    if (after) add(item, "div", `Replaced ${after.time} UTC: ${after.words}`);
     if (!undo || !allowed) continue;
-    const back = button(item, "Take back", async () => {
+    const does = after ? "Restore" : "Take back", back = button(item, does, async () => {
       back.disabled = true;
       const { error } = await change(...undo);
       if (!error) return;
@@ -43,7 +56,7 @@ function show() {
       item.querySelector(".bad")?.remove();
       add(item, "p", error, "bad").setAttribute("role", "alert");
     });
-    back.setAttribute("aria-label", `Take back: ${words}`);
+    back.setAttribute("aria-label", `${does}: ${words}`);
   }
 }
 onPermission(permission => { allowed = permission.allowed; show(); });
