@@ -28,7 +28,7 @@ export class EditPanel {
     kinds.append(new Option("Floor plan", PLAN));
     kinds.addEventListener("change", () => this.show(kinds.value));
     byId("edit-form").addEventListener("submit", event => { event.preventDefault(); this.check(); });
-    byId("edit-form").addEventListener("input", () => this.forget());
+    byId("edit-form").addEventListener("input", () => { this.lines(); this.forget(); });
     byId("edit-apply").addEventListener("click", () => this.apply());
     byId("edit-nodes").addEventListener("change", () => this.typed());
     byId("edit-clear").addEventListener("click", () => { drawing.cancel(); selection.clear(); });
@@ -56,20 +56,27 @@ export class EditPanel {
   fields({ id, fields, more }) {
     const set = add(byId("edit-kinds"), "div", "", "fields"), inputs = {};
     set.hidden = true;
+    const depending = [];
     let details = null;
     if (more) {
       details = document.createElement("details");
       add(details, "summary", more);
     }
-    for (const { name, label, options, more: hidden, ...attributes } of fields) {
+    for (const { name, label, options, more: hidden, when, ...attributes } of fields) {
       const line = add(hidden ? details : set, "label", label), input = add(line, options ? "select" : "input");
       input.id = `edit-${id}-${name}`;
       for (const [value, words] of options || []) input.append(new Option(words, value));
       for (const [key, value] of Object.entries(attributes)) input[key] = value;
       inputs[name] = input;
+      if (when) depending.push([line, input, when]);
     }
     if (details) set.append(details);
-    return { set, inputs, details };
+    return { set, inputs, details, depending };
+  }
+  // Fields that are shown for some values of others only.
+  lines() {
+    for (const [line, input, when] of this.forms.get(this.kind)?.depending || [])
+      line.hidden = input.disabled = !when(this.values());
   }
   // Which kind of edit, from the list or from another panel.
   show(kind) {
@@ -83,6 +90,7 @@ export class EditPanel {
       // What is hidden must not keep the form from being sent.
       for (const input of Object.values(inputs)) input.disabled = id !== kind;
     }
+    this.lines();
     byId("edit-answer").textContent = "";
     this.drawing.cancel();
     this.forget();

@@ -29,6 +29,9 @@ const annotation = (name, body) => ({ path: "annotations", content: { name, body
 const mapOf = name => name.slice(0, name.lastIndexOf("."));
 
 const RADIUS = { name: "radius", label: "Radius, m", type: "number", value: 1, min: 0.1, step: 0.1 };
+const BEGIN = { name: "begin", label: "From", type: "datetime-local" };
+const END = { name: "end", label: "Until", type: "datetime-local" };
+const windowed = ({ scope }) => scope === "window";
 
 export const EDITORS = [
   { id: "link", group: "What is merged", label: "Link two places",
@@ -54,11 +57,17 @@ export const EDITORS = [
       return constraint({ unmerge: scope === "maps" ? both.map(mapOf) : both });
     } },
   { id: "retire", group: "What is merged", label: "Retire",
-    hint: "It takes no part in the merge, in routes and in answers any more. Nothing is deleted.",
+    hint: "It takes no part in the merge, in routes and in answers any more. Nothing is deleted. Times are this device's.",
     fields: [{ name: "scope", label: "Retire", options: [["selected", "the nodes or the area"],
-      ["map", "the whole map of the node"]] }],
-    whole: ({ scope }) => scope === "map",
-    request(selection, { scope }) {
+      ["map", "the whole map of the node"], ["window", "its map between times"]] },
+      { ...BEGIN, step: 1, when: windowed }, { ...END, step: 1, when: windowed }],
+    whole: ({ scope }) => scope !== "selected",
+    request(selection, { scope, begin, end }) {
+      if (scope === "window") {
+        const [node] = nodes(selection, 1, "Retiring a time window");
+        if (!begin && !end) lacks("A time window begins or ends: give one of the times, or both.");
+        return constraint({ window: { map: mapOf(node), begin: time(begin), end: time(end) } });
+      }
       if (scope === "map") return constraint({ retire: [mapOf(nodes(selection, 1, "Retiring a map")[0])] });
       return constraint(selection.area ? { area: selection.area } : { retire: nodes(selection, 0, "Retiring") });
     } },
@@ -70,8 +79,7 @@ export const EDITORS = [
   { id: "closure", group: "What is said about it", label: "Close a way or an area",
     hint: "No route leads through an area, the floor around one node, or the way between two. Times are this device's.",
     fields: [{ name: "name", label: "Name", type: "text", maxLength: 64, placeholder: "of an area" }, RADIUS,
-      { name: "begin", label: "From", type: "datetime-local" },
-      { name: "end", label: "Until", type: "datetime-local" }],
+      BEGIN, END],
     request: (selection, { name, radius, begin, end }) => annotation(named(selection, name), { kind: "closure",
       ...where(selection, "A closure", radius), begin_ns: time(begin), end_ns: time(end) }) },
   { id: "preference", group: "What is said about it", label: "Prefer or avoid",

@@ -6,16 +6,18 @@ from collections.abc import Iterator
 
 import pytest
 
+from mapweave.hybridmap.constraint_subject import RetiredWindow
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.server import MapServer
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.http.person import Person, annotation, opened
+from tests.mapserver.http.person import Person, annotation, last, opened
 from tests.mapserver.test_corrections import FIRST, LAST, A
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 NAMES = "return mapweave.selection.names"
 DISABLED = "return ['edit-check', 'edit-apply'].map(name => document.getElementById(name).disabled)"
+CORRECTIONS = "return [...document.querySelectorAll('#corrections li')].map(one => one.textContent)"
 PLACES = "return [...document.querySelectorAll('#places li')].map(one => one.textContent)"
 
 
@@ -90,6 +92,26 @@ def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer)
     assert "Nothing is mapped within 2 m of 90,90" in person.text("announcement")
 
 
+def test_a_place_that_was_replaced_is_restored(person: Person, server: MapServer) -> None:
+    page = person.page
+    name_place(person, "kitchen", str(FIRST))
+    name_place(person, "kitchen", str(LAST))
+    person.page.run("document.querySelector('#corrections li button').click()")
+    eventually(lambda: len(server.annotations().made) == 3)
+    person.press("tab-events")
+    eventually(lambda: len(page.run(CORRECTIONS)) == 3)
+    _, second, first = page.run(CORRECTIONS)
+    assert f"is node {LAST}" in second and "Restore" in second
+    assert (
+        f"is node {FIRST}" in first and "Replaced" in first and f"UTC: place kitchen is node {LAST}" in first
+    )
+    assert "Restore" not in first, "it holds already"
+    page.run("document.querySelectorAll('#corrections li')[1].querySelector('button').click()")
+    eventually(lambda: len(server.annotations().made) == 4)
+    kitchen = server.annotations().last("place", "kitchen")
+    assert kitchen is not None and kitchen.body.anchor == LAST
+
+
 def test_floors_are_named_wherever_a_place_is_shown(person: Person, server: MapServer) -> None:
     page = person.page
     person.fill("edit-nodes", str(LAST))
@@ -102,3 +124,18 @@ def test_floors_are_named_wherever_a_place_is_shown(person: Person, server: MapS
     page.run("document.getElementById('search').requestSubmit()")
     facts = "return [...document.querySelectorAll('#selected dt, #selected dd')].map(one => one.textContent)"
     eventually(lambda: page.run(facts)[2:4] == ["floor", "ground"])
+
+
+def test_a_time_window_is_retired(person: Person, server: MapServer) -> None:
+    person.fill("edit-nodes", str(LAST))
+    person.fill("edit-kind", "retire")
+    shown = "return document.getElementById('edit-retire-begin').checkVisibility()"
+    assert not person.page.run(shown)
+    assert "give one of the times" in person.edit("retire", "a lamp was off", scope="window")
+    assert person.page.run(shown)
+    said = person.edit("retire", "a lamp was off", begin="1970-01-01T00:00:00", end="2031-03-01T12:00:05")
+    assert "only checked" in said, said
+    person.apply()
+    window = last(server)
+    assert isinstance(window, RetiredWindow) and window.map == LAST.map
+    assert window.end_ns % (60 * 10**9) == 5 * 10**9
