@@ -1,5 +1,6 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
 import { add, ask, button, byId, degrees, facts, percent, seconds } from "./dom.js";
+import { wordsOf } from "./names.js";
 
 const QUIET = 5; // s without a status
 let panel = null;
@@ -48,9 +49,11 @@ export function showRobot(name, whyNot, goal) {
   add(box, "h2", `Robot ${name}`);
   panel = { name, facts: add(box, "div"), portal: null };
   if (whyNot) { add(box, "p", whyNot, "soft"); return; }
-  const form = add(box, "form", "", "actions"), input = add(form, "input");
+  const form = add(box, "form", "", "actions"), input = add(form, "input"), via = add(form, "input");
   input.id = "goal"; input.value = goal; input.placeholder = "node, x,y, place or home"; input.setAttribute("list", "names");
   input.setAttribute("aria-label", `Where to send ${name}`);
+  via.id = "via"; via.placeholder = "by way of, in order";
+  via.setAttribute("aria-label", `Places that ${name} must pass before, in order`);
   add(form, "button", "Send");
   const actions = add(box, "div", "", "actions"), words = add(box, "p");
   words.setAttribute("role", "status");
@@ -62,7 +65,8 @@ export function showRobot(name, whyNot, goal) {
   };
   form.addEventListener("submit", event => {
     event.preventDefault();
-    give("go?" + new URLSearchParams({ goal: input.value.trim(), by: "page" }));
+    const passed = wordsOf(via.value).map(word => ["via", word]);
+    give("go?" + new URLSearchParams([["goal", input.value.trim()], ["by", "page"], ...passed]));
   });
   button(actions, "Explore", () => give("explore?by=page"));
   button(actions, "Stop", () => give("stop?by=page"));
