@@ -4,15 +4,18 @@ import { add, ask, button, byId, degrees, side } from "./dom.js";
 const LONGEST = 2048; // px; the server makes photos smaller anyway
 const result = byId("answer");
 
-async function shrunk(file) {
+const TAKEN = ["image/jpeg", "image/png"];
+
+// What is sent: the file itself, or a JPEG of it if it is large or of another kind; null if it is no image.
+async function prepared(file) {
   try {
-    const image = await createImageBitmap(file), scale = LONGEST / Math.max(image.width, image.height);
-    if (scale >= 1 || file.size < 2e6) return file;
+    const image = await createImageBitmap(file), scale = Math.min(1, LONGEST / Math.max(image.width, image.height));
+    if (TAKEN.includes(file.type) && (scale === 1 || file.size < 2e6)) return file;
     const canvas = document.createElement("canvas");
     canvas.width = Math.round(image.width * scale); canvas.height = Math.round(image.height * scale);
     canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height);
-    return await new Promise(done => canvas.toBlob(done, "image/jpeg", 0.92)) || file;
-  } catch (error) { return file; }
+    return await new Promise(done => canvas.toBlob(done, "image/jpeg", 0.92));
+  } catch (error) { return null; }
 }
 function table(candidates, show) {
   const made = add(result, "table"), head = made.insertRow();
@@ -20,7 +23,10 @@ function table(candidates, show) {
   for (const c of candidates) {
     const [x, y, turn] = c.node_from_robot.mean, row = made.insertRow();
     const away = m => c.distance_known ? m.toFixed(2) + " m" : "not known";
-    button(add(row, "td"), c.node, () => show(c.node));
+    const place = add(row, "td");
+    button(place, c.node, () => show(c.node));
+    const where = [c.place, c.floor && `floor ${c.floor}`].filter(Boolean).join(", ");
+    if (where) add(place, "div", where);
     const probability = (100 * c.probability).toFixed(0) + " %";
     for (const text of [away(x), away(y), degrees(turn), probability]) add(row, "td", text);
   }
@@ -42,13 +48,15 @@ function whyNot(similar, show) {
 let file = null;
 async function locate(found, show) {
   if (!file) return;
-  byId("shown").src = URL.createObjectURL(file); byId("shown").hidden = false;
   const query = new URLSearchParams();
   for (const name of ["height_m", "hfov"]) if (byId(name).value) query.set(name, byId(name).value);
   result.className = ""; result.textContent = "Looking ...";
   const busy = () => { result.textContent = "Many robots ask at present, waiting ..."; };
-  const body = await shrunk(file), headers = { "Content-Type": body.type || "application/octet-stream" };
-  const answer = await ask("relocalize?" + query, { method: "POST", headers, body }, busy);
+  const body = await prepared(file), headers = { "Content-Type": body?.type };
+  if (body) byId("shown").src = URL.createObjectURL(body);
+  byId("shown").hidden = !body;
+  const answer = body ? await ask("relocalize?" + query, { method: "POST", headers, body }, busy)
+    : { error: `${file.name} is no image that can be read: choose a JPEG or PNG.` };
   result.textContent = "";
   if (answer.error) { result.className = "box failed"; result.textContent = answer.error; found([]); return; }
   const good = answer.certainty === "found" || answer.certainty === "place";

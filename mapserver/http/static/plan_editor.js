@@ -81,6 +81,10 @@ export class PlanEditor {
     this.report();
   }
   clickedPlan(u, v) {
+    if (u < 0 || v < 0 || u > this.image.width || v > this.image.height) {
+      byId("plan-next").textContent = "That is beside the plan: click on its image.";
+      return;
+    }
     this.pixel = { u: +u.toFixed(1), v: +v.toFixed(1) };
     this.join();
   }

@@ -214,6 +214,11 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
         browser.run("document.getElementById('plan-canvas').focus()")
         person.key("Enter")
         eventually(lambda: browser.run("return mapweave.planEditor.pixel?.u") == 250)
+        # A click beside the plan is none.
+        corner = "const box = document.getElementById('plan-canvas').getBoundingClientRect();"
+        person.mouse(tuple(browser.run(f"{corner} return [box.left + 3, box.top + 3]")))
+        assert "beside the plan" in person.text("plan-next")
+        assert browser.run("return mapweave.planEditor.pixel?.u") == 250
         person.press("fit")
         browser.run("mapweave.viewport.zoom(0.3)")
         node, pose = next(iter(poses.items()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,15 +25,8 @@ STATUS = "return document.getElementById('summary').textContent"
 KIND = "const answer = document.getElementById('answer'); return answer.dataset.certainty || answer.className"
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
-
-
-@pytest.fixture
-def services() -> StubServices:
-    return StubServices()
+def text_of(name: str) -> str:
+    return f"return document.getElementById('{name}').textContent"
 
 
 @pytest.fixture
@@ -85,6 +79,41 @@ def test_no_unknown_distance_is_shown(page: Browser, services: StubServices, ima
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "place")
     assert page.run(ROWS)[1] == ["r0.1.7", "not known", "not known", "6°", "90 %"]
+
+
+def test_an_answer_names_the_place_and_the_floor(page: Browser, services: StubServices, image: Path) -> None:
+    (where,) = PLACE.candidates
+    services.answer = replace(PLACE, candidates=(replace(where, place="<b>kitchen", floor="ground"),))
+    page.type("#image", str(image))
+    eventually(lambda: page.run(KIND) == "place")
+    assert page.run(ROWS)[1][0] == "r0.1.7<b>kitchen, floor ground"
+
+
+def test_what_is_no_image_is_not_sent(page: Browser, services: StubServices, tmp_path: Path) -> None:
+    (tmp_path / "notes.log").write_text("no image")
+    page.type("#image", str(tmp_path / "notes.log"))
+    eventually(lambda: page.run(KIND) == "box failed")
+    assert page.run(RESULT) == "notes.log is no image that can be read: choose a JPEG or PNG."
+    assert not page.run("return document.getElementById('shown').checkVisibility()") and not services.views
+
+
+def test_a_robot_passes_places_on_its_way(page: Browser, services: StubServices) -> None:
+    node = NodeId("r0", 1, 1)
+    services.said = Annotations(
+        tuple(Annotation(name, Place(node), False, "anna", 1) for name in ("east", "east wing"))
+    )
+    services.fleet = FleetStatus((RobotEntry("r0", True, place="east wing", floor="ground"),))
+    eventually(lambda: "at east wing, floor ground" in page.run(text_of("robots")))
+    eventually(lambda: "east wing" in page.run(text_of("names").replace("textContent", "innerHTML")))
+    page.run("document.querySelector('#robots button').click()")
+    facts = page.run(
+        "return [...document.querySelectorAll('#selected dt, #selected dd')].map(one => one.textContent)"
+    )
+    assert facts[facts.index("place") + 1] == "east wing" and facts[facts.index("floor") + 1] == "ground"
+    page.type("#goal", "home")
+    page.type("#via", "east wing, 3.1,-2.0 r0.1.1, east\n")
+    eventually(lambda: services.ways == [("home", ("east wing", "3.1,-2.0", "r0.1.1", "east"))])
+    eventually(lambda: "r0 stays where it is" in page.run(text_of("selected")))
 
 
 def test_errors_are_shown_on_the_page(page: Browser, services: StubServices, image: Path) -> None:
