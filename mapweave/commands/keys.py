@@ -55,6 +55,9 @@ def add_to(commands: Any) -> None:
     revoke.add_argument("name", metavar="NAME")
     revoke.add_argument("--because", default="", metavar="TEXT", help="why; the router's log says it")
     revoke.add_argument("--tokens", action="store_true", help="only the tokens for HTTP; the key stays good")
+    revoke.add_argument(
+        "--force", action="store_true", help="also the only server, which goes on with its key until it ends"
+    )
     revoke.set_defaults(run=_revoke)
 
     bundle = _action(actions, "bundle", "the one file to copy to a robot or person")
@@ -151,16 +154,14 @@ def _list(arguments: argparse.Namespace) -> int:
 def _revoke(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.identities.key_folder import KeyFolder
-    from mapweave.identities.tokens import end_tokens
 
+    folder = KeyFolder(arguments.keys)
     if arguments.tokens:
-        if KeyFolder(arguments.keys).find(arguments.name) is None or not end_tokens(
-            arguments.keys, arguments.name
-        ):
+        if folder.find(arguments.name) is None or not folder.end_tokens(arguments.name):
             raise InvalidValue(f"{arguments.name} has no token; `mapweave keys list` shows who has")
         print(f"the tokens of {arguments.name} are void, and who logged in with them is logged out")
         return 0
-    KeyFolder(arguments.keys).revoke(arguments.name, " ".join(arguments.because.split()))
+    folder.revoke(arguments.name, " ".join(arguments.because.split()), arguments.force)
     print(f"{arguments.name} is admitted no more; a running server takes note within seconds")
     return 0
 

@@ -9,7 +9,6 @@ NAME.key.toml     key file of NAME: copy it there
 
 from __future__ import annotations
 
-import os
 import re
 import secrets
 import socket
@@ -25,6 +24,7 @@ import msgspec
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, SettingsError
 from mapweave.hybridmap.node import check_name
+from mapweave.identities.folder_changes import kept_on_failure, locked
 from mapweave.identities.key_file import (
     SUFFIX,
     KeyFile,
@@ -33,7 +33,7 @@ from mapweave.identities.key_file import (
     write_key_file,
     write_private,
 )
-from mapweave.identities.tokens import add_token, end_tokens
+from mapweave.identities.tokens import add_token, end_tokens, time_of
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Access, Credentials, Member, Role
@@ -79,12 +79,17 @@ class Identity:
     revoked: str = ""
     void: tuple[tuple[str, str], ...] = ()
 
+    def __post_init__(self) -> None:
+        """Refuse an end that is no time (ValueError)."""
+        if self.expires:
+            time_of(self.expires)
+
     @property
     def state(self) -> str:
         """In a word or two."""
         if self.revoked:
             return f"revoked {self.revoked}"
-        over = self.expires and datetime.fromisoformat(self.expires) <= datetime.now(UTC)
+        over = self.expires and time_of(self.expires) <= datetime.now(UTC)
         return "expired" if over else "good"
 
 
@@ -110,7 +115,10 @@ class Catalogue:
 
 
 class KeyFolder:
-    """The keys of a fleet."""
+    """The keys of a fleet.
+
+    What changes them holds the folder's lock, and first reads what other processes have changed.
+    """
 
     def __init__(self, path: Path) -> None:
         """Read it.
@@ -119,8 +127,12 @@ class KeyFolder:
             SettingsError: it is missing or damaged.
         """
         self.path = path
+        self.catalogue = self._read_catalogue()
+
+    def _read_catalogue(self) -> Catalogue:
+        path = self.path
         try:
-            self.catalogue = msgspec.json.decode(read_whole(path / CATALOGUE), type=Catalogue)
+            return msgspec.json.decode(read_whole(path / CATALOGUE), type=Catalogue)
         except FileNotFoundError:
             raise SettingsError(f"{path}: no keys are here; make some with `mapweave keys init`") from None
         except NotADirectoryError:
@@ -138,8 +150,6 @@ class KeyFolder:
             SettingsError: there are keys already, or a host is no name or address.
             InvalidFile: the disk does not take them; nothing is left there.
         """
-        if (path / CATALOGUE).exists():
-            raise SettingsError(f"{path}: there are keys already; add to them with `mapweave keys add`")
         check_name(fleet)
         check_name(server)
         for host in hosts:
@@ -158,7 +168,11 @@ class KeyFolder:
         path.chmod(0o700)
         try:
             # A full disk leaves nothing, and not an authority without a server: moving takes no room.
-            with TemporaryDirectory(dir=path, prefix=".") as beside:
+            with locked(path), TemporaryDirectory(dir=path, prefix=".") as beside:
+                if (path / CATALOGUE).exists():
+                    raise SettingsError(
+                        f"{path}: there are keys already; add to them with `mapweave keys add`"
+                    )
                 try:
                     cls._fill(Path(beside), catalogue, server)
                 except InvalidFile as error:
@@ -199,6 +213,10 @@ class KeyFolder:
             InvalidValue: it has a key, and another role.
         """
         check_name(name)
+        with self._changing():
+            return self._add(name, role, days)
+
+    def _add(self, name: str, role: Role, days: float) -> Path:
         known = self.find(name)
         if known is not None and not known.revoked and known.role is not role:
             raise InvalidValue(f"{name} is a {known.role} already; revoke that key first")
@@ -219,27 +237,43 @@ class KeyFolder:
         else:
             credentials = Credentials(name, role, password=secrets.token_urlsafe(24))
             identity = Identity(name, role, subject, issued_at, void=void)
+        if known is not None and known.revoked:
+            # What a revocation that was cut off has left must not come back with the name.
+            end_tokens(self.path, name)
         path = self.path / f"{name}{SUFFIX}"
-        with _kept_on_failure(path, self.path / PASSWORDS):
+        with kept_on_failure(path, self.path / PASSWORDS):
             write_key_file(path, KeyFile(self.catalogue.fleet, self.catalogue.endpoints, credentials))
-            self._keep(identity)
+            self._keep(identity, credentials.password)
         return path
 
-    def revoke(self, name: str, because: str = "") -> None:
+    def revoke(self, name: str, because: str = "", force: bool = False) -> None:
         """Admit an identity no more.
 
+        Args:
+            name: whose key is revoked.
+            because: why.
+            force: also the only server.
+
         Raises:
-            InvalidValue: there is none, or its key is revoked.
+            InvalidValue: there is none, its key is revoked, or it is the only server.
         """
-        identity = self.find(name)
-        if identity is None or identity.revoked:
-            known = ", ".join(one.name for one in self.catalogue.identities if not one.revoked)
-            raise InvalidValue(f"{name} has no key; these have: {known}")
-        when = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-        said = f"{when}{f': {because}' if because else ''}"
-        end_tokens(self.path, name)
-        (self.path / f"{name}{SUFFIX}").unlink(missing_ok=True)
-        self._keep(replace(identity, revoked=said, void=(*identity.void, (identity.subject, said))))
+        with self._changing():
+            identity = self.find(name)
+            good = [one for one in self.catalogue.identities if not one.revoked]
+            if identity is None or identity.revoked:
+                raise InvalidValue(f"{name} has no key; these have: {', '.join(one.name for one in good)}")
+            if not force and [one.name for one in good if one.role is Role.SERVER] == [name]:
+                raise InvalidValue(
+                    f"{name} is the only server: add another one first, or give --force and then "
+                    f"`mapweave keys add {name} --role server`"
+                )
+            when = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+            said = f"{when}{f': {because}' if because else ''}"
+            with kept_on_failure(self.path / PASSWORDS):
+                self._keep(replace(identity, revoked=said, void=(*identity.void, (identity.subject, said))))
+            # Last: what could not be revoked stays as it was.
+            (self.path / f"{name}{SUFFIX}").unlink(missing_ok=True)
+            end_tokens(self.path, name)
 
     def token(self, name: str, days: float) -> str:
         """A new token with which an identity logs in over HTTP; only its hash is kept.
@@ -247,10 +281,18 @@ class KeyFolder:
         Raises:
             InvalidValue: there is no such identity with a good key.
         """
-        identity = self.find(name)
-        if identity is None or identity.state != "good":
-            raise InvalidValue(f"{name} has no good key: make one, `mapweave keys add {name} --role ROLE`")
-        return add_token(self.path, name, days)
+        with self._changing():
+            identity = self.find(name)
+            if identity is None or identity.state != "good":
+                raise InvalidValue(
+                    f"{name} has no good key: make one, `mapweave keys add {name} --role ROLE`"
+                )
+            return add_token(self.path, name, days)
+
+    def end_tokens(self, name: str) -> int:
+        """End all tokens of a name; returns how many there were."""
+        with locked(self.path):
+            return end_tokens(self.path, name)
 
     def find(self, name: str) -> Identity | None:
         """The identity of this name."""
@@ -264,16 +306,28 @@ class KeyFolder:
         """
         path = self.path / f"{name}{SUFFIX}"
         if not path.exists():
-            raise InvalidValue(f"{name} has no key here; make one with `mapweave keys add {name}`")
+            known = self.find(name)
+            role = f" --role {known.role}" if known is not None and known.role is not Role.ROBOT else ""
+            raise InvalidValue(f"{name} has no key here; make one with `mapweave keys add {name}{role}`")
         return path
 
-    def router(self, server: str, listen: Sequence[str] = (), routers: Sequence[str] = ()) -> BusSettings:
+    def router(
+        self,
+        server: str,
+        listen: Sequence[str] = (),
+        routers: Sequence[str] = (),
+        own: Credentials | None = None,
+    ) -> BusSettings:
         """Settings of one of the fleet's routers.
 
         Args:
             server: name of the map server, whose key the router has.
             listen: other endpoints than those of the keys.
             routers: that it joins.
+            own: the key that the router has, if not that of the folder.
+
+        Raises:
+            InvalidValue, SettingsError: the server's key is not here, or cannot be read.
         """
         catalogue = self.catalogue
         good = [Member(one.name, one.role, one.subject) for one in catalogue.identities if not one.revoked]
@@ -282,54 +336,49 @@ class KeyFolder:
         return BusSettings(
             mode="router", listen=tuple(listen) or catalogue.listen, routers=tuple(routers),
             fleet=catalogue.fleet,
-            credentials=read_key_file(self.key_file(server)).credentials,
+            credentials=own or read_key_file(self.key_file(server)).credentials,
             access=Access(tuple(good), passwords, tuple(bad)),
         )  # fmt: skip
 
     def changed(self) -> bool:
         """Whether identities came or went since this was read; afterwards this knows them."""
         before = self.catalogue
-        self.catalogue = KeyFolder(self.path).catalogue
+        self.catalogue = self._read_catalogue()
         return self.catalogue != before
 
-    def _keep(self, identity: Identity) -> None:
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Hold the folder's lock, and know what others have changed before."""
+        with locked(self.path):
+            self.catalogue = self._read_catalogue()
+            yield
+
+    def _keep(self, identity: Identity, password: str = "") -> None:
         others = tuple(one for one in self.catalogue.identities if one.name != identity.name)
         catalogue = replace(self.catalogue, identities=(*others, identity))
         if self.profile is Profile.LAB:
-            users = [one.name for one in catalogue.identities if not one.revoked]
-            lines = [f"{name}:{read_key_file(self.key_file(name)).credentials.password}" for name in users]
-            write_private(self.path / PASSWORDS, "\n".join(lines) + "\n")
+            good = {one.name for one in others if not one.revoked}
+            lines = [line for line in self._password_lines() if line.partition(":")[0] in good]
+            if not identity.revoked:
+                lines.append(f"{identity.name}:{password}")
+            write_private(self.path / PASSWORDS, "".join(f"{line}\n" for line in lines))
         # Last: the server reads all of it again when this has changed.
         text = msgspec.json.format(msgspec.json.encode(catalogue), indent=1)
         write_whole(self.path / CATALOGUE, text)
         give_to_folders_owner(self.path / CATALOGUE)
         self.catalogue = catalogue
 
+    def _password_lines(self) -> list[str]:
+        """As the router reads them; from key files, which may have been moved, only if these are gone."""
+        if (self.path / PASSWORDS).exists():
+            return self._read(PASSWORDS).splitlines()
+        known = {one.name: self.path / f"{one.name}{SUFFIX}" for one in self.catalogue.identities}
+        return [
+            f"{n}:{read_key_file(path).credentials.password}" for n, path in known.items() if path.exists()
+        ]
+
     def _read(self, name: str) -> str:
         try:
             return read_whole(self.path / name).decode()
         except (OSError, UnicodeDecodeError) as error:
             raise SettingsError(f"{self.path / name}: {error}") from None
-
-
-@contextmanager
-def _kept_on_failure(*paths: Path) -> Iterator[None]:
-    """Put files back as they were if what is done fails; on a full disk a name is left, but no room."""
-    before = {path: path.with_name(f".{path.name}.before") for path in paths}
-    for path, kept in before.items():
-        kept.unlink(missing_ok=True)
-        if path.exists():
-            os.link(path, kept)
-    try:
-        yield
-    except BaseException:
-        for path, kept in before.items():
-            if kept.exists():
-                kept.replace(path)
-            else:
-                path.unlink(missing_ok=True)
-        raise
-    finally:
-        # Also behind a failure: two names of one file are left by a replacement.
-        for kept in before.values():
-            kept.unlink(missing_ok=True)

@@ -1,6 +1,7 @@
 """Tokens with which members of a fleet log in over HTTP. Only their hashes are kept, beside the identities.
 
-A token is 32 random bytes, so its plain SHA-256 cannot be turned back, and no guess meets it.
+A token is 32 random bytes, so its plain SHA-256 cannot be turned back, and no guess meets it. They
+are changed by `KeyFolder`, with the lock of its folder held.
 """
 
 from __future__ import annotations
@@ -40,10 +41,29 @@ class Token:
     issued: str
     expires: str
 
+    def __post_init__(self) -> None:
+        """Refuse an end that is no time (ValueError)."""
+        time_of(self.expires)
+
     @property
     def expired(self) -> bool:
         """Whether it has ended."""
-        return datetime.fromisoformat(self.expires) <= datetime.now(UTC)
+        return time_of(self.expires) <= datetime.now(UTC)
+
+
+def time_of(words: str) -> datetime:
+    """A time in the words of ISO 8601.
+
+    Raises:
+        ValueError: it is none, or its offset from UTC is missing.
+    """
+    try:
+        time = datetime.fromisoformat(words)
+    except ValueError:
+        time = None
+    if time is None or time.tzinfo is None:
+        raise ValueError(f"{words[:40]!r} is no time with its offset from UTC")
+    return time
 
 
 def hash_of(token: str) -> str:

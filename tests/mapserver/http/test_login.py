@@ -26,7 +26,7 @@ from mapweave.hybridmap.errors import SettingsError
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
-from mapweave.identities.tokens import TOKENS, end_tokens
+from mapweave.identities.tokens import TOKENS
 from mapweave.mapserver.http import sessions
 from mapweave.mapserver.http.rates import MOST_PEOPLE, QUESTIONS, Rates
 from mapweave.mapserver.http.serving import MAX_WAITING, Limits
@@ -197,7 +197,7 @@ def revoke_identity(keyed: Keyed) -> None:
 
 
 def revoke_tokens(keyed: Keyed) -> None:
-    assert end_tokens(keyed.folder.path, "vera") == 1
+    assert keyed.folder.end_tokens("vera") == 1
 
 
 def damage_tokens(keyed: Keyed) -> None:

@@ -1,0 +1,185 @@
+"""Changes of a folder of keys: by several processes at once, with files moved away or damaged."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue, SettingsError
+from mapweave.identities import key_folder
+from mapweave.identities.key_folder import KeyFolder, Profile
+from mapweave.identities.logins import Logins
+from mapweave.identities.tokens import TOKENS, read_tokens
+from mapweave.wire.credentials import Role
+from tests.mapweave.command_line import complaint
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> KeyFolder:
+    """Of the lab profile: passwords are kept in a file of their own, too."""
+    folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0")
+    for name in ("r0", "r1", "r2"):
+        folder.add(name, Role.ROBOT)
+    return folder
+
+
+def at_once(folder: Path, *actions: str) -> None:
+    """Run each action in a process of its own, when all have read the folder."""
+    head = (
+        "import sys\nfrom pathlib import Path\n"
+        "from mapweave.identities.key_folder import KeyFolder, Profile\n"
+        "from mapweave.wire.credentials import Role\n"
+        f"path = Path({str(folder)!r})\n"
+        "folder = KeyFolder(path) if path.exists() else None\n"
+        "print(flush=True)\nsys.stdin.readline()\n"
+    )
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-c", head + action],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )
+        for action in actions
+    ]  # fmt: skip
+    for process in running:
+        assert process.stdout is not None and process.stdout.readline() == "\n"
+    for process in running:
+        assert process.stdin is not None
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    for process in running:
+        _, errors = process.communicate(timeout=60)
+        assert (process.returncode, errors) == (0, "")
+
+
+def users(folder: KeyFolder) -> list[str]:
+    """Who has a password."""
+    return [line.partition(":")[0] for line in (folder.path / "passwords").read_text().splitlines()]
+
+
+def test_changes_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
+    new = [f"a{k}" for k in range(4)]
+    at_once(folder.path, "folder.revoke('r1')", *(f"folder.add('{name}', Role.ROBOT)" for name in new))
+    good = {one.name for one in KeyFolder(folder.path).catalogue.identities if not one.revoked}
+    assert good == {"s0", "r0", "r2", *new}
+    assert sorted(users(folder)) == sorted(good)
+    assert {path.name.partition(".")[0] for path in folder.path.glob("*.key.toml")} == good
+
+
+def test_tokens_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
+    folder.token("r1", 1.0)
+    tokens = [f"[folder.token('{name}', 1.0) for _ in range(10)]" for name in ("r0", "r2", "s0")]
+    at_once(folder.path, "folder.end_tokens('r1')", *tokens)
+    names = [one.name for one in read_tokens(folder.path)]
+    assert {name: names.count(name) for name in names} == {"r0": 10, "r2": 10, "s0": 10}
+
+
+def test_of_two_authorities_at_once_one_is_made(tmp_path: Path) -> None:
+    create = (
+        "try:\n    KeyFolder.create(path, 'demo', Profile.PRODUCTION, [], 's0')\n"
+        "    Path(f'{path}.made').open('x')\n"
+        "except Exception as error:\n    assert 'there are keys already' in str(error), error\n"
+    )
+    at_once(tmp_path / "keys", *[create] * 3)
+    assert (tmp_path / "keys.made").exists()
+    folder = KeyFolder(tmp_path / "keys")
+    certificate = folder.router("s0").credentials
+    assert certificate is not None and certificate.authority == (folder.path / "authority.pem").read_text()
+
+
+def test_a_key_file_that_was_moved_holds_up_no_change(folder: KeyFolder, tmp_path: Path) -> None:
+    """To its robot, instead of a copy: its own password stays good."""
+    (folder.path / "r0.key.toml").rename(tmp_path / "r0.key.toml")
+    folder.revoke("r1")
+    folder.add("r9", Role.ROBOT)
+    assert users(folder) == ["s0", "r0", "r2", "r9"]
+    folder.revoke("r0")
+    assert users(folder) == ["s0", "r2", "r9"]
+    (folder.path / "passwords").unlink()
+    folder.revoke("r9")
+    assert users(folder) == ["s0", "r2"], "as the key files say"
+
+
+@pytest.mark.parametrize("file", ["passwords", "fleet.json"])
+def test_a_revocation_that_fails_changes_nothing(
+    file: str, folder: KeyFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder.token("r1", 1.0)
+    before = {path.name: path.read_bytes() for path in folder.path.iterdir()}
+
+    def refusing(write: Callable[..., None]) -> Callable[..., None]:
+        def refuse(path: Path, *content: object) -> None:
+            if path.name == file:
+                raise InvalidFile("full")
+            write(path, *content)
+
+        return refuse
+
+    for name in ("write_whole", "write_private"):
+        monkeypatch.setattr(key_folder, name, refusing(getattr(key_folder, name)))
+    with pytest.raises(InvalidFile, match="full"):
+        folder.revoke("r1")
+    assert {path.name: path.read_bytes() for path in folder.path.iterdir()} == before
+    monkeypatch.undo()
+    folder.revoke("r1")
+    assert read_tokens(folder.path) == () and not (folder.path / "r1.key.toml").exists()
+
+
+def test_tokens_that_a_broken_off_revocation_left_do_not_come_back(
+    folder: KeyFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token = folder.token("r1", 1.0)
+
+    def interrupted(folder: Path, name: str) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(key_folder, "end_tokens", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        folder.revoke("r1")
+    monkeypatch.undo()
+    assert Logins(folder.path).login(token) is None
+    folder.add("r1", Role.VIEWER)
+    assert Logins(folder.path).login(token) is None
+
+
+def test_the_only_server_is_revoked_by_force_alone(
+    folder: KeyFolder, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A running router keeps its key, and no other could be started."""
+    assert "s0 is the only server: add another one first" in complaint(
+        capfd, "keys", "revoke", "s0", "--keys", folder.path
+    )
+    with pytest.raises(InvalidValue, match="only server"):
+        folder.revoke("s0")
+    folder.revoke("s0", force=True)
+    with pytest.raises(InvalidValue, match="mapweave keys add s0 --role server"):
+        folder.key_file("s0")
+    folder.add("s1", Role.SERVER)
+    folder.add("s2", Role.SERVER)
+    folder.revoke("s1")
+
+
+@pytest.mark.parametrize("expires", ["2027-01-01T00:00:00x", "2027-01-01T00:00:00", "soon"])
+def test_a_damaged_date_is_one_line_and_lets_no_client_in(
+    expires: str, folder: KeyFolder, capfd: pytest.CaptureFixture[str]
+) -> None:
+    token = folder.token("r1", 1.0)
+    logins = Logins(folder.path)
+    assert logins.login(token) is not None
+    for name in (TOKENS, "fleet.json"):
+        content = json.loads((folder.path / name).read_text())
+        rows = content if name == TOKENS else content["identities"]
+        rows[-1]["expires"] = expires
+        good = (folder.path / name).read_bytes()
+        (folder.path / name).write_text(json.dumps(content))
+        line = complaint(capfd, "keys", "list", "--keys", folder.path)
+        assert name in line and expires in line
+        assert logins.login(token) is None
+        (folder.path / name).write_bytes(good)
+        assert logins.login(token) is not None
+    with pytest.raises(SettingsError, match="no keys are here"):
+        KeyFolder(folder.path / "elsewhere")
