@@ -34,8 +34,6 @@ _D = TypeVar("_D", bound=Declared)
 SILENT, UNANSWERED = 20.0, 10.0
 """After so long without any message a client asks its router for a sign of life, and connects again if none
 comes for so long, s. A router that is gone is noticed earlier, by Zenoh."""
-REFUSALS = "off,zenoh_link_tls=warn,zenoh_transport=warn"
-"""What of Zenoh's own log a router with keys shows."""
 
 
 class ZenohBus:
@@ -234,9 +232,10 @@ class ZenohBus:
         members = {member.subject: member for member in access.members}
         revoked = dict(access.revoked)
         known: set[str] = set()
+        certified = self._settings.credentials is not None and self._settings.credentials.certified
 
         def report(event: zenoh.LinkEvent) -> None:
-            subject, where = event.link.auth_identifier or "a client without a name", str(event.link.dst)
+            subject, where = event.link.auth_identifier or "a client", str(event.link.dst)
             if event.kind == zenoh.SampleKind.DELETE:
                 known.discard(where)
                 log.info("%s at %s disconnects", subject, where)
@@ -244,7 +243,10 @@ class ZenohBus:
             if where in known:
                 return
             known.add(where)
-            if subject in members:
+            if not certified:
+                # Zenoh has checked the password, and does not say whose it was.
+                log.info("%s connects from %s", subject, where)
+            elif subject in members:
                 log.info("%s %s connects from %s", members[subject].role, members[subject].name, where)
             elif subject in revoked:
                 log.warning("refused: %s at %s: this key was revoked %s", subject, where, revoked[subject])
@@ -335,9 +337,6 @@ def _end(session: zenoh.Session) -> None:
 
 def _open_router(settings: BusSettings) -> zenoh.Session:
     allow_many_files()
-    if settings.access is not None:
-        # Zenoh itself says why it refuses a handshake: a foreign authority, no certificate, a wrong password.
-        zenoh.init_log_from_env_or(REFUSALS)
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:

@@ -40,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.terminal import log_with_time, stamped
     from mapweave.wire.zenoh_bus import ZenohBus
     from mapweave.wire.zenoh_config import router_file
+    from mapweave.wire.zenoh_log import show_refusals
 
     log_with_time(arguments.log_format)
     network = network_of(arguments, settings_of(arguments))
@@ -48,6 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(router_file(settings))
         return 0
     stop = stop_on_signals()
+    if keys is not None:
+        show_refusals(arguments.log_format)
     bus = ZenohBus(settings)
     try:
         print(stamped(f"router listens at {', '.join(settings.listen)}"), flush=True)

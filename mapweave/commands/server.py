@@ -90,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.terminal import log_with_time, stamped
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
+    from mapweave.wire.zenoh_log import show_refusals
 
     # Lines have dates, so that a log shows when two maps came apart.
     log_with_time(arguments.log_format)
@@ -116,6 +117,8 @@ def run(arguments: argparse.Namespace) -> int:
 
         people = http_access(http, folder, name)
     stop = stop_on_signals()
+    if folder is not None:
+        show_refusals(arguments.log_format)
     bus = ZenohBus(router)
     try:
         how = ServerSettings(settings.admission_control, settings.merge, settings.quotas, cluster)

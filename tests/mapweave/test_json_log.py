@@ -6,15 +6,18 @@ import io
 import json
 import logging
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.json_log import JsonFormatter
 from mapweave.wire.log_messages import Mark
 from mapweave.wire.memory import MemoryHub
@@ -86,3 +89,35 @@ def test_every_line_of_a_process_is_an_object_also_its_last(tmp_path: Path) -> N
     (listens, *_), (fails,) = objects(first + rest), objects(again.stdout)
     assert (listens["level"], listens["message"]) == ("info", f"router listens at tcp/127.0.0.1:{port}")
     assert again.returncode == 1 and fails["level"] == "error" and str(port) in fails["message"]
+
+
+@pytest.mark.parametrize("log_format", ["text", "json"])
+def test_a_refused_handshake_leaves_the_log_as_it_is(log_format: str, tmp_path: Path) -> None:
+    """Zenoh, which refuses it, writes lines of its own."""
+    port = free_port()
+    KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0", port)
+    words = [sys.executable, "-m", "mapweave", "router", "--keys", "keys", "--log-format", log_format]
+    words += ["--listen", f"tls/127.0.0.1:{port}"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "cwd": tmp_path}
+    with subprocess.Popen(words, **pipes) as router:
+        assert router.stdout is not None
+        try:
+            lines = router.stdout.readline()
+            with socket.create_connection(("127.0.0.1", port)) as stranger:
+                stranger.settimeout(30)
+                stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+                with suppress(ConnectionResetError):
+                    while stranger.recv(100):
+                        pass
+            if log_format == "text":
+                lines += router.stdout.readline()
+        finally:
+            router.send_signal(signal.SIGTERM)
+            lines += router.communicate(timeout=30)[0]
+    assert router.returncode == 0
+    if log_format == "json":
+        (listens,) = objects(lines)
+        assert str(port) in listens["message"]
+    else:
+        _, refused = lines.splitlines()
+        assert "received corrupt message" in refused and "\x1b" not in lines
