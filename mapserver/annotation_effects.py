@@ -29,7 +29,8 @@ def effects_of(annotation: Annotation, places: Places) -> Iterator[str]:
             # A closure of tomorrow has no effect now: at its beginning it has the one that is meant.
             when = (body.begin_ns or 0) if isinstance(body, Closure) else annotation.stamp_ns
             rules = RouteRules(places.router.roads, Annotations((annotation,)), when)
-            yield f"{_counted(len(rules.closed or rules.factors), 'way')} of robots"
+            verb = "closes" if isinstance(body, Closure) else "holds for"
+            yield f"it {verb} {_counted(len(rules.closed or rules.factors), 'way')} of robots"
         case Floor(node, label):
             floors = {**places.annotations.floors, node.map: label}
             apart = sum(

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor
+from mapweave.hybridmap.constraint_subject import nodes_in_words
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.manual_constraint import ManualConstraints
@@ -17,7 +18,8 @@ from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places
-from mapweave.mapserver.portals import check_portal
+from mapweave.mapserver.portals import Portals, check_portal
+from mapweave.mapserver.routes import Router
 from mapweave.mapserver.services import guarded
 from mapweave.merge.floors import floor_of, held_together
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -125,7 +127,7 @@ class Annotator:
         return self._places().answer(request)
 
     def annotate(self, annotation: Annotation, check: bool = False) -> str:
-        """Add an annotation to the record, from any thread; returns what it says, in words.
+        """Add an annotation to the record, from any thread; returns what it says and does, in words.
 
         Args:
             annotation: the new one.
@@ -137,14 +139,15 @@ class Annotator:
         with self._turn:
             places, annotations = self._places(), self._record.annotations
             check_annotation(places.merged, annotations, annotation, self._constraints())
+            check_closure(places.router, annotations, annotation)
             self._check(annotation)
+            words = "; ".join((annotation.words, *effects_of(annotation, places)))
             if check:
-                words = "; ".join((annotation.words, *effects_of(annotation, places)))
                 return f"only checked, nothing is changed: {words}"
             self._record.add(annotation)
             self._changed(self._record.annotations)
-        log.warning("%s", annotation.words)
-        return annotation.words
+        log.warning("%s", words)
+        return words
 
     def _annotate(self, request: Request, who: str) -> None:
         def annotate(payload: bytes) -> bytes:
@@ -191,6 +194,31 @@ def check_annotation(
             check_portal(merged, annotations, name, body)
         case Floor():
             _check_floor(merged, annotations, body, constraints)
+
+
+def check_closure(router: Router, annotations: Annotations, annotation: Annotation) -> None:
+    """Refuse to close an edge that is none: its barrier would close the ways of others.
+
+    Args:
+        router: of the merged map.
+        annotations: the record, with portals.
+        annotation: the new one, of any kind.
+
+    Raises:
+        InvalidValue: no edge and no portal joins the two, or one is not there.
+    """
+    body = annotation.body
+    if annotation.removed or not isinstance(body, Closure) or body.edge is None:
+        return
+    first, second = body.edge
+    for node in body.edge:
+        router.merged.check(node)
+    graph = router.roads.union.graph
+    if graph.has_edge(first, second) or Portals(router.merged, annotations).between(first, second):
+        return
+    joined = sorted(graph.adj[first]) if first in graph else []
+    edges = f" ({first} has edges to {nodes_in_words(joined)})" if joined else ""
+    raise InvalidValue(f"no edge joins {first} and {second}{edges}: give two nodes of one edge, or an area")
 
 
 def _check_floor(

@@ -15,8 +15,9 @@ from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.annotation_words import annotation_of_words
-from mapweave.mapserver.annotator import check_annotation
+from mapweave.mapserver.annotator import check_annotation, check_closure
 from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
@@ -115,6 +116,10 @@ class OfflineAnnotations:
         )
         constraints = ManualConstraints(self._opened.content.constraints)
         check_annotation(self._router.merged, self.annotations(), annotation, constraints)
+        check_closure(self._router, self.annotations(), annotation)
+        words = "; ".join(
+            (annotation.words, *effects_of(annotation, Places(self._router, self.annotations())))
+        )
         body = annotation.body
         if isinstance(body, FloorPlan) and not annotation.removed:
             self.plan_image(body.image.sha256)
@@ -129,4 +134,4 @@ class OfflineAnnotations:
         if isinstance(body, Pin) and content.poses:
             content = replace(content, poses=dict(self.merged.poses))
         write_map_file(self._out, content)
-        return annotation.words
+        return words

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable
 
@@ -66,6 +67,7 @@ def test_what_is_closed_from_the_shell_holds_for_all(
                 "close", "kitchen", "--radius", "0.02", "--until", "+2h", "--because", "paint", "--by", "bob"
             )
             assert status == 0 and out.startswith("until ") and "UTC)\nclosure kitchen is an area" in out
+            assert re.search(r'by bob: "paint"; it closes \d+ ways? of robots$', out.strip())
             answer = asks()
             assert (answer.granted, answer.closed) == (0, True)
             assert "the way ahead is closed by bob until" in answer.reason and '"paint"' in answer.reason

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -180,6 +181,22 @@ def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: st
     status, answer = small.http("POST", body)
     assert status == 400 and words in answer["error"], answer
     assert small.http("GET") == (200, {"constraints": []})
+
+
+def test_a_closure_of_an_edge_that_is_none_is_refused_and_others_say_how_much_they_close(
+    small: Asking, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(InvalidValue, match=r"^no edge joins a\.1\.1 and b\.1\.5 \(a\.1\.1 has edges to node"):
+        small.fleet.annotate("closure", "nowhere", edge=["a.1.1", "b.1.5"])
+    assert not small.fleet.annotations().made
+    # Likewise in a file.
+    path = tmp_path / "both.mapweave"
+    small.fleet.save(path)
+    capfd.readouterr()
+    assert main(["close", "a.1.1", "b.1.5", "--map", str(path)]) == 1
+    assert capfd.readouterr().err.startswith("mapweave: no edge joins a.1.1 and b.1.5 (")
+    assert main(["close", "a.1.1", "a.1.3", "--map", str(path)]) == 0
+    assert re.search(r"; it closes \d+ ways? of robots$", capfd.readouterr().out.strip())
 
 
 @pytest.fixture(scope="module")
