@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from mapweave.hybridmap.annotation import Annotation
+from mapweave.hybridmap.annotation import Annotation, Preference
 from mapweave.hybridmap.explanation import Hop, MapsExplanation, RouteExplanation
 from mapweave.hybridmap.node import Edge, MapId, NodeId
 from mapweave.hybridmap.portal import PortalStop
@@ -15,7 +15,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.route import Route, edge_cost
 from mapweave.mapserver.roadmap import IMPLIED
-from mapweave.mapserver.route_rules import RouteRules, rule_words
+from mapweave.mapserver.route_rules import OUT, RouteRules, named_words
 from mapweave.mapserver.routes import WARY_COST, Router
 from mapweave.merge.explanation.component_changes import joined_maps
 from mapweave.merge.explanation.map_explanation import explain_maps
@@ -52,14 +52,16 @@ class _Hindrances:
             return "reported as blocked"
         for closure in self.rules.closed.get(pair, ()):
             if closure not in self.within:
-                return rule_words(closure)
+                return named_words([closure])
         if pair in self.wary:
             return f"another robot recently could not get through: {self.wary_cost:g} m dearer"
         return ""
 
     def preferred(self, pair: frozenset[NodeId]) -> str:
-        """Who prefers or avoids a pair, in words; empty if it is not so."""
-        return "; ".join(map(rule_words, self.rules.preferences.get(pair, ())))
+        """Why a pair on a way costs less or more than by itself, in words; empty if it is not so."""
+        leaving = [entry.name for entry in self.rules.closed.get(pair, ()) if entry in self.within]
+        said = [f"in {' and '.join(leaving)}, which is closed (cost times {OUT:g})"] if leaving else []
+        return "; ".join((*said, *(named_words([entry]) for entry in self.rules.preferences.get(pair, ()))))
 
 
 def explain_route(
@@ -109,27 +111,57 @@ def explain_route(
     best = router.ways(poses, toll=0.0, within=within).find(start, goal)
     gaps = _gaps(router, best, poses, hindrances) if best.cost < route.cost - CLEARLY else ()
     hops = tuple(_hops(router, route, poses, hindrances))
-    reason = _why(router, route, best, hops, gaps)
+    reason = _why(router, route, best, hops, gaps) + _leaving(within)
     if rules:
         free = router.ways(poses, blocked, wary, within=None).find(start, goal)
-        reason += _detour(router, route, free, poses, hindrances)
+        reason += _detour(router, route, free, poses)
     return RouteExplanation(start, goal, True, reason, hops, gaps)
 
 
-def _detour(
-    router: Router, route: Route, free: Route, poses: Mapping[NodeId, Pose2], hindrances: _Hindrances
-) -> str:
+def _leaving(within: Collection[Annotation]) -> str:
+    """That a route begins where robots may not drive, in words; empty if it does not."""
+    if not within:
+        return ""
+    closed = named_words(sorted(within, key=lambda entry: entry.name))
+    return f"; it begins in a closed area, which a robot may leave: {closed}"
+
+
+def _detour(router: Router, route: Route, free: Route, poses: Mapping[NodeId, Pose2]) -> str:
     """What closures and preferences change of a route, in words; empty if it is the same without them."""
     if not free.nodes or free.nodes == route.nodes:
         return ""
-    of = router.merged.component_of
-    longer = _length(route, poses, of) - _length(free, poses, of)
-    reasons = [
-        hindrances.words(pair) or hindrances.preferred(pair) for pair in map(frozenset, pairwise(free.nodes))
+    rules, of = router.rules, router.merged.component_of
+    taken, left = ([frozenset(pair) for pair in pairwise(way.nodes)] for way in (route, free))
+    # What both ways have in common is no reason to choose one of them.
+    against = [
+        entry
+        for pair in left
+        if pair not in taken
+        for entry in (*rules.closed.get(pair, ()), *_preferences(rules, pair, lambda factor: factor > 1.0))
     ]
-    reasons += [hindrances.preferred(pair) for pair in map(frozenset, pairwise(route.nodes))]
-    said = "; ".join(dict.fromkeys(filter(None, reasons)))
-    return f"; a detour of {longer:.1f} m, since the way without it is {said}" if said else ""
+    in_favour = [
+        entry
+        for pair in taken
+        if pair not in left
+        for entry in _preferences(rules, pair, lambda factor: factor < 1.0)
+    ]
+    longer = _length(route, poses, of) - _length(free, poses, of)
+    # Rules act on the cost, so that a way may also be shorter by them.
+    said = f"; a detour of {longer:.1f} m" if round(longer, 1) > 0.0 else ""
+    if against:
+        said = f"{said or '; a way that would cost less is not taken'}, since {named_words(against)}"
+    if in_favour:
+        said += f"; it leads this way since {named_words(in_favour)}"
+    return said if against or in_favour else ""
+
+
+def _preferences(
+    rules: RouteRules, pair: frozenset[NodeId], wanted: Callable[[float], bool]
+) -> Iterator[Annotation]:
+    """Preferences of a pair that have such factors."""
+    for entry in rules.preferences.get(pair, ()):
+        if isinstance(entry.body, Preference) and wanted(entry.body.factor):
+            yield entry
 
 
 def _length(route: Route, poses: Mapping[NodeId, Pose2], of: Callable[[NodeId], int | None]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -179,15 +179,14 @@ class RouteRules:
         barrier = np.array([middle - aside, middle + aside])
         return _Extent(entry, number, barrier, False, edge)
 
-    def _hops(self, extent: _Extent) -> Iterator[Hop]:
+    def _hops(self, extent: _Extent) -> set[Hop]:
         """The pairs of nodes whose ways it is about."""
+        # An edge crosses its own barrier: as a set it is among them once.
+        hops = set() if extent.edge is None else {frozenset(extent.edge)}
         pairs, begin, end = self._roads.segments(extent.component)
-        if extent.edge is not None:
-            yield frozenset(extent.edge)
-            if np.allclose(*extent.polygon):
-                return
-        for k in np.flatnonzero(extent.covers(begin, end)) if len(pairs) else ():
-            yield frozenset(pairs[int(k)])
+        if pairs and not (hops and np.allclose(*extent.polygon)):
+            hops |= {frozenset(pairs[int(k)]) for k in np.flatnonzero(extent.covers(begin, end))}
+        return hops
 
 
 def rule_words(entry: Annotation) -> str:
@@ -200,3 +199,8 @@ def rule_words(entry: Annotation) -> str:
     assert isinstance(entry.body, Closure), "the other rule"
     until = "" if entry.body.end_ns is None else f" until {utc_words(entry.body.end_ns)}"
     return f"closed {who}{until}{why}"
+
+
+def named_words(entries: Iterable[Annotation]) -> str:
+    """Closures and preferences with their names, for example `door is closed by anna: "wet floor"`."""
+    return " and ".join(dict.fromkeys(f"{entry.name} is {rule_words(entry)}" for entry in entries))

@@ -16,8 +16,10 @@ from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.route import edge_cost
+from mapweave.mapserver.annotator import check_closure
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.places import Places
@@ -141,8 +143,8 @@ def test_an_explanation_names_who_closed_the_way_until_when_and_the_detour(grid)
     router = grid.at(law(said("door", Closure((at(1, 0), at(2, 0)), None, None, 4 * HOUR))), 0)
     explanation = explain_route(router, at(0, 0), at(4, 0))
     assert explanation.found and len(explanation.hops) == 6
-    closed = 'closed by anna until 1970-01-01 04:00 UTC: "wet floor"'
-    assert f"a detour of 2.0 m, since the way without it is {closed}" in explanation.reason
+    closed = 'door is closed by anna until 1970-01-01 04:00 UTC: "wet floor"'
+    assert explanation.reason.endswith(f"; a detour of 2.0 m, since {closed}")
     assert [(gap.a, gap.b, gap.words) for gap in explanation.gaps] == [(at(1, 0), at(2, 0), closed)]
     every = law(*(said(f"e{y}", Closure((at(1, y), at(2, y)))) for y in range(SIZE)))
     none = explain_route(grid.at(every, 0), at(0, 0), at(4, 0))
@@ -157,13 +159,78 @@ def test_an_explanation_names_who_closed_the_way_until_when_and_the_detour(grid)
 def test_an_explanation_names_who_prefers_a_way(grid) -> None:
     row = Preference(0.2, None, rectangle(-0.5, 0.5, 4.5, 1.5))
     explanation = explain_route(grid.at(law(said("row", row)), 0), at(0, 0), at(4, 0))
-    assert (
-        "a detour of 2.0 m" in explanation.reason
-        and "preferred by anna (cost times 0.2)" in explanation.reason
-    )
-    assert sum("preferred by anna" in hop.words for hop in explanation.hops) >= 4
+    preferred = 'row is preferred by anna (cost times 0.2): "wet floor"'
+    assert explanation.reason.endswith(f"; a detour of 2.0 m; it leads this way since {preferred}")
+    assert sum(preferred in hop.words for hop in explanation.hops) >= 4
     total = sum(hop.cost for hop in explanation.hops)
     assert f"cost {total:.2f} m" in explanation.reason
+
+
+def test_a_way_that_is_avoided_is_named_and_no_detour_is_said_where_the_other_is_no_longer(grid) -> None:
+    """Rules act on the cost, a detour is one in metres: of two ways of one length neither is one."""
+    here, there = at(0, 0), at(1, 1)
+    first = explain_route(grid, here, there).hops[0].b
+    avoided = said("carpet", Preference(10.0, (here, first)))
+    reason = explain_route(grid.at(law(avoided), 0), here, there).reason
+    why = 'carpet is avoided by anna (cost times 10): "wet floor"'
+    assert "detour" not in reason and reason.endswith(
+        f"; a way that would cost less is not taken, since {why}"
+    )
+    second = at(1, 0) if first == at(0, 1) else at(0, 1)
+    preferred = said("hall", Preference(0.2, (here, second)))
+    reason = explain_route(grid.at(law(preferred), 0), here, there).reason
+    assert "detour" not in reason and "since the way" not in reason
+    assert reason.endswith(
+        '; it leads this way since hall is preferred by anna (cost times 0.2): "wet floor"'
+    )
+    # What both ways have in common, and what speaks for the way that is left, is no reason.
+    common = said("ramp", Preference(3.0, (at(0, 0), at(1, 0))))
+    straight = [
+        said("door", Closure((at(2, 0), at(3, 0)))),
+        said("mat", Preference(0.9, (at(3, 0), at(4, 0)))),
+    ]
+    closed = said("gate", Closure((at(0, 0), at(0, 1))))
+    explanation = explain_route(grid.at(law(common, *straight, closed), 0), at(0, 0), at(4, 0))
+    assert "; a detour of 2.0 m, since door is closed by anna" in explanation.reason
+    assert "ramp" not in explanation.reason and "mat" not in explanation.reason
+
+
+@pytest.mark.parametrize("factor", [0.5, 4.0])
+def test_an_edge_has_its_factor_once(grid, factor: float) -> None:
+    """It crosses its own barrier, as parallel edges of other robots do."""
+    pair = at(1, 0), at(2, 0)
+    rules = grid.at(law(said("mat", Preference(factor, pair))), 0).rules
+    assert rules.factors == {frozenset(pair): factor}
+    (named,) = rules.preferences.values()
+    assert [entry.name for entry in named] == ["mat"]
+    closed = grid.at(law(said("door", Closure(pair))), 0).rules.closed
+    assert [entry.name for entry in closed[frozenset(pair)]] == ["door"]
+
+
+def test_a_route_that_begins_in_a_closed_area_says_so(grid) -> None:
+    entry = said("kitchen", Closure(None, rectangle(-0.5, -0.5, 1.5, 4.5)))
+    explanation = explain_route(grid.at(law(entry), 0), at(0, 0), at(4, 0))
+    assert explanation.found and explanation.reason.endswith(
+        '; it begins in a closed area, which a robot may leave: kitchen is closed by anna: "wet floor"'
+    )
+    dear = [hop for hop in explanation.hops if "in kitchen, which is closed (cost times 4)" in hop.words]
+    assert [(hop.a, hop.b) for hop in dear] == [(at(0, 0), at(1, 0)), (at(1, 0), at(2, 0))]
+    assert dear[0].cost == pytest.approx(4.0 * explanation.hops[-1].cost, rel=0.01)
+    outside = explain_route(grid.at(law(entry), 0), at(3, 0), at(4, 0))
+    assert "kitchen" not in outside.reason and "kitchen" not in outside.hops[0].words
+
+
+def test_ways_that_are_no_edges_are_not_closed(grid) -> None:
+    """A barrier between nodes that nothing joins would close the ways of others between the two."""
+    wrong = said("door", Closure((at(0, 0), at(4, 0))))
+    with pytest.raises(InvalidValue, match=r"no edge joins a.1.1 and a.1.5 \(a.1.1 has edges to nodes a.1.2"):
+        check_closure(grid, law(), wrong)
+    check_closure(grid, law(), replace(wrong, removed=True))
+    with pytest.raises(InvalidValue, match=r"z\.1"):
+        check_closure(grid, law(), said("door", Closure((at(0, 0), NodeId("z", 1, 1)))))
+    check_closure(grid, law(), said("door", Closure((at(1, 0), at(0, 0)))))
+    door = Annotation("door", Portal(at(0, 0), at(4, 0), PortalMeans.DOOR), False, "anna", 1)
+    check_closure(grid, law(door), said("shut", Closure((at(4, 0), at(0, 0)))))
 
 
 def test_a_robot_in_an_area_that_is_closed_may_leave_it(grid) -> None:
