@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated
@@ -255,6 +256,23 @@ class RouteExplanation:
     hops: tuple[Hop, ...] = ()
     gaps: tuple[Hop, ...] = ()
     apart: MapsExplanation | None = None
+
+
+def route_over(legs: Sequence[RouteExplanation]) -> RouteExplanation:
+    """One route of those from stop to stop: all of their steps, or what is missing.
+
+    Args:
+        legs: one or more; each begins where the one before ends.
+    """
+    missing = [leg for leg in legs if not leg.found]
+    listed = missing or legs
+    if len(legs) == 1:
+        return legs[0]
+    reason = ". ".join(f"{leg.start} to {leg.goal}: {leg.reason}" for leg in listed)
+    hops = () if missing else tuple(hop for leg in legs for hop in leg.hops)
+    gaps = tuple(gap for leg in listed for gap in leg.gaps)
+    apart = next((leg.apart for leg in missing if leg.apart is not None), None)
+    return RouteExplanation(legs[0].start, legs[-1].goal, not missing, reason, hops, gaps, apart)
 
 
 Explanation = PairExplanation | FleetExplanation | RouteExplanation

@@ -11,8 +11,9 @@ import numpy as np
 from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.named_nodes import Resolve
 from mapweave.hybridmap.node import NodeId
-from mapweave.hybridmap.query import ResolveAnswer, Resolved, ResolveRequest
+from mapweave.hybridmap.query import Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
 from mapweave.mapserver.places import position_of
 from mapweave.wire.typed import packed, value_of
@@ -26,7 +27,6 @@ TIMES = ("begin_ns", "end_ns")
 AROUND = 1.0
 """Of a place that is a node, so much floor around it is meant, m."""
 
-Resolve = Callable[[ResolveRequest], ResolveAnswer]
 Value = TypeVar("Value")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from mapweave.connection import ANSWERED
-from mapweave.fleet_questions import FleetQuestions
+from mapweave.fleet_annotations import FleetAnnotations
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.constraint_subject import (
     Apart,
@@ -14,11 +14,11 @@ from mapweave.hybridmap.constraint_subject import (
     RetiredMap,
     Subject,
     read_ends,
-    read_retired,
     read_window,
 )
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
+from mapweave.hybridmap.named_nodes import own_ids_of, retired_of
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.log_messages import decode_record
@@ -29,7 +29,7 @@ CHECKING = 20.0
 """How long a server may take to check a manual constraint against a large map, s."""
 
 
-class FleetConstraints(FleetQuestions):
+class FleetConstraints(FleetAnnotations):
     """The part of `mapweave.fleet.Fleet` by which people correct the merge."""
 
     def link(
@@ -38,7 +38,7 @@ class FleetConstraints(FleetQuestions):
         """Link two nodes by hand: they see one place.
 
         Args:
-            a: a node, `r0.1.17`.
+            a: a node, `r0.1.17`, the name of a place, or a position `3.1,-2.0`.
             b: another one, of the same map or of another.
             pose: of b's robot frame in a's, where their images do not say it; needs `because`.
             because: why.
@@ -51,11 +51,13 @@ class FleetConstraints(FleetQuestions):
             InvalidValue: the images do not agree, or the map contradicts it: the evidence, and what to do.
             NotConnected: no map server answers.
         """
-        return self.constrain(Linked(NodeId.parse(a), NodeId.parse(b), pose), True, because, check=check)
+        first, second = map(NodeId.parse, own_ids_of((a, b), self.annotations, self.resolve))
+        return self.constrain(Linked(first, second, pose), True, because, check=check)
 
     def unlink(self, first: str, second: str, because: str = "", *, check: bool = False) -> str:
         """Undo the link between two nodes, or all links between two maps; see `link`."""
-        return self.constrain(Apart(read_ends(first, second)), True, because, check=check)
+        ends = read_ends(*own_ids_of((first, second), self.annotations, self.resolve))
+        return self.constrain(Apart(ends), True, because, check=check)
 
     def retire(
         self,
@@ -69,7 +71,8 @@ class FleetConstraints(FleetQuestions):
         """Retire a map, some nodes, an area, or what a map has of a time; see `link`.
 
         Args:
-            which: one map, `r0.1`, or nodes, `r0.1.17`; none with an area.
+            which: one map, `r0.1`, or nodes, `r0.1.17`, or names of places: of one that is an area all of it;
+                none with `area`.
             area: where all nodes are retired, of all maps.
             begin: of one map alone nodes from then on: ns since 1970, or `2026-03-01 12:00` (UTC).
             end: and until then.
@@ -82,7 +85,7 @@ class FleetConstraints(FleetQuestions):
                 raise InvalidValue("an area goes with neither maps, nodes nor times")
             about = RetiredArea(area)
         else:
-            about = read_retired(which)
+            about = retired_of(which, self.annotations, self.resolve)
             if begin or end:
                 if not isinstance(about, RetiredMap):
                     raise InvalidValue("a time window is of one map")

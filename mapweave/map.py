@@ -14,6 +14,7 @@ import time
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +32,9 @@ from mapweave.hybridmap.explanation import (
     MapsExplanation,
     PairExplanation,
     RouteExplanation,
+    route_over,
 )
+from mapweave.hybridmap.named_nodes import ids_of
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
@@ -206,7 +209,11 @@ class Map(ABC):
         return self._answer(view_of(image, camera, lens))
 
     def route(
-        self, start: NodeName, goal: NodeName, blocked: Iterable[tuple[NodeName, NodeName]] = ()
+        self,
+        start: NodeName,
+        goal: NodeName,
+        blocked: Iterable[tuple[NodeName, NodeName]] = (),
+        via: Iterable[NodeName] = (),
     ) -> RouteExplanation:
         """The way that a robot would drive, step by step, or why there is none.
 
@@ -214,15 +221,21 @@ class Map(ABC):
             start: a node.
             goal: another one.
             blocked: as if a robot could not get through between these.
+            via: what to pass before, in order.
 
         Raises:
             InvalidValue: a node is not there.
         """
-        a, b, *closed = self._named(start, goal, *(end for pair in blocked for end in pair))
+        stops = [start, *via, goal]
+        nodes = self._named(*stops, *(end for pair in blocked for end in pair))
+        stopping, closed = nodes[: len(stops)], nodes[len(stops) :]
         pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
-        explanation = self._explained(ExplainRequest((a, b), True, pairs))
-        assert isinstance(explanation, RouteExplanation), "a route was asked for"
-        return explanation
+        legs = []
+        for ends in pairwise(stopping):
+            explanation = self._explained(ExplainRequest(ends, True, pairs))
+            assert isinstance(explanation, RouteExplanation), "a route was asked for"
+            legs.append(explanation)
+        return route_over(legs)
 
     def explain(self, a: NodeName, b: NodeName) -> PairExplanation:
         """Why two nodes are linked, or are not, with every number behind it.
@@ -256,12 +269,7 @@ class Map(ABC):
         Raises:
             InvalidValue: one is none.
         """
-        nodes = {name: _node_id(name) for name in names}
-        words = [str(name) for name, node in nodes.items() if node is None]
-        if words:
-            found = self.resolve(ResolveRequest(tuple(words))).found
-            nodes |= {word: one.node for word, one in zip(words, found, strict=True)}
-        return [node for name in names if (node := nodes[name]) is not None]
+        return [NodeId.parse(word) for word in ids_of(map(str, names), self.resolve)]
 
     def export(self, path: str | os.PathLike[str], to: str = "", component: int = 0) -> list[Path]:
         """Write a component for others' tools, as `mapweave map export` does.
@@ -357,13 +365,3 @@ def open(path: str | os.PathLike[str]) -> FileMap:
         return FileMap(opened.content)
     need("server")
     return FileMap(opened.file(opened.merged()))
-
-
-def _node_id(name: NodeName) -> NodeId | None:
-    """The node that is written; None if it may be the name of a place, or a position."""
-    if isinstance(name, NodeId):
-        return name
-    try:
-        return NodeId.parse(name)
-    except InvalidValue:
-        return None

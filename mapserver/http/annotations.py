@@ -9,7 +9,6 @@ from typing import Any, Protocol
 import msgspec
 
 from mapweave.hybridmap.annotation import MAX_NAME, Annotation, Annotations
-from mapweave.hybridmap.constraint_subject import Ends, read_ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
@@ -89,16 +88,3 @@ def annotate(server: Annotating, data: bytes, by: str, who: str = "") -> Mapping
         placed = placed_plan(annotation.name, annotation.body, server.merged())
         answer["plan"] = json_values(placed)
     return answer
-
-
-def ends_of_words(server: Annotating, words: tuple[str, str]) -> Ends:
-    """Two nodes or maps; a word that is none may be the name of a place, or a position.
-
-    Raises:
-        InvalidValue: it is none of these.
-    """
-    known = server.annotations()
-    if any(known.last("place", word) or "," in word for word in words):
-        first, second = server.resolve(ResolveRequest(words)).found
-        return first.node, second.node
-    return read_ends(*words)

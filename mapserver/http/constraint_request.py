@@ -7,7 +7,9 @@
     {"window": {"map": "r0.1", "begin": "2026-03-01T12:00", "end": "2026-03-01T12:05"}}
     {"undo": 3}                                                  takes back number 3 of the record
 
-With each: `because`, `by`, `undo: true` (takes it back), `check: true` (only says what it would do).
+In the place of a node there may be the name of a place, or a position in the merged map; `retire` with the
+name of an area retires the area. With each: `because`, `by`, `undo: true` (takes it back), `check: true`
+(only says what it would do).
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from mapweave.hybridmap.constraint_subject import (
 )
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
+from mapweave.hybridmap.named_nodes import Record, Resolve, own_ids_of, retired_of
 from mapweave.hybridmap.node import NodeId
 
 ONE = "link, unmerge, retire, area, window, or undo with a number"
@@ -59,7 +62,14 @@ class _Body(msgspec.Struct, forbid_unknown_fields=True):
     by: str = ""
 
 
-def read_request(body: bytes, by: str, now_ns: int, record: Sequence[ManualConstraint]) -> ConstraintRequest:
+def read_request(
+    body: bytes,
+    by: str,
+    now_ns: int,
+    record: Sequence[ManualConstraint],
+    annotations: Record,
+    resolve: Resolve,
+) -> ConstraintRequest:
     """A manual constraint as it is posted.
 
     Args:
@@ -67,6 +77,8 @@ def read_request(body: bytes, by: str, now_ns: int, record: Sequence[ManualConst
         by: has decided, if the request does not say.
         now_ns: wall time.
         record: the constraints that there are, in order.
+        annotations: returns the record with the places.
+        resolve: returns nodes for words.
 
     Raises:
         InvalidValue: it is no such request.
@@ -83,7 +95,7 @@ def read_request(body: bytes, by: str, now_ns: int, record: Sequence[ManualConst
     ]
     if len(given) + numbered != 1:
         raise InvalidValue(f"give one of {ONE}")
-    about = _numbered(asked.undo, record) if numbered else _subject(asked, now_ns)
+    about = _numbered(asked.undo, record) if numbered else _subject(asked, now_ns, annotations, resolve)
     constraint = ManualConstraint(about, asked.undo is False, asked.by or by, now_ns, asked.because)
     return ConstraintRequest(constraint, asked.check)
 
@@ -94,17 +106,18 @@ def _numbered(number: int, record: Sequence[ManualConstraint]) -> Subject:
     return record[number - 1].about
 
 
-def _subject(asked: _Body, now_ns: int) -> Subject:
+def _subject(asked: _Body, now_ns: int, annotations: Record, resolve: Resolve) -> Subject:
     if asked.link is not None:
-        a, b = map(NodeId.parse, asked.link)
+        a, b = map(NodeId.parse, own_ids_of(asked.link, annotations, resolve))
         return Linked(a, b, None if asked.pose is None else read_pose(asked.pose))
     if asked.unmerge is not None:
-        return Apart(read_ends(*asked.unmerge))
+        return Apart(read_ends(*own_ids_of(asked.unmerge, annotations, resolve)))
     if asked.area is not None:
-        return RetiredArea(Area(NodeId.parse(asked.area.anchor), tuple(asked.area.corners)))
+        (anchor,) = own_ids_of([asked.area.anchor], annotations, resolve)
+        return RetiredArea(Area(NodeId.parse(anchor), tuple(asked.area.corners)))
     if asked.window is not None:
         which = read_retired([asked.window.map])
         if not isinstance(which, RetiredMap):
             raise InvalidValue(f"{asked.window.map} is no map")
         return read_window(which.map, asked.window.begin, asked.window.end, now_ns)
-    return read_retired(asked.retire or ())
+    return retired_of(asked.retire or (), annotations, resolve)

@@ -8,7 +8,7 @@
     GET /status       what the server holds, JSON
     GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
-    GET /route        explanation of the route from a to b: ?a=r0.1.17&b=r1.1.5, JSON
+    GET /route        explanation of the route from a to b: ?a=r0.1.17&b=r1.1.5&via=kitchen, JSON
     GET /robots       what every robot is doing, JSON
     GET /missions     the missions that are known, JSON
     GET /metrics      what Prometheus scrapes
@@ -38,6 +38,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -51,18 +52,18 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
+from mapweave.hybridmap.explanation import route_over
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
 from mapweave.hybridmap.mission_order import MissionKind, Missions
 from mapweave.hybridmap.node import NodeId
-from mapweave.hybridmap.query import ExplainRequest
 from mapweave.identities.logins import Logins
-from mapweave.mapserver.http.annotations import annotate, annotations_json, ends_of_words
+from mapweave.mapserver.http.annotations import annotate, annotations_json
 from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.body import FORM, IMAGE, JSON, read_body
 from mapweave.mapserver.http.constraint_request import read_request
+from mapweave.mapserver.http.explain_request import read_questions
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.live import Live
@@ -343,7 +344,9 @@ class Questions:
 
         def constrain() -> Mapping[str, Any]:
             record = self._server.constraints().made
-            asked = read_request(body, BY, time.time_ns(), record)
+            asked = read_request(
+                body, BY, time.time_ns(), record, self._server.annotations, self._server.resolve
+            )
             if who:
                 asked = replace(asked, constraint=replace(asked.constraint, who=who))
             return {"said": self._server.constrain(asked)}
@@ -351,17 +354,10 @@ class Questions:
         return await run_in_threadpool(constrain)
 
     async def _explain(self, request: Request) -> Mapping[str, Any]:
-        ends: Ends | None = None
-        path, query = request.url.path, dict(request.query_params)
-        route = path == "/route"
-        if query or route:
-            if query.keys() != {"a", "b"}:
-                raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
-            words = query["a"].strip(), query["b"].strip()
-            ends = await run_in_threadpool(ends_of_words, self._server, words)
-        asked = ExplainRequest(ends, route)
-        explanation = await self._result(lambda: self._server.explain(asked))
-        return await run_in_threadpool(json_values, explanation)
+        path, query, resolve = request.url.path, request.query_params, self._server.resolve
+        asked = await run_in_threadpool(read_questions, path, query, resolve)
+        first, *more = [await self._result(partial(self._server.explain, one)) for one in asked]
+        return await run_in_threadpool(json_values, route_over([first, *more]) if more else first)
 
     async def _relocalize(self, request: Request) -> Mapping[str, Any]:
         body = await read_body(request, (*IMAGE, FORM), self._patience)

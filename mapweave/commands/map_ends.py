@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING
 
 from mapweave.commands.network import key_holder, network_of, reach, settings_of
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.named_nodes import Record, Resolve, ids_of
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest, ResolveAnswer, ResolveRequest
 from mapweave.wire.bus import Reply
@@ -34,7 +37,7 @@ def ends_of(words: list[str]) -> Ends:
 
 
 def resolved(arguments: argparse.Namespace, words: list[str], router: Router | None = None) -> list[str]:
-    """Words with nodes in the place of named places and positions; nodes and maps as they are.
+    """Words with active nodes in the place of named places and positions; nodes and maps as they are.
 
     Args:
         arguments: of the command line; with `map`, of this file, else of a running server.
@@ -44,23 +47,34 @@ def resolved(arguments: argparse.Namespace, words: list[str], router: Router | N
     Raises:
         MapweaveError: a word is none of these, or no server answers.
     """
-    asked = [word for word in words if not _is_end(word)]
-    if not asked:
-        return words
-    request = ResolveRequest(tuple(asked))
-    if arguments.map is None:
-        answer = decode(ask(arguments, Keys.any_resolve, encode(request))[0].payload, ResolveAnswer)
-    else:
-        from mapweave.commands.map_input import router_of
-        from mapweave.mapserver.places import Places
+    return ids_of(words, names_of(arguments, router)[1])
 
-        router = router or router_of(arguments)
-        answer = Places(router, router.annotations).answer(request)
-    for word, one in zip(asked, answer.found, strict=True):
+
+def names_of(arguments: argparse.Namespace, router: Router | None = None) -> tuple[Record, Resolve]:
+    """The annotations, and nodes for words with notes on stderr, as functions; see `resolved`."""
+    if arguments.map is None:
+        return (
+            lambda: decode(ask(arguments, Keys.any_annotations, b"")[0].payload, Annotations),
+            lambda request: _noted(
+                request,
+                decode(ask(arguments, Keys.any_resolve, encode(request))[0].payload, ResolveAnswer),
+            ),
+        )
+    from mapweave.commands.map_input import router_of
+    from mapweave.mapserver.places import Places
+
+    known = cache(lambda: router or router_of(arguments))
+    return (
+        lambda: known().annotations,
+        lambda request: _noted(request, Places(known(), known().annotations).answer(request)),
+    )
+
+
+def _noted(request: ResolveRequest, answer: ResolveAnswer) -> ResolveAnswer:
+    for word, one in zip(request.words, answer.found, strict=True):
         if one.note:
             print(f"mapweave: {word}: {one.note}", file=sys.stderr)
-    nodes = {word: str(one.node) for word, one in zip(asked, answer.found, strict=True)}
-    return [nodes.get(word, word) for word in words]
+    return answer
 
 
 def explanation_of(
@@ -82,14 +96,6 @@ def explanation_of(
     from mapweave.mapserver.explanations import explained
 
     return explained(request, router or router_of(arguments), settings_of(arguments).merge.consistency)
-
-
-def _is_end(word: str) -> bool:
-    try:
-        read_end(word)
-    except InvalidValue:
-        return False
-    return True
 
 
 def map_of(word: str) -> MapId:

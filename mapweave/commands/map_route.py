@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.commands.map_ends import node_of, resolved
     from mapweave.explanation_text import route_words
     from mapweave.extras import need
+    from mapweave.hybridmap.explanation import route_over
     from mapweave.mapserver.http.json_values import json_values
 
     if arguments.draw is not None:
@@ -60,11 +61,10 @@ def run(arguments: argparse.Namespace) -> int:
     words = [*stops, *(word for pair in arguments.blocked for word in pair)]
     router = None if arguments.map is None else router_of(arguments)
     nodes = list(map(node_of, resolved(arguments, words, router)))
-    start, goal, rest = nodes[0], nodes[len(stops) - 1], nodes[len(stops) :]
+    rest = nodes[len(stops) :]
     blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
-    if arguments.via:
-        return _run_via(arguments, router, nodes[: len(stops)], blocked)
-    explanation = _explained(arguments, router, start, goal, blocked)
+    legs = [_explained(arguments, router, *ends, blocked) for ends in pairwise(nodes[: len(stops)])]
+    explanation = route_over(legs)
     values, lines = json_values(explanation), route_words(explanation)
     if arguments.draw is not None and explanation.found:
         draw_route(arguments, None if router is None else router.merged, explanation)
@@ -74,28 +74,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.draw is not None and not explanation.found:
         print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
     return DONE if explanation.found else NO
-
-
-def _run_via(
-    arguments: argparse.Namespace,
-    router: Router | None,
-    stops: list[NodeId],
-    blocked: tuple[tuple[NodeId, NodeId], ...],
-) -> int:
-    """Explain the way from stop to stop."""
-    from mapweave.explanation_text import route_words
-    from mapweave.hybridmap.errors import InvalidValue
-    from mapweave.mapserver.http.json_values import json_values
-
-    if arguments.draw is not None:
-        raise InvalidValue("--draw and --via do not go together: draw the way from one place to the next")
-    legs = [_explained(arguments, router, a, b, blocked) for a, b in pairwise(stops)]
-    found = all(leg.found for leg in legs)
-    if arguments.json:
-        print(json.dumps({"found": found, "legs": [json_values(leg) for leg in legs]}))
-    else:
-        print("\n".join(line for leg in legs for line in route_words(leg)))
-    return DONE if found else NO
 
 
 def draw_route(

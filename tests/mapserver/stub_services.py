@@ -17,7 +17,16 @@ from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, ExplainRequest, RelocalizeAnswer, View, Whereabouts
+from mapweave.hybridmap.query import (
+    Certainty,
+    ExplainRequest,
+    RelocalizeAnswer,
+    ResolveAnswer,
+    ResolveRequest,
+    View,
+    Whereabouts,
+)
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
@@ -76,6 +85,9 @@ class StubServices:
     ) -> MissionReport:
         self.ways.append((goal, via))
         raise InvalidValue(f"{robot} stays where it is")
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        return Places(Router(self.merged()), self.annotations()).answer(request)
 
     def metrics(self) -> bytes:
         return b"mapweave_nodes 12.0\n"

@@ -183,6 +183,50 @@ def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: st
     assert small.http("GET") == (200, {"constraints": []})
 
 
+def test_places_stand_for_nodes_and_areas_in_corrections(path: Path) -> None:
+    with serving(path) as asking:
+        fleet = asking.fleet
+        fleet.annotate("place", "door", node=str(LAST))
+        fleet.annotate("place", "gate", node=str(FIRST))
+        around = Area(NodeId("b", 1, 5), ((-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (-0.2, 0.2)))
+        corners = [list(corner) for corner in around.corners]
+        fleet.annotate("place", "corner", area={"anchor": "b.1.5", "corners": corners})
+
+        def posted(**body: object) -> str:
+            status, answer = asking.http("POST", {**body, "check": True})
+            return str(answer["said" if status == 200 else "error"])
+
+        # The same by name as by id, of Python and of HTTP.
+        linked = fleet.link(str(FIRST), str(LAST), check=True)
+        assert linked == fleet.link("gate", " door ", check=True) == posted(link=["gate", "door"], by="anna")
+        fleet.link("gate", "door")
+        asking.merged()
+        assert "1 link is undone" in fleet.unlink("door", "gate", check=True)
+        assert "1 link is undone" in posted(unmerge=["door", "gate"])
+        assert main(["map", "unmerge", "door", "gate", "--check", *asking.at]) == 0
+        assert main(["map", "link", "gate", "door", "--undo", "--check", *asking.at]) == 0
+        assert f"node {LAST} is retired" in fleet.retire("door", check=True)
+        nodes = f"nodes {LAST} and b.1.5 are retired"
+        assert nodes in fleet.retire("b.1.5", "door", check=True) and nodes in posted(
+            retire=["door", "b.1.5"]
+        )
+        # An area is retired as a whole, and the same name takes it back.
+        for words in (fleet.retire("corner", check=True), posted(retire=["corner"])):
+            assert "the area of 4 corners at b.1.5 is retired" in words
+        assert f"corners at {LAST} is retired" in posted(area={"anchor": "door", "corners": corners})
+        for body in ({"retire": ["corner"]}, {"retire": ["gate"]}):
+            assert asking.http("POST", body)[0] == 200
+            asking.merged()
+            assert asking.http("POST", {**body, "undo": True})[0] == 200
+            asking.merged()
+        with pytest.raises(InvalidValue, match="place corner is an area: give it alone"):
+            fleet.retire("corner", "door")
+        for refused in (lambda: fleet.retire("dor"), lambda: fleet.link("dor", "gate")):
+            with pytest.raises(InvalidValue, match=r"'dor' is no place of this map \(is it door\?\): give"):
+                refused()
+        assert "'dor' is no place of this map" in posted(area={"anchor": "dor", "corners": corners})
+
+
 def test_a_closure_of_an_edge_that_is_none_is_refused_and_others_say_how_much_they_close(
     small: Asking, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

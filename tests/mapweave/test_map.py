@@ -115,6 +115,16 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
         assert str(asked.node("kitchen").id) == "r1.1.3"
         assert asked.route("r0.1.1", "kitchen").hops == asked.route("r0.1.1", "r1.1.3").hops != ()
         assert asked.annotations().last("place", "kitchen") is not None
+    for asked in (fleet, file):
+        stops = ("r0.1.1", "r1.1.5", "kitchen", "r0.1.5")
+        legs = [asked.route(*ends) for ends in pairwise(stops)]
+        over = asked.route(stops[0], stops[-1], via=stops[1:-1])
+        assert over.found and (str(over.start), str(over.goal)) == ("r0.1.1", "r0.1.5")
+        assert over.hops == tuple(hop for leg in legs for hop in leg.hops)
+        assert all(leg.reason in over.reason for leg in legs)
+    walls = [("r1.1.5", node) for node in graph if node != "r1.1.5"]
+    none = file.route("r0.1.1", "r0.1.5", blocked=walls, via=["r0.1.3", "r1.1.5"])
+    assert not none.found and not none.hops and "r0.1.3 to r1.1.5: " in none.reason
     assert not file.route("r0.1.1", "r0.1.3", blocked=[(a, b) for a in graph for b in graph if a < b]).found
     for asked in (fleet, file):
         pair = asked.explain("r0.1.1", mapweave.NodeId("r1", 1, 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
@@ -67,7 +68,8 @@ def test_maps_and_nodes_are_explained(served: Web) -> None:
     [
         ("?a=r0.1", "write /explain"),
         ("?a=r0.1&b=r1.1&c=1", "write /explain"),
-        ("?a=r0.1&b=", "neither a node nor a map"),
+        ("?a=r0.1&b=", "'' is no place of this map: give a node"),
+        ("?a=r0.1&b=r1.1&via=r0.1.1", "write /explain"),
         ("?a=r0.1&b=r1.1.1", "a node and a map"),
         ("?a=r0.1&b=r0.1", "give two maps"),
         ("?a=r0.1.1&b=r9.1.1", "there is no map r9.1; known are: r0.1, r1.1"),
@@ -76,6 +78,24 @@ def test_maps_and_nodes_are_explained(served: Web) -> None:
 def test_unknown_nodes_are_reported_in_one_line(served: Web, query: str, words: str) -> None:
     status, result = ask(served, query)
     assert status == 400 and words in result["error"] and "\n" not in result["error"]
+
+
+def test_a_route_leads_over_what_it_must_pass(served: Web) -> None:
+    start, first, second, goal = "r0.1.1", "r1.1.7", "r0.1.3", "r1.1.1"
+    legs = [ask(served, f"?a={a}&b={b}", "route")[1] for a, b in pairwise((start, first, second, goal))]
+    status, way = ask(served, f"?a={start}&b={goal}&via={first}&via={second}", "route")
+    assert status == 200 and way["found"] and (way["start"], way["goal"]) == (start, goal)
+    assert way["hops"] == [hop for leg in legs for hop in leg["hops"]]
+    assert {first, second} <= {hop["b"] for hop in way["hops"]}
+    assert all(f"{leg['start']} to {leg['goal']}: {leg['reason']}" in way["reason"] for leg in legs)
+    for query, words in (
+        (f"?a={start}&b={goal}&via=nowhere", "'nowhere' is no place of this map"),
+        (f"?a={start}&b={goal}&via=r0.1", "r0.1.1 and r0.1 are a node and a map"),
+        (f"?a={start}&via={goal}", "write /route?a=r0.1.17&b=r1.1.5: "),
+        (f"?a={start}&b={goal}{17 * f'&via={first}'}", "at most 16 places"),
+    ):
+        status, result = ask(served, query, "route")
+        assert status == 400 and words in result["error"] and "\n" not in result["error"], result
 
 
 def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices) -> None:
@@ -111,7 +131,7 @@ def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: py
             "r0.1",
         ]
         page.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=%3Cb%3Ex")
-        eventually(lambda: "neither a node nor a map" in page.run(RESULT))
+        eventually(lambda: "'<b>x' is no place of this map: give a node" in page.run(RESULT))
         assert page.run("return document.querySelector('#result b')") is None
         assert page.run("return document.querySelectorAll('b').length") == 0
 

@@ -1,0 +1,89 @@
+"""Ids for what people write: ids of nodes and maps stay, names of places and positions are looked up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from mapweave.hybridmap.annotation import Annotations, Place
+from mapweave.hybridmap.constraint_subject import (
+    RetiredArea,
+    RetiredMap,
+    RetiredNodes,
+    read_end,
+    read_retired,
+)
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+
+Resolve = Callable[[ResolveRequest], ResolveAnswer]
+"""Returns nodes for words, of a map; raises InvalidValue for a word that is none."""
+Record = Callable[[], Annotations]
+"""Returns the annotations of the same map."""
+
+
+def ids_of(words: Iterable[str], resolve: Resolve) -> list[str]:
+    """An id for each word: nodes (`r0.1.17`) and maps (`r0.1`) as they are, active nodes for all else.
+
+    Ids are not looked up: a retired node has no place in the map, and can be taken back all the same.
+
+    Raises:
+        InvalidValue: a word is neither an id, nor the name of a place, nor a position.
+    """
+    written = [word.strip() for word in words]
+    asked = tuple(dict.fromkeys(word for word in written if not _is_id(word)))
+    found = resolve(ResolveRequest(asked)).found if asked else ()
+    ids = {word: str(one.node) for word, one in zip(asked, found, strict=True)}
+    return [ids.get(word, word) for word in written]
+
+
+def own_ids_of(words: Iterable[str], annotations: Record, resolve: Resolve) -> list[str]:
+    """Likewise, for corrections: a place that is a node means that node, active or not.
+
+    So the same name takes back what it has set, whatever has become of the node in between.
+
+    Args:
+        words: as people write them.
+        annotations: returns the places.
+        resolve: returns nodes for words.
+
+    Raises:
+        InvalidValue: see `ids_of`.
+    """
+    own = [str(place.node) if place and place.node else word for word, place in _places(words, annotations)]
+    return ids_of(own, resolve)
+
+
+def retired_of(
+    words: Iterable[str], annotations: Record, resolve: Resolve
+) -> RetiredMap | RetiredNodes | RetiredArea:
+    """One map, some nodes, or a named area, as people write them; see `own_ids_of`.
+
+    Raises:
+        InvalidValue: they are none of these, or an area and something else.
+    """
+    places = _places(words, annotations)
+    for word, place in places:
+        if place is not None and place.area is not None:
+            if len(places) > 1:
+                raise InvalidValue(f"place {word} is an area: give it alone")
+            return RetiredArea(place.area)
+    return read_retired(own_ids_of((word for word, _ in places), annotations, resolve))
+
+
+def _places(words: Iterable[str], annotations: Record) -> list[tuple[str, Place | None]]:
+    """Each word, and the place of which it is the name."""
+    written = [word.strip() for word in words]
+    known = Annotations() if all(map(_is_id, written)) else annotations()
+    entries = [known.last("place", word) for word in written]
+    bodies = [entry.body if entry is not None else None for entry in entries]
+    return [
+        (word, body if isinstance(body, Place) else None) for word, body in zip(written, bodies, strict=True)
+    ]
+
+
+def _is_id(word: str) -> bool:
+    try:
+        read_end(word)
+    except InvalidValue:
+        return False
+    return True
