@@ -114,4 +114,4 @@ else:
             raise ImportError(f"mapweave.{name} {MissingExtra([extra])}") from error
 
     def __dir__():
-        return [*globals(), *__all__, "__version__"]
+        return [*__all__, "__version__"]

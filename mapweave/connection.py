@@ -22,7 +22,7 @@ ANSWERED = 2.0
 """s; a server or robot that is there answers sooner."""
 
 
-def reach(settings: BusSettings, advice: str = "give --connect") -> ZenohBus:
+def reach(settings: BusSettings, advice: str = "give the endpoint of its router (--connect)") -> ZenohBus:
     """A connection of a client that needs a router now.
 
     Args:
@@ -40,7 +40,9 @@ def reach(settings: BusSettings, advice: str = "give --connect") -> ZenohBus:
         where = ", ".join(settings.endpoints)
         if any(map(_listens, settings.endpoints)):
             reason = "what listens there does not let this in"
-            advice = _key_hint(settings.credentials) or "; if the fleet has keys, give --keys FILE"
+            advice = (
+                _key_hint(settings.credentials) or "; if the fleet has keys, give a key file (--keys FILE)"
+            )
             raise NotConnected(f"no router at {where}: {reason}{advice}")
         raise NotConnected(f"no router at {where}: start `mapweave server`, or {advice}")
     return bus
@@ -64,7 +66,8 @@ def no_server(fleet: str, holder: Credentials | None = None) -> NotConnected:
         holder: of the key with which one is connected, if there is one.
     """
     return NotConnected(
-        f"a router is up, but no map server of fleet {fleet} answers: start `mapweave server` or give --fleet"
+        f"a router is up, but no map server of fleet {fleet} answers: start `mapweave server` or give "
+        "another fleet (--fleet)"
         f"{_key_hint(holder)}"
     )
 

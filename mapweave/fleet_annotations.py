@@ -25,7 +25,7 @@ class FleetAnnotations(FleetQuestions):
         """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
 
         Args:
-            kind: of the annotation: place, closure, preference, plan, pin.
+            kind: of the annotation: place, closure, preference, floor, portal, plan, pin.
             name: for the same kind and name the last one holds.
             because: why.
             fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a

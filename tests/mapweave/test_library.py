@@ -16,6 +16,7 @@ import pytest
 import mapweave
 from synthetic.maps import changes_of
 from synthetic.world import room, take_map, take_view
+from tests.waiting import free_port
 
 SOURCE = Path(mapweave.__file__)
 WORLD = room(0, 0, 5, 4, 600, np.random.default_rng(1))
@@ -72,6 +73,15 @@ def test_each_name_is_what_type_checkers_see() -> None:
 def test_what_is_public_is_this_list() -> None:
     """Others' programs depend on these names: one that is added stays."""
     assert sorted(mapweave.__all__) == PUBLIC.split()
+    assert set(dir(mapweave)) == {*mapweave.__all__, "__version__"}
+
+
+def test_advice_is_also_of_use_in_python() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with pytest.raises(mapweave.MapweaveError) as refused:
+        mapweave.connect(endpoint)
+    advice = "start `mapweave server`, or give the endpoint of its router (--connect)"
+    assert str(refused.value) == f"no router at {endpoint}: {advice}"
 
 
 def test_what_is_not_there() -> None:
