@@ -26,6 +26,5 @@ print(f"from {first} to {last}: {route.reason}")
 for hop in route.hops:
     print(f"  {hop.a} -> {hop.b}: {hop.distance:.2f} m, {hop.words}")
 
-FOLDER.mkdir(parents=True, exist_ok=True)
 office.save(FOLDER / "office.mapweave")
 print(FOLDER / "office.mapweave", office.hash[:12])

@@ -1,7 +1,4 @@
-"""Load a map and plot it: `python examples/plot_map.py [MAP.mapweave]`.
-
-Without a map it takes that of a robot in the simulator.
-"""
+"""Load a map, or drive a simulated robot, and plot it: `python examples/plot_map.py [MAP.mapweave]`."""
 
 import sys
 from pathlib import Path
@@ -29,6 +26,5 @@ print(office.route(first, last).reason)  # what a robot would drive, and why
 
 axes = office.plot()
 axes.set_title("An office, by one robot")
-FOLDER.mkdir(parents=True, exist_ok=True)
 axes.figure.savefig(FOLDER / "map.png", dpi=110)
 print(FOLDER / "map.png")

@@ -19,7 +19,7 @@ from tests.simulator import needs_simulator
 from tests.waiting import eventually, free_port
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SHORT = ("drive_in_simulator", "merge_maps", "plot_map", "relocalize_photo", "rerun_log", "watch_fleet")
+SHORT = sorted({path.stem for path in EXAMPLES.glob("*.py")} - {"own_robot"})  # a driver has five methods
 
 
 def run(folder: Path, name: str, *words: str) -> str:
@@ -34,9 +34,7 @@ def run(folder: Path, name: str, *words: str) -> str:
 
 @pytest.mark.parametrize("name", SHORT)
 def test_they_are_short(name: str) -> None:
-    lines = (EXAMPLES / f"{name}.py").read_text().splitlines()
-    code = [line for line in lines if line.strip() and not line.strip().startswith("#")]
-    assert len(code) <= 35
+    assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 30
 
 
 @pytest.mark.slow
@@ -61,7 +59,7 @@ def test_they_run(tmp_path: Path) -> None:
     )
     assert "found" in printed and found[:2] == pytest.approx(really[:2], abs=0.02)
     assert found[2] == pytest.approx(really[2], abs=1.0)
-    assert run(tmp_path, "drive_in_simulator", "r1").split()[-1] == "out/examples/r1.mapweave"
+    assert run(tmp_path, "drive_in_simulator").split() == [f"out/examples/r{k}.mapweave" for k in (0, 1)]
 
     printed = run(tmp_path, "rerun_log")
     assert "not in it: nothing" in printed and (out / "r0.rrd").stat().st_size > 100_000
