@@ -10,7 +10,7 @@ import sys
 import tomllib
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -65,6 +65,13 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         raise SettingsError(f"{where}: {error}") from None
 
 
+def no_setting(name: str, known: Collection[str]) -> str:
+    """That a file has a setting which does not exist, and which one may be meant."""
+    close = difflib.get_close_matches(name, known, 1)
+    hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
+    return f"no setting {name!r}; {hint}"
+
+
 def _problems(kind: Any, value: Any, path: str) -> Iterator[str]:
     """What `msgspec.convert` lets pass: names that a dataclass does not have, numbers that are no floats."""
     kinds = list(_dataclasses(kind))
@@ -72,9 +79,8 @@ def _problems(kind: Any, value: Any, path: str) -> Iterator[str]:
         hints = typing.get_type_hints(kinds[0], include_extras=True)
         for name, inner in value.items():
             if name not in hints:
-                close = difflib.get_close_matches(str(name), hints, 1)
-                hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(hints)}"
-                yield f"{path}: no setting {name!r}; {hint}" if path else f"no setting {name!r}; {hint}"
+                problem = no_setting(str(name), hints)
+                yield f"{path}: {problem}" if path else problem
             else:
                 yield from _problems(hints[name], inner, f"{path}.{name}" if path else name)
     elif isinstance(value, list | tuple):

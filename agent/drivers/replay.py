@@ -13,10 +13,10 @@ import numpy as np
 from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.recordings.geometry_file import read_geometry
-from mapweave.agent.recordings.image_folder import read_split
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.recording import Recording
+from mapweave.agent.recordings.splits import read_split
 from mapweave.hybridmap.errors import DeviceError
 
 AXLE_PER_HEIGHT = 0.9

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
 from mapweave.agent.drive_geometry import DriveGeometry
-from mapweave.agent.recordings.camera_file import number
+from mapweave.agent.recordings.toml_file import check_keys, number, read_table
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.atomic_file import read_whole, write_whole
 
@@ -22,6 +21,9 @@ KEYS = {
     "drift": "drift_deg_per_m", "delay": "delay_s",
 }  # fmt: skip
 """Key by field of `DriveGeometry`; keys with `deg` are in degrees."""
+CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "lens", "distortion")
+FILE_KEYS = (*CAMERA_KEYS, *KEYS.values())
+"""What a camera.toml or a robot's own file may give."""
 LIMITS = {
     "forward": (-10.0, 10.0), "left": (-10.0, 10.0), "height": (0.001, 100.0), "heading": (-0.6, 0.6),
     "pitch": (-0.6, 0.6), "roll": (-0.6, 0.6), "wheel_scale": (0.2, 5.0), "turn_scale": (0.2, 5.0),
@@ -34,14 +36,15 @@ def read_geometry(path: Path) -> dict[str, float]:
     """The fields of `DriveGeometry` that a file gives; none if there is no file.
 
     Raises:
-        DeviceError: the file cannot be read, or a value is no number or cannot be right.
+        DeviceError: the file cannot be read, has an unknown key, or a value is no number or cannot be right.
     """
-    try:
-        values = tomllib.loads(read_whole(path).decode("utf-8"))
-        found = {field: _scale(key) * number(values, key) for field, key in KEYS.items() if key in values}
-    except FileNotFoundError:
+    if not path.exists():
         return {}
-    except (OSError, ValueError) as error:
+    values = read_table(path, "it must give the robot's geometry")
+    try:
+        check_keys(values, FILE_KEYS)
+        found = {field: _scale(key) * number(values, key) for field, key in KEYS.items() if key in values}
+    except ValueError as error:
         raise DeviceError(f"{path}: {error}") from None
     for field, value in found.items():
         low, high = LIMITS[field]

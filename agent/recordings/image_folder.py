@@ -1,17 +1,16 @@
-"""The files of a folder of images: images/, times.txt, odometry.csv, splits.toml."""
+"""The files of a folder of images: images/, times.txt, odometry.csv."""
 
 from __future__ import annotations
 
 import csv
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mapweave.agent.recordings.camera_file import number, whole
+from mapweave.agent.recordings.toml_file import number
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.storage.atomic_file import read_whole
@@ -104,37 +103,5 @@ def read_increments(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np
         # The number that a file without a last line's end ends in may have had more digits.
         rows = rows if whole else rows[:-1]
     if len(rows) < 2:
-        raise DeviceError(damage)
+        raise DeviceError(damage or f"{path}: {count} images are no drive; there must be two or more")
     return np.array(rows), damage
-
-
-def read_split(path: Path, robot: str | None, count: int) -> range:
-    """The images of one robot of a splits.toml; all without a robot.
-
-    Raises:
-        DeviceError: the file is missing or wrong, or has no such robot.
-    """
-    if robot is None:
-        return range(count)
-    try:
-        robots = {str(r["name"]): r for r in tomllib.loads(read_whole(path).decode("utf-8")).get("robot", [])}
-    except FileNotFoundError:
-        raise DeviceError(f"{path}: no such file; it must describe robot {robot!r}") from None
-    except (OSError, ValueError) as error:
-        raise DeviceError(f"{path}: {error}") from None
-    except (KeyError, TypeError):
-        raise DeviceError(f"{path}: write a [[robot]] table with a name for each robot") from None
-    if robot not in robots:
-        raise DeviceError(f"{path}: no robot {robot!r}; there are {', '.join(sorted(robots)) or 'none'}")
-    split = robots[robot]
-    try:
-        first, last, step = (whole(v) for v in (split["first"], split["last"], split.get("step", 1)))
-    except (KeyError, ValueError, TypeError) as error:
-        raise DeviceError(f"{path}: robot {robot!r}: {error}") from None
-    if step < 1:
-        raise DeviceError(f"{path}: robot {robot!r}: step {step} must be 1 or more")
-    if not 0 <= first <= last < count:
-        raise DeviceError(
-            f"{path}: robot {robot!r}: frames {first} to {last} are not within the {count} images"
-        )
-    return range(first, last + 1, step)

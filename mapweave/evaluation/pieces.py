@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.image_folder import images_of
-from mapweave.evaluation.splits import robots_of
+from mapweave.agent.recordings.splits import robots_of
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.node import check_name
 

@@ -13,11 +13,11 @@ from rich.console import Console
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_of
+from mapweave.agent.recordings.splits import robots_of
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.asking_again import Trial, trial_figures
 from mapweave.evaluation.drive import DriveMap
 from mapweave.evaluation.photographs import AppearanceMap, Photographs, photograph_trials
-from mapweave.evaluation.splits import robots_of
 from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import Verdict, figures
 from mapweave.hybridmap.camera import Camera

@@ -214,6 +214,14 @@ def folder_at(name: str):
     return spoil
 
 
+def single(folder: Path) -> None:
+    """One image with its time and its row of odometry."""
+    for path in sorted((folder / "images").glob("*.png"))[1:]:
+        path.unlink()
+    (folder / "times.txt").write_text("100\n")
+    (folder / "odometry.csv").write_text("forward_m,turn_rad\n0,0\n")
+
+
 ODOMETRY = "frame,turn_rad,forward_m\n" + "0,0,0\n" * COUNT
 WRONG = {
     "no recording": (gone("."), "no such folder"),
@@ -234,6 +242,11 @@ WRONG = {
     "lens of four": (replaced("camera.toml", ", 0.0, 0.0]", ", 0.0]"), "camera.toml"),
     "lens is one": (replaced("camera.toml", "[-0.1, 0.02, 0.001, 0.0, 0.0]", "0.1"), "camera.toml"),
     "lens is no number": (replaced("camera.toml", "0.02", "nan"), "camera.toml"),
+    "camera with another key": (replaced("camera.toml", "forward_m", "foward_m"), "did you mean 'forward_m'?"),
+    "width is text": (replaced("camera.toml", "width = 320", 'width = "a"'), "width 'a' is no whole number"),
+    "camera of deep lists": (written("camera.toml", "width = " + "[" * 5000), "camera.toml"),
+    "camera with a long number": (replaced("camera.toml", "0.05", "9" * 400), "forward_m has too many digits"),
+    "one image": (single, "1 images are no drive; there must be two or more"),
     "no odometry": (gone("odometry.csv"), "without odometry the map has no scale"),
     "odometry is a folder": (folder_at("odometry.csv"), "odometry.csv"),
     "odometry is empty": (written("odometry.csv", ""), "0 rows for 14 images"),
@@ -273,6 +286,7 @@ WRONG_SPLITS = {
         "robot 'b'",
     ),
     "a frame that is text": (replaced("splits.toml", "first = 2", 'first = "x"'), "robot 'b'"),
+    "splits of deep lists": (written("splits.toml", "robot = " + "[" * 5000), "splits.toml"),
     "a frame that is a list": (replaced("splits.toml", "first = 2", "first = [2]"), "robot 'b'"),
     "a frame that is infinite": (replaced("splits.toml", "first = 2", "first = inf"), "robot 'b'"),
     "a frame far away": (replaced("splits.toml", "last = 13", f"last = 1{'0' * 40}"), "not within the 14"),
