@@ -66,6 +66,7 @@ class MissionControl:
         keep: Keep = lambda reports: None,
         alone: WithoutServer = WithoutServer.GO_ON,
         defer: Defer = lambda save: save(),
+        refusal: str = "",
     ) -> None:
         """Go on with what was kept.
 
@@ -76,11 +77,12 @@ class MissionControl:
             alone: what the robot does while no server is in reach.
             defer: calls a function, at once or in another thread: the robot's loop, which calls `follow`,
                 must not wait for the disk.
+            refusal: why no orders are taken; empty if they are.
         """
         self.unknown_goal: Callable[[NodeId], str] = lambda node: ""
         self._robot = robot
         self._keep = keep
-        self._alone, self._defer = alone, defer
+        self._alone, self._defer, self._refusal = alone, defer, refusal
         # The robot's loop waits for the first of these, and never for the second.
         self._lock, self._saving = threading.Lock(), threading.Lock()
         self._unsaved: list[MissionReport] = []
@@ -106,7 +108,9 @@ class MissionControl:
         """Take the mission with which the agent is started: it is newer than what was kept."""
         report = self.report
         newest = 0 if report is None else report.order.stamp_ns
-        self.take(MissionOrder.new(self._robot, kind, FIRST, after_ns=newest))
+        with self._lock:
+            self._taken(MissionOrder.new(self._robot, kind, FIRST, after_ns=newest))
+        self.save()
 
     def take(self, order: MissionOrder) -> MissionReport:
         """Take an order; returns what has become of it.
@@ -117,7 +121,10 @@ class MissionControl:
         if order.robot != self._robot:
             raise InvalidValue(f"a mission of {order.robot} came to {self._robot}")
         with self._lock:
-            report = self._taken(order)
+            if self._refusal:
+                report = self._note(MissionReport(order, MissionState.REFUSED, 0.0, self._refusal))
+            else:
+                report = self._taken(order)
         self.save()
         return report
 

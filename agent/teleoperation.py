@@ -23,12 +23,14 @@ class Teleoperation:
     Thread-safe: requests come in the bus's thread, the robot's loop reads.
     """
 
-    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, clock: Callable[[], int] = time.monotonic_ns, refusal: str = "") -> None:
         """No one drives.
 
         Args:
             clock: ns, of this process alone.
+            refusal: why no commands are taken; empty if they are.
         """
+        self._refusal = refusal
         self._clock = clock
         self._lock = threading.Lock()
         self._session: int | None = None
@@ -39,8 +41,10 @@ class Teleoperation:
         """Take a command; returns the time of the answer, ns, which the next request repeats.
 
         Raises:
-            InvalidValue: another program drives the robot now.
+            InvalidValue: another program drives the robot now, or no commands are taken.
         """
+        if self._refusal:
+            raise InvalidValue(self._refusal)
         now = self._clock()
         with self._lock:
             if self._session not in (None, request.session) and now - self._at_ns < DEAD_MAN * 1e9:

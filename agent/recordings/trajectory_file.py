@@ -7,6 +7,9 @@ from pathlib import Path
 
 from mapweave.hybridmap.pose import Pose2
 
+BY_WHEELS = "# not localized: by the wheels alone from here\n"
+LOCALIZED = "# localized from here\n"
+
 
 def tum_line(stamp_ns: int, pose: Pose2) -> str:
     """One pose. The stamp keeps its nanoseconds, which a float64 would not."""
@@ -16,20 +19,52 @@ def tum_line(stamp_ns: int, pose: Pose2) -> str:
 
 
 class TrajectoryFile:
-    """Writes poses as they come; what was there before is kept."""
+    """Writes a pose for each frame. Where the robot is not localized the wheels carry the pose on.
+
+    Comments say which poses are the wheels' alone; TUM's tools and evo skip them.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Begin or go on.
+        """Begin or go on: what was there before is kept.
 
         Raises:
             OSError: it cannot be written.
         """
         self._file = path.open("a", encoding="ascii")
+        self._pose = Pose2()
+        self._localized: bool | None = None
+        # Frames before the first at which the robot is localized, in the frame of the first of them.
+        self._waiting: list[tuple[int, Pose2]] = []
 
-    def add(self, stamp_ns: int, pose: Pose2) -> None:
-        """Write one."""
-        self._file.write(tum_line(stamp_ns, pose))
+    def add(self, stamp_ns: int, motion: Pose2, pose: Pose2 | None) -> None:
+        """Add a frame.
+
+        Args:
+            stamp_ns: of it.
+            motion: by the wheels, since the frame before.
+            pose: in the map; None if the robot is not localized.
+        """
+        carried = self._pose @ motion
+        if self._localized is None and pose is None:
+            self._waiting.append((stamp_ns, carried))
+        else:
+            if pose is not None:
+                self._write_waiting(pose @ carried.inverse())
+            self._write(stamp_ns, carried if pose is None else pose, pose is not None)
+        self._pose = carried if pose is None else pose
 
     def close(self) -> None:
         """Finish the file."""
+        self._write_waiting(Pose2())
         self._file.close()
+
+    def _write_waiting(self, map_from_first: Pose2) -> None:
+        waiting, self._waiting = self._waiting, []
+        for stamp_ns, pose in waiting:
+            self._write(stamp_ns, map_from_first @ pose, localized=False)
+
+    def _write(self, stamp_ns: int, pose: Pose2, localized: bool) -> None:
+        if localized != self._localized and (self._localized is not None or not localized):
+            self._file.write(LOCALIZED if localized else BY_WHEELS)
+        self._localized = localized
+        self._file.write(tum_line(stamp_ns, pose))

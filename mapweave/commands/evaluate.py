@@ -106,14 +106,15 @@ def run_replay(arguments: argparse.Namespace) -> int:
     path: Path = arguments.recording
     out = arguments.out or Path("out/eval-replay") / path.resolve().stem
     check_output(out)
-    truth = arguments.truth or (path if path.is_dir() else path.parent) / "truth.csv"
+    beside = (path if path.is_dir() else path.parent) / "truth.csv"
+    truth = arguments.truth or (beside if beside.exists() else None)
     replay = Replay(path, arguments.robot, options=options_of(arguments))
     console = plain_or_terminal()
     for note in replay.recording.notes:
         console.print(note, highlight=False)
     with Bar(console, "frames", len(replay)) as bar:
         evaluated = evaluate_replay(replay, settings_of(arguments).agent, truth, lambda frame: bar.advance())
-    for line in replay.damage:
+    for line in (*evaluated.notes, *replay.damage):
         console.print(line, highlight=False)
     for written in evaluated.write(out):
         console.print(f"{written}", highlight=False)

@@ -22,6 +22,10 @@ from mapweave.hybridmap.errors import DeviceError
 if TYPE_CHECKING:
     from mapweave.agent.recordings.options import RecordingOptions
     from mapweave.agent.recordings.recording import Recording
+    from mapweave.settings import NetworkSettings
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.memory import MemoryBus
+    from mapweave.wire.zenoh_bus import ZenohBus
 
 
 def add_to(commands: Any) -> None:
@@ -38,7 +42,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--name", help="in the fleet (default: the robot's, else the folder's)")
     parser.add_argument("--data", type=Path, default=Path("out/replay"), help="folder for the map")
     parser.add_argument("--epoch", type=int, help="least number of the new map (default: the next one)")
-    parser.add_argument("--offline", action="store_true", help="do not connect to a server")
+    parser.add_argument("--offline", action="store_true", help="do not connect to a router or a server")
     parser.add_argument(
         "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
     )
@@ -100,15 +104,13 @@ def run(arguments: argparse.Namespace) -> int:
         mission=MissionKind.CARRIED,
         server=network.server,
         total=len(robot),
-        trajectories=True,
+        recorded=True,
         patience=0.0 if arguments.offline else arguments.patience,
         calibration=calibration_of(arguments, name),
         rerun=arguments.rerun,
     )
     stop = stop_on_signals()
-    bus, keys = connect(network)
-    if not arguments.offline:
-        warn_without_router(bus, name)
+    bus, keys = _bus(network, name, arguments.offline)
     try:
         run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
@@ -118,12 +120,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     """Map a recording without odometry by its images alone."""
-    from mapweave.agent.replication.epochs import newest_on_server, next_epoch
+    from mapweave.agent.recordings.trajectory_file import tum_line
+    from mapweave.agent.replication.epochs import newest_on_server
     from mapweave.agent.replication.journal import Journal
     from mapweave.hybridmap.change import NodePut
     from mapweave.photographs import send_map
     from mapweave.processes.agent import FIRST_PATIENCE
-    from mapweave.processes.agent_files import epochs_of_files, map_path
+    from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path
     from mapweave.storage.map_file import MapFile, write_map_file
     from mapweave.terminal import EventLog, plain_or_terminal, tracked
     from mapweave.visual_mapping import keyframes, visual_maps
@@ -137,12 +140,12 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     journal = Journal(path, name)
     taken = [*epochs_of_files(data, name), *(known_map.epoch for known_map in journal.maps())]
     journal.close()
-    bus, keys = connect(network)
+    bus, keys = _bus(network, name, arguments.offline)
     try:
         stored = None
-        if not (taken or arguments.offline):
+        if not (taken or arguments.epoch or arguments.offline):
             stored = newest_on_server(bus, keys, network.server, name, FIRST_PATIENCE)
-        epoch = max([arguments.epoch or 0, *(used + 1 for used in taken)]) or next_epoch(taken, stored)
+        epoch = max(arguments.epoch or 0, *(used + 1 for used in taken), (stored or 0) + 1)
         frames = tracked(range(len(recording)), name, console=console)
         walk, damage = keyframes(recording, frames)
         maps = visual_maps(walk, recording.camera, name, epoch)
@@ -151,14 +154,29 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
             raise DeviceError(damage[0] if damage else f"{recording.path}: {why}: nothing can be mapped")
         for map_id, changes in maps:
             write_map_file(map_path(data, map_id), MapFile("agent", str(map_id), tuple(changes)))
-            nodes = sum(isinstance(change, NodePut) for change in changes)
-            say(f"{name}: {nodes} nodes in {map_path(data, map_id)}; its scale is unknown")
+            nodes = [change.node for change in changes if isinstance(change, NodePut)]
+            trajectory_path(data, map_id).write_text(
+                "".join(tum_line(node.stamp_ns, node.map_from_robot.mean) for node in nodes)
+            )
+            say(f"{name}: {len(nodes)} nodes in {map_path(data, map_id)}; its scale is unknown")
             if not arguments.offline:
                 sent = send_map(changes, map_id, path, bus, keys, network.server, arguments.patience)
                 say(f"{name}: server {network.server} has {'' if sent else 'not taken '}it all")
     finally:
         bus.close()
     return _report([*recording.damage, *damage])
+
+
+def _bus(network: NetworkSettings, name: str, offline: bool) -> tuple[ZenohBus | MemoryBus, Keys]:
+    """The connection; offline it reaches no one."""
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.memory import MemoryBus, MemoryHub
+
+    if offline:
+        return MemoryBus(MemoryHub()), Keys(network.fleet)
+    bus, keys = connect(network)
+    warn_without_router(bus, name)
+    return bus, keys
 
 
 def name_of(arguments: argparse.Namespace) -> str:

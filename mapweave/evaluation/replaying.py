@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from mapweave.agent.mission import Carried
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Stamps
-from mapweave.agent.recordings.trajectory_file import tum_line
+from mapweave.agent.recordings.trajectory_file import TrajectoryFile, tum_line
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.map_score import align
 from mapweave.evaluation.truth import Truth
@@ -61,6 +62,7 @@ class ReplayEvaluation:
         frames: all, in order.
         maps: that were made.
         truth: (N, 3) pose of each frame, NaN where unknown.
+        notes: what is wrong with the declared geometry, a line each.
     """
 
     name: str
@@ -105,8 +107,13 @@ class ReplayEvaluation:
         out = []
         for part in range(len(self.maps)):
             path = folder / f"map{part}.tum"
-            poses = [(f.stamp_ns, f.map_from_robot) for f in self.frames if f.part == part]
-            path.write_text("".join(tum_line(stamp, pose) for stamp, pose in poses if pose is not None))
+            path.unlink(missing_ok=True)
+            trajectory = TrajectoryFile(path)
+            for before, frame in pairwise([self.frames[0], *self.frames]):
+                if frame.part == part:
+                    motion = before.wheels.inverse() @ frame.wheels
+                    trajectory.add(frame.stamp_ns, motion, frame.map_from_robot)
+            trajectory.close()
             out.append(path)
         wheels = folder / "wheels.tum"
         wheels.write_text("".join(tum_line(frame.stamp_ns, frame.wheels) for frame in self.frames))
@@ -159,12 +166,14 @@ def evaluate_replay(
     Args:
         replay: read to its end.
         settings: of the pipeline.
-        truth: truth.csv, or poses as TUM writes them; None or a file that is missing scores nothing.
+        truth: truth.csv, or poses as TUM writes them; None scores nothing.
         on_frame: called after each frame.
 
     Raises:
-        DeviceError: the truth is there, but wrong; or an image cannot be read.
+        DeviceError: the truth is missing or wrong; or no image can be read.
     """
+    # A wrong file is reported before the recording is mapped.
+    true_poses(truth, np.zeros(0, np.int64))
     description = replay.describe()
     pipelines = [_pipeline(0, description, settings)]
     frames, wheels = list[Frame](), Pose2()
@@ -180,18 +189,21 @@ def evaluate_replay(
         on_frame(frames[-1])
     stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
     maps = [pipeline.map for pipeline in pipelines]
-    return ReplayEvaluation(str(replay.recording.path), frames, maps, true_poses(truth, stamps))
+    notes = [str(cause) for cause in pipelines[-1].calibration.causes]
+    return ReplayEvaluation(str(replay.recording.path), frames, maps, true_poses(truth, stamps), notes)
 
 
 def true_poses(path: Path | None, stamps_ns: Stamps) -> Array:
     """(N, 3) true poses at stamps, NaN where the truth says nothing.
 
     Raises:
-        DeviceError: the file is there, but wrong.
+        DeviceError: the file is missing or wrong.
     """
     out = np.full((len(stamps_ns), 3), math.nan)
-    if path is None or not path.exists():
+    if path is None:
         return out
+    if not path.exists():
+        raise DeviceError(f"{path}: no such file; without --truth nothing is scored")
     if path.suffix == ".csv":
         read = Truth.read(path)
         known, poses = read.stamps_ns, np.array([pose.vector for pose in read.poses]).reshape(-1, 3)
@@ -229,7 +241,10 @@ def rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         if isinstance(value, dict):
             words = "; ".join(f"{count} {reason}" for reason, count in value.items()) or "none"
         else:
-            words = "unknown" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+            share = f"{100 * value:g} %" if name == "frames_used" else ""
+            words = share or (
+                "unknown" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+            )
         wheels = report.get(f"wheels_{name}")
         out.append((name, words if wheels is None else f"{words} (wheels alone {wheels:g})"))
     return out

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 FIRST_PATIENCE = 3.0
 """How long a robot that remembers no map asks the server for the number of its next one, s."""
+RECORDED = "a recording takes no orders"
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ class AgentOptions:
         synchronization: what the loop waits for between ticks.
         server: whose acknowledgement lets changes be forgotten.
         total: observations that will come, if that is known.
-        trajectories: whether the pose at each observation goes to a file beside the map's.
+        recorded: whether the robot is a recording. It takes no orders, and the pose at each observation goes
+            to a file beside the map's; its first map has number 1 if no server has another.
         patience: how long to wait at the end until the server has everything, s.
         calibration: file with what `mapweave calibrate` has measured of this robot, if it exists.
         ros2: where pose and map are published as ROS 2 topics; None if they are not.
@@ -82,7 +84,7 @@ class AgentOptions:
     synchronization: Synchronization = field(default_factory=FreeRunning)
     server: str = "s0"
     total: int | None = None
-    trajectories: bool = False
+    recorded: bool = False
     patience: float = 5.0
     calibration: Path | None = None
     ros2: Ros2Link | None = None
@@ -135,7 +137,8 @@ class Agent:
         self._bus = TrafficMeter(bus)
         self._keys = keys
         self._settings = replace(settings, seed=options.seed)
-        self._teleoperation = Teleoperation()
+        refusal = RECORDED if options.recorded else ""
+        self._teleoperation = Teleoperation(refusal=refusal)
         self._options = options
         self._on_step = on_step
         self._causes = 0
@@ -145,7 +148,7 @@ class Agent:
         try:
             self.missions = MissionControl(
                 options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server,
-                lambda save: threading.Thread(target=save, name="missions").start(),
+                lambda save: threading.Thread(target=save, name="missions").start(), refusal,
             )  # fmt: skip
             if options.mission is not None or self.missions.report is None:
                 self.missions.begin(options.mission or options.otherwise)
@@ -182,6 +185,9 @@ class Agent:
             stored = None
             if options.patience > 0.0:
                 stored = newest_on_server(self._bus, self._keys, options.server, options.name, patience)
+            if options.recorded:
+                # The same recording is the same map, down to its number.
+                stored = stored or 0
             epoch = next_epoch(taken, stored)
         map_id = self.journal.open_map(epoch)
         pipeline = Pipeline(
@@ -225,7 +231,7 @@ class Agent:
             lambda: self.replicator.status().failure,
         )  # fmt: skip
         path = trajectory_path(options.data, map_id)
-        self._trajectory = TrajectoryFile(path) if options.trajectories else None
+        self._trajectory = TrajectoryFile(path) if options.recorded else None
         self.runner = Runner(
             pipeline, self._fleet, self.replicator, self.missions, MappingMonitor(self._description),
             options.synchronization, self._stepped, self._say,
@@ -246,8 +252,9 @@ class Agent:
         self._print(f"{self._options.name}: {line}")
 
     def _stepped(self, observation: Observation, step: Step) -> None:
-        if self._trajectory is not None and step.status.located:
-            self._trajectory.add(observation.stamp_ns, step.status.map_from_robot)
+        if self._trajectory is not None:
+            pose = step.status.map_from_robot if step.status.located else None
+            self._trajectory.add(observation.stamp_ns, observation.odometry.motion(), pose)
         line = self._server_watch.see(self._fleet.server_in_reach(), observation.stamp_ns)
         if line and self._options.patience > 0.0:
             self._say(line)

@@ -22,6 +22,7 @@ from mapweave.processes.ros2_publisher import Ros2Publisher
 from mapweave.processes.service_manager import ServiceManager
 from mapweave.terminal import EventLog, plain_or_terminal
 from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus
 from mapweave.wire.zenoh_bus import ZenohBus
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ SILENCE = 2.0
 
 def run_agent(
     robot: Robot,
-    bus: ZenohBus,
+    bus: ZenohBus | MemoryBus,
     keys: Keys,
     settings: AgentSettings,
     options: AgentOptions,
@@ -129,7 +130,7 @@ def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> Rob
 
 
 def _hand_over(
-    say: Callable[[str], None], replicator: Replicator, bus: ZenohBus, options: AgentOptions
+    say: Callable[[str], None], replicator: Replicator, bus: ZenohBus | MemoryBus, options: AgentOptions
 ) -> None:
     if not replicator.flush(10.0):
         return  # closing it says what is lost

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.agent.mission import Explore, GoTo, Idle
+from mapweave.agent.mission import Carried, Explore, GoTo, Idle
 from mapweave.agent.mission_control import GONE, MissionControl, as_mission
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import WithoutServer
@@ -237,3 +237,13 @@ def test_a_robot_whose_server_is_gone_does_as_it_is_set(setting, home, does, rea
     assert control.next(True, 60.0, home) == (None if does is None else Explore()), "and goes on"
     control.follow(status())
     assert control.report.reason == ""
+
+
+def test_a_recording_takes_no_orders() -> None:
+    control = MissionControl("r0", refusal="a recording takes no orders")
+    control.begin(MissionKind.CARRIED)
+    report = control.take(order(2**62, MissionKind.STOP))
+    assert (report.state, report.reason) == (MissionState.REFUSED, "a recording takes no orders")
+    assert isinstance(control.next(True, 0.0, None), Carried)
+    held = control.report
+    assert held is not None and held.order.kind is MissionKind.CARRIED

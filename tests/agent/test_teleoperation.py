@@ -127,3 +127,10 @@ def test_the_fleet_client_answers_with_its_status_and_a_mission_ends_the_wait(cl
         link.close()
         person.close()
         bus.close()
+
+
+def test_no_one_drives_a_recording(clock: Clock) -> None:
+    recording = Teleoperation(clock, "a recording takes no orders")
+    with pytest.raises(InvalidValue, match="a recording takes no orders"):
+        recording.take(DriveRequest(1, 0.2, 0.0))
+    assert recording.driven() is None

@@ -146,6 +146,18 @@ def one_node():
     return (NodePut(Node(NodeId("r0", 1, 1), 0, here, camera, Landmarks.empty())),)
 
 
+def test_a_recording_offline_is_mapped_without_a_session(recording, tmp_path, capfd, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise AssertionError("a session was opened")
+
+    monkeypatch.setattr("mapweave.wire.zenoh_bus.ZenohBus.__init__", refuse)
+    data = tmp_path / "data"
+    assert main(["replay", str(recording), "--data", str(data), "--offline"]) == 0
+    stamps = [line.split()[0] for line in (data / "walk.1.tum").read_text().splitlines() if line[0] != "#"]
+    assert stamps == ["0.000000000", "0.100000000", "0.200000000"], "every frame, localized or not"
+    capfd.readouterr()
+
+
 def test_a_recording_without_a_server_is_mapped_all_the_same(recording, tmp_path, capfd, closed):
     data = tmp_path / "data"
     arguments = ["replay", recording, "--data", data, "--name", "r0", "--epoch", 1, "--offline"]

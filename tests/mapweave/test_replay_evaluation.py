@@ -13,9 +13,10 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 
 from mapweave.cli import main
-from mapweave.evaluation.replaying import errors
+from mapweave.evaluation.replaying import errors, rows
 from mapweave.hybridmap.pose import Pose2
 from tests.agent.conftest import PhotoWalls
+from tests.mapweave.command_line import complaint
 
 
 def trajectory(poses: np.ndarray) -> PoseTrajectory3D:
@@ -85,6 +86,9 @@ def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
     assert main(["eval", "replay", str(folder), "--out", str(out), "--json"]) == 0
     report = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert report["frames"] == 30 and report["maps"] == 1 and report["nodes"] >= 1
+    assert str(report["frames"]) == "30" and ("frames_used", f"{100 * report['frames_used']:g} %") in rows(
+        report
+    )
     used = round(report["frames_used"] * report["frames"])
     assert used >= 25 and used + sum(report["not_used"].values()) == 30
     # Alignment leaves of an error in proportion to the way its spread: 3 % of the way's standard deviation.
@@ -93,6 +97,8 @@ def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
     assert 0.0 <= report["ate_m"] < 1.5 * spread
     estimate = file_interface.read_tum_trajectory_file(out / "map0.tum")
     wheels = file_interface.read_tum_trajectory_file(out / "wheels.tum")
-    assert (estimate.num_poses, wheels.num_poses) == (used, 30)
+    assert (estimate.num_poses, wheels.num_poses) == (30, 30), "also those that were not used, by the wheels"
     matched, _ = sync.associate_trajectories(wheels, estimate)
-    assert matched.num_poses == used
+    assert matched.num_poses == 30
+    missing = tmp_path / "none.csv"
+    assert f"{missing}: no such file" in complaint(capfd, "eval", "replay", folder, "--truth", missing)

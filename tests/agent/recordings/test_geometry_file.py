@@ -68,7 +68,7 @@ def test_angles_are_degrees(tmp_path: Path) -> None:
         ("height_m = 0", "height_m"), ("wheel_scale = 0.01", "wheel_scale"), ("delay_s = nan", "delay_s"),
         ('left_m = "x"', "left_m"),
         ("forward_m = inf", "forward_m"),
-        ("foward_m = 0.1", "no setting 'foward_m'; did you mean 'forward_m'?"), ("foo = 1", "'foo'; known are"),
+        ("foward_m = 0.1", "no setting 'foward_m'; did you mean 'forward_m'?"), ("foo = 1", "known are"),
         ("left_m = " + "9" * 400, "left_m has too many digits"), ("left_m = " + "[" * 5000, "r0.toml"),
     ],
 )  # fmt: skip
