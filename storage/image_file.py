@@ -50,7 +50,10 @@ def read_grey(path: Path, camera: Camera | None = None, source: str = "the camer
         raise DeviceError(f"{path}: not an image that can be read ({error})") from None
     if camera is not None and image.shape != (camera.height, camera.width):
         height, width = image.shape
-        raise DeviceError(f"{path}: {width}x{height} px, but {source} gives {camera.width}x{camera.height}")
+        raise DeviceError(
+            f"{path}: {width}x{height} px, but {source} gives {camera.width}x{camera.height}; give a "
+            "camera.toml of images of this size"
+        )
     return image
 
 

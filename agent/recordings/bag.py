@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.recordings.damaged_bag import DamagedBag
-from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
+from mapweave.agent.recordings.incomplete import CameraGiven, Incomplete, complete
+from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import (
-    Images,
-    Recording,
-    StampedPoses,
-    assembled,
-    without_odometry,
-)
+from mapweave.agent.recordings.recording import BagContents, Images, Recording, StampedPoses, Topic, names_of
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import (
     CAMERA_TYPE,
@@ -36,9 +31,8 @@ from mapweave.agent.ros_messages.values import (
     pose_of,
     stamp_of,
 )
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
-from mapweave.vision.lens import Distortion, lens_of
+from mapweave.vision.lens import lens_of
 
 SUFFIXES = {".bag", ".mcap", ".db3"}
 POSE_TYPES = (
@@ -48,21 +42,6 @@ POSE_TYPES = (
 )
 TRUTH = ("truth", "gt", "amcl", "mocap", "vicon")
 """Parts of names of topics that are never taken for odometry."""
-
-
-@dataclass(frozen=True)
-class Topic:
-    """One of a bag's.
-
-    Attributes:
-        name: of the topic.
-        kind: type of its messages.
-        count: how many there are.
-    """
-
-    name: str
-    kind: str
-    count: int
 
 
 class Bag:
@@ -89,6 +68,12 @@ class Bag:
             for name, (kind, count) in part.topics.items():
                 counts[name, kind] = counts.get((name, kind), 0) + count
         self.topics = tuple(Topic(name, kind, counts[name, kind]) for name, kind in sorted(counts))
+
+    @property
+    def contents(self) -> BagContents:
+        """What is in it."""
+        times = [time for part in self._parts for time in part.span_ns]
+        return BagContents(self.topics, (max(times) - min(times)) * 1e-9 if times else 0.0)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Stamps, ns, and messages of a topic, in the order in which they were recorded.
@@ -134,6 +119,7 @@ class WholeBag:
 
     Attributes:
         topics: by name: the type of its messages, and how many there are.
+        span_ns: when the first message and the last were recorded; empty if there are none.
     """
 
     def __init__(self, owner: Bag, path: Path) -> None:
@@ -155,6 +141,8 @@ class WholeBag:
         for connection in self._reader.connections:
             _, count = self.topics.get(connection.topic, ("", 0))
             self.topics[connection.topic] = connection.msgtype, count + connection.msgcount
+        begin, end = self._reader.start_time, self._reader.end_time
+        self.span_ns = (begin, end) if self._reader.message_count else ()
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Stamps, ns, and messages of a topic, in the order in which they were recorded.
@@ -226,34 +214,43 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
         DeviceError: something is missing or wrong; one line says which topics there are.
     """
     opened = Bag(path)
-    image = _chosen(opened, options.image_topic, IMAGE_TYPES, "images", "--image-topic")
+    if options.image_topic is None and not _of(opened, IMAGE_TYPES):
+        lacks = f"no images ({' or '.join(IMAGE_TYPES)})"
+        has_odometry = options.odometry is not None or _odometry_topic(opened, options) is not None
+        message = f"{path}: {lacks}; it has {names_of(opened.topics)}"
+        raise Incomplete(message, None, (lacks,), has_odometry, opened.contents)
+    image = _chosen(opened, options.image_topic, IMAGE_TYPES, "images")
     stamps = [stamp for stamp, _ in opened.messages(image.name)]
     if not stamps:
         raise DeviceError((opened.damage or [f"{path}: {image.name} has no images"])[-1])
     notes = [f"images from {image.name}"]
     if (np.diff(np.array(stamps)) <= 0).any():
         raise DeviceError(f"{path}: the stamps of {image.name} do not ascend")
-    camera, distortion = _camera(opened, image.name, options, notes)
+    given = _camera(opened, image.name, options, notes)
     images = Images(np.array(stamps, np.int64), _sequential(opened, image.name))
     kind = f"bag ({path.suffix.lstrip('.') or 'folder'})"
+    odometry = None
     if options.odometry is not None:
         odometry = read_poses(options.odometry)
     elif (topic := _odometry_topic(opened, options)) is not None:
         notes.append(f"odometry from {topic.name}")
         odometry = _poses(opened, topic.name)
-    else:
-        message, lost = f"{NO_ODOMETRY}; topics: {_names(opened.topics)}", tuple(opened.damage)
-        raise without_odometry(path, kind, camera, distortion, images, message, tuple(notes), lost)
-    whole = assembled(path, kind, camera, distortion, images, odometry, tuple(notes), tuple(opened.damage))
+    found, lost = opened.contents, tuple(opened.damage)
+    whole = complete(path, kind, given, images, odometry, tuple(notes), lost, found)
     kidnapped = _kidnapped(opened, whole.stamps_ns)
     begins = int(np.diff(kidnapped, prepend=False)[kidnapped].sum())
     lifted = (f"the robot was lifted {begins} times",) if begins else ()
     return replace(whole, kidnapped=kidnapped, notes=(*whole.notes, *lifted), damage=tuple(opened.damage))
 
 
-def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, option: str) -> Topic:
-    """The topic that is wanted, else the one of the right type with most messages."""
-    fitting = [topic for topic in opened.topics if topic.kind in kinds and topic.count]
+def _of(opened: Bag, kinds: Sequence[str]) -> list[Topic]:
+    """The topics of these types that have messages."""
+    return [topic for topic in opened.topics if topic.kind in kinds and topic.count]
+
+
+def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str) -> Topic:
+    """The topic that is wanted, else the one of the right type with most messages; there must be one."""
+    fitting = _of(opened, kinds)
     if wanted is not None:
         for topic in opened.topics:
             if topic.name == wanted:
@@ -261,9 +258,7 @@ def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, op
                     kind = f"{topic.count} messages of {topic.kind}"
                     raise DeviceError(f"{opened.path}: {wanted} has {kind}; {what} are {' or '.join(kinds)}")
                 return topic
-        raise DeviceError(f"{opened.path}: no topic {wanted}; it has {_names(opened.topics)}")
-    if not fitting:
-        raise DeviceError(f"{opened.path}: no {what} ({' or '.join(kinds)}); it has {_names(opened.topics)}")
+        raise DeviceError(f"{opened.path}: no topic {wanted}; it has {names_of(opened.topics)}")
     most = max(topic.count for topic in fitting)
     # Raw and compressed forms of one camera have as many messages: the first name decides.
     return next(topic for topic in fitting if topic.count == most)
@@ -271,17 +266,13 @@ def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, op
 
 def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic | None:
     if options.odometry_topic is not None:
-        return _chosen(opened, options.odometry_topic, POSE_TYPES, "poses", "--odometry-topic")
-    fitting = [topic for topic in opened.topics if topic.kind == ODOMETRY_TYPE and topic.count]
+        return _chosen(opened, options.odometry_topic, POSE_TYPES, "poses")
+    fitting = _of(opened, (ODOMETRY_TYPE,))
     fitting = [topic for topic in fitting if not any(word in topic.name.lower() for word in TRUTH)]
     if not fitting:
         return None
     # Filtered odometry may hold other sensors' errors; the wheels' own is what the filters here expect.
     return min(fitting, key=lambda topic: ("filter" in topic.name.lower(), -topic.count, topic.name))
-
-
-def _names(topics: Sequence[Topic]) -> str:
-    return ", ".join(f"{topic.name} ({topic.kind})" for topic in topics if topic.count) or "no messages"
 
 
 def _poses(opened: Bag, topic: str) -> StampedPoses:
@@ -318,17 +309,18 @@ def _kidnapped(opened: Bag, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     return kidnapped
 
 
-def _camera(
-    opened: Bag, image: str, options: RecordingOptions, notes: list[str]
-) -> tuple[Camera, Distortion]:
+def _camera(opened: Bag, image: str, options: RecordingOptions, notes: list[str]) -> CameraGiven:
     if options.camera is not None:
-        return options.camera_of(opened.path, None)
-    infos = [topic for topic in opened.topics if topic.kind == CAMERA_TYPE and topic.count]
+        return options.camera_of(None)
+    infos = _of(opened, (CAMERA_TYPE,))
+    if options.camera_info_topic is not None:
+        infos = [_chosen(opened, options.camera_info_topic, (CAMERA_TYPE,), "cameras")]
     near = [
         topic for topic in infos if _namespace(topic.name) == _namespace(image.removesuffix("/compressed"))
     ]
     if not (near or len(infos) == 1):
-        raise DeviceError(f"{opened.path}: no camera_info beside {image}; give --camera FILE (a camera.toml)")
+        other = " or --camera-info-topic TOPIC" if infos else ""
+        return CameraGiven(None, f"no camera_info beside {image}; give --camera FILE (a camera.toml){other}")
     info = (near or infos)[0]
     _, message = next(opened.messages(info.name), (0, None))
     if message is None:
@@ -349,7 +341,7 @@ def _camera(
             notes.append(
                 f"the camera looks {math.degrees(mount.heading):.0f} deg to the left: it should look ahead"
             )
-    return options.camera_of(opened.path, given, mount is not None)
+    return options.camera_of(given, mount is not None)
 
 
 def _namespace(topic: str) -> str:

@@ -29,6 +29,7 @@ class DamagedBag:
 
     Attributes:
         topics: by name: the type of its messages, and how many there are.
+        span_ns: when the first message and the last were recorded.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,14 +48,18 @@ class DamagedBag:
         self._decode: Callable[[bytes, str], Any] = store.deserialize_ros1 if ros1 else store.deserialize_cdr
         topics: dict[int, tuple[str, str]] = {}
         counts: Counter[int] = Counter()
+        times: list[int] = []
         for connection, second, third in self._items(path):
             if isinstance(second, str):
                 topics[connection] = second, str(third)
             else:
                 counts[connection] += 1
+                # A row of a database that was cut off has no stamp.
+                times += [second] if isinstance(second, int) else []
         self.topics = {topics[k][0]: (topics[k][1], count) for k, count in counts.items() if k in topics}
         if not self.topics:
             raise DeviceError(f"{path}: no message in it can be read")
+        self.span_ns = (min(times), max(times)) if times else ()
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Stamps, ns, and messages of a topic, in the order in which they were recorded.

@@ -11,21 +11,15 @@ import numpy as np
 
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_in, images_of, read_increments, read_times
-from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
+from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven, complete
+from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import (
-    Images,
-    Recording,
-    Stamps,
-    assembled,
-    stamps_of,
-    without_odometry,
-)
+from mapweave.agent.recordings.recording import Images, Recording, Stamps, stamps_of
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.image_file import image_size, read_grey
-from mapweave.vision.lens import NO_DISTORTION, Distortion, LensModel, lens_of
+from mapweave.vision.lens import NO_DISTORTION, LensModel, lens_of
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
@@ -119,18 +113,26 @@ def images_folder(folder: Path, options: RecordingOptions) -> Recording:
     Raises:
         DeviceError: something is missing or wrong.
     """
-    paths = images_of(folder)
-    camera, distortion = read_camera(options.camera or folder / "camera.toml")
+    paths, kind = images_of(folder), "folder of images"
+    file = options.camera or folder / "camera.toml"
+    if options.camera is None and not file.exists():
+        optics = CameraGiven(
+            None, f"no {file.name}, which must give the camera's intrinsics; give --camera FILE"
+        )
+    else:
+        optics = CameraGiven(read_camera(file))
     times = folder / "times.txt"
     stamps = stamps_of(times, read_times(times, len(paths)))
-    path, images = folder / "odometry.csv", _images(paths, stamps, camera)
+    path = folder / "odometry.csv"
+    images = _images(paths, stamps, None if optics.known is None else optics.known[0])
     if options.odometry is not None or _is_poses(path):
-        poses = read_poses(options.odometry or path)
-        return assembled(folder, "folder of images", camera, distortion, images, poses)
+        return complete(folder, kind, optics, images, read_poses(options.odometry or path))
+    if not path.exists():
+        return complete(folder, kind, optics, images, None)
     increments, damage = read_increments(path, len(paths))
     images = Images(stamps[: len(increments)], images.read)
     lines = (f"{damage}; the images before it are used",) if damage else ()
-    return assembled(folder, "folder of images", camera, distortion, images, increments, damage=lines)
+    return complete(folder, kind, optics, images, increments, damage=lines)
 
 
 def _is_poses(path: Path) -> bool:
@@ -147,17 +149,14 @@ def _folder(
     kind: str,
     paths: Sequence[Path],
     stamps_ns: Stamps,
-    given: tuple[Camera, Distortion] | None,
+    given: CameraAndLens | None,
     options: RecordingOptions,
 ) -> Recording:
-    camera, distortion = options.camera_of(folder, given)
+    optics = options.camera_of(given)
     beside = next((p for p in (folder / "odometry.csv", folder / "odometry.txt") if p.exists()), None)
     odometry = options.odometry or beside
-    images = _images(paths, stamps_ns)
-    if odometry is None:
-        message = f"{kind}, {len(paths)} images, but {NO_ODOMETRY}"
-        raise without_odometry(folder, kind, camera, distortion, images, message)
-    return assembled(folder, kind, camera, distortion, images, read_poses(odometry))
+    poses = None if odometry is None else read_poses(odometry)
+    return complete(folder, kind, optics, _images(paths, stamps_ns), poses)
 
 
 def _images(paths: Sequence[Path], stamps_ns: Stamps, camera: Camera | None = None) -> Images:

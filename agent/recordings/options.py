@@ -6,9 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mapweave.agent.recordings.camera_file import read_camera
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.errors import DeviceError
-from mapweave.vision.lens import Distortion
+from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven
 
 
 @dataclass(frozen=True)
@@ -21,6 +19,7 @@ class RecordingOptions:
         odometry: file with poses, see `mapweave.agent.recordings.pose_files`.
         image_topic: of a bag; None takes the most likely one.
         odometry_topic: of a bag; likewise.
+        camera_info_topic: of a bag; None takes the one beside the images.
     """
 
     camera: Path | None = None
@@ -28,33 +27,24 @@ class RecordingOptions:
     odometry: Path | None = None
     image_topic: str | None = None
     odometry_topic: str | None = None
+    camera_info_topic: str | None = None
 
-    def camera_of(
-        self, path: Path, given: tuple[Camera, Distortion] | None, height_given: bool = False
-    ) -> tuple[Camera, Distortion]:
+    def camera_of(self, given: CameraAndLens | None, height_given: bool = False) -> CameraGiven:
         """The camera: the person's file, else the recording's with the person's height.
 
         Args:
-            path: of the recording, for the error.
             given: by the recording.
             height_given: whether its mount is, too.
 
         Raises:
-            DeviceError: the camera or its height is not given.
+            DeviceError: the person's file is missing or wrong.
         """
         if self.camera is not None:
-            return read_camera(self.camera)
+            return CameraGiven(read_camera(self.camera))
         if given is None:
-            raise DeviceError(f"{path}: does not say what camera it is; give --camera FILE (a camera.toml)")
+            return CameraGiven(None, "does not say what camera it is; give --camera FILE (a camera.toml)")
         camera, distortion = given
         if self.camera_height is not None:
-            return replace(camera, mount_height=self.camera_height), distortion
-        if not height_given:
-            raise DeviceError(f"{path}: does not say how high the camera is; give --camera-height METRES")
-        return given
-
-
-NO_ODOMETRY = (
-    "no odometry: give --odometry FILE (stamped poses), or let `mapweave replay` map it by its images alone, "
-    "without a scale"
-)
+            return CameraGiven((replace(camera, mount_height=self.camera_height), distortion))
+        lacks = "" if height_given else "does not say how high the camera is; give --camera-height METRES"
+        return CameraGiven(given, lacks)

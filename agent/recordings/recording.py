@@ -26,6 +26,34 @@ MOST_WIDTH = 800
 """px; wider images are reduced. SIFT takes time in proportion to the area."""
 
 
+@dataclass(frozen=True)
+class Topic:
+    """One of a bag's.
+
+    Attributes:
+        name: of the topic.
+        kind: type of its messages.
+        count: how many there are.
+    """
+
+    name: str
+    kind: str
+    count: int
+
+
+@dataclass(frozen=True)
+class BagContents:
+    """What is in a bag.
+
+    Attributes:
+        topics: by name.
+        seconds: from the first message to the last, s.
+    """
+
+    topics: tuple[Topic, ...]
+    seconds: float
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """A drive.
@@ -41,6 +69,7 @@ class Recording:
         notes: what was guessed or left out, a line each.
         damage: what cannot be read of it, a line each; what comes before is used.
         kidnapped: (N,) whether the robot was lifted since the image before; None if the format does not say.
+        bag: what else is in it, if it is one.
     """
 
     path: Path
@@ -53,6 +82,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
     kidnapped: NDArray[np.bool_] | None = None
+    bag: BagContents | None = None
 
     def __len__(self) -> int:
         """How many images there are."""
@@ -87,19 +117,6 @@ class StampedPoses:
     stamps_ns: Stamps
     poses: Array
     damage: str = ""
-
-
-class NoOdometry(DeviceError):
-    """A recording has all but odometry.
-
-    Attributes:
-        recording: the rest; its increments are zero.
-    """
-
-    def __init__(self, message: str, recording: Recording) -> None:
-        """Take the line for people, and what there is."""
-        super().__init__(message)
-        self.recording = recording
 
 
 def stamps_of(path: Path, seconds: Iterable[float]) -> Stamps:
@@ -243,20 +260,9 @@ def _silence(stamps_ns: Stamps, odometry_ns: Stamps) -> list[str]:
     return [f"the camera is silent for {gaps[longest] / 1e9:.1f} s, {begin:.1f} s after its first image"]
 
 
-def without_odometry(
-    path: Path,
-    kind: str,
-    camera: Camera,
-    distortion: Distortion,
-    images: Images,
-    message: str,
-    notes: tuple[str, ...] = (),
-    damage: tuple[str, ...] = (),
-) -> NoOdometry:
-    """The error of a recording that has no odometry, with the images. Arguments as of `assembled`."""
-    nothing = np.zeros((len(images.stamps_ns), 2))
-    recording = assembled(path, kind, camera, distortion, images, nothing, notes, damage)
-    return NoOdometry(f"{path}: {message}", recording)
+def names_of(topics: Iterable[Topic]) -> str:
+    """Names and types of the topics that have messages."""
+    return ", ".join(f"{topic.name} ({topic.kind})" for topic in topics if topic.count) or "no messages"
 
 
 def reduced(camera: Camera, factor: int) -> Camera:
@@ -283,7 +289,8 @@ def _reader(
         if image.shape != (camera.height, camera.width):
             height, width = image.shape
             raise DeviceError(
-                f"{path}: image {k} has {width}x{height} px, but the camera {camera.width}x{camera.height}"
+                f"{path}: image {k} has {width}x{height} px, but the camera {camera.width}x{camera.height}; "
+                "give --camera FILE, the camera.toml of images of this size"
             )
         if factor == 1:
             return image

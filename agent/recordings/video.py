@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
+from mapweave.agent.recordings.incomplete import complete
+from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import Images, Recording, assembled, without_odometry
+from mapweave.agent.recordings.recording import Images, Recording
 from mapweave.hybridmap.errors import DeviceError
 
 SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
@@ -30,13 +31,10 @@ def video(path: Path, options: RecordingOptions) -> Recording:
         DeviceError: it cannot be read, or its camera or odometry is not given.
     """
     images = video_images(path)
-    camera, distortion = options.camera_of(path, None)
+    given = options.camera_of(None)
     beside = path.with_suffix(".csv")
     odometry = options.odometry or (beside if beside.exists() else None)
-    if odometry is None:
-        message = f"video, {len(images.stamps_ns)} frames, but {NO_ODOMETRY}"
-        raise without_odometry(path, "video", camera, distortion, images, message)
-    return assembled(path, "video", camera, distortion, images, read_poses(odometry))
+    return complete(path, "video", given, images, None if odometry is None else read_poses(odometry))
 
 
 def video_images(path: Path) -> Images:

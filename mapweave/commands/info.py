@@ -4,9 +4,22 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.replay import add_recording, options_of
+
+if TYPE_CHECKING:
+    from mapweave.agent.recordings.recording import Recording
+
+ODOMETRY = (
+    "odometry: give --odometry FILE (stamped poses). Without it `mapweave replay` maps it by its images "
+    "alone; such a map has no scale, so nothing in it is metric, and lost robots get the place but not the "
+    "distance"
+)
+UNKNOWN = dict.fromkeys(
+    ("images_per_second", "longest_gap_s", "width", "height", "focal_px", "camera_height_m",
+     "camera_forward_m", "driven_m", "turned_rad")
+)  # fmt: skip
 
 
 def add_to(commands: Any) -> None:
@@ -14,7 +27,8 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "info",
         help="say what is in a recording, and what is missing",
-        description="Open a recording as `mapweave replay` does, and say what is in it.",
+        description="Open a recording as `mapweave replay` does, and say what is in it. What is missing is "
+        "listed with the option that gives it.",
     )
     add_recording(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -23,55 +37,90 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Open and describe."""
+    from mapweave.agent.recordings.incomplete import Incomplete
+    from mapweave.agent.recordings.opening import open_recording
+
+    lacks: tuple[str, ...] = ()
+    odometry = True
+    try:
+        whole = open_recording(arguments.recording, options_of(arguments))
+        recording: Recording | None = whole
+        bag = whole.bag
+    except Incomplete as error:
+        recording, lacks, odometry, bag = error.recording, error.lacks, error.odometry, error.bag
+    facts = {
+        "recording": str(arguments.recording),
+        "format": "bag" if recording is None else recording.kind,
+        "images": 0,
+        "seconds": 0.0 if bag is None else round(bag.seconds, 3),
+        **UNKNOWN,
+        "notes": [],
+        "damage": [],
+        **({} if recording is None else _described(recording, bool(lacks), odometry)),
+        "topics": [] if bag is None else [
+            {"name": topic.name, "type": topic.kind, "count": topic.count} for topic in bag.topics
+        ],
+        "missing": [*lacks, *([] if odometry else [ODOMETRY])],
+    }  # fmt: skip
+    if arguments.json:
+        print(json.dumps(facts))
+    else:
+        _print(facts)
+    return 0
+
+
+def _described(recording: Recording, camera_lacks: bool, odometry: bool) -> dict[str, Any]:
+    """What images, camera and odometry say.
+
+    Raises:
+        DeviceError: no image can be read.
+    """
     import numpy as np
 
-    from mapweave.agent.recordings.opening import open_recording
-    from mapweave.agent.recordings.recording import NoOdometry
+    from mapweave.agent.recordings.incomplete import first_image
 
-    missing = []
-    try:
-        recording = open_recording(arguments.recording, options_of(arguments))
-    except NoOdometry as error:
-        recording = error.recording
-        missing.append(
-            "odometry: `mapweave replay` maps it by its images alone; such a map has no scale, so nothing in "
-            "it is metric, and lost robots get the place but not the distance"
-        )
     camera, stamps = recording.camera, recording.stamps_ns
-    recording.read(0)
-    seconds = float(stamps[-1] - stamps[0]) * 1e-9
+    _, unreadable = first_image(len(recording), recording.read)
     gaps = np.diff(stamps) * 1e-9
     way, turn = np.abs(recording.increments).sum(axis=0)
-    facts = {
-        "recording": str(recording.path),
-        "format": recording.kind,
+    out: dict[str, Any] = {
         "images": len(recording),
-        "seconds": round(seconds, 3),
+        "seconds": round(float(stamps[-1] - stamps[0]) * 1e-9, 3),
         "images_per_second": round(1.0 / float(np.median(gaps)), 2),
         "longest_gap_s": round(float(gaps.max()), 3),
         "width": camera.width,
         "height": camera.height,
-        "focal_px": round(camera.fx, 1),
-        "camera_height_m": round(camera.mount_height, 3),
-        "camera_forward_m": round(camera.mount_forward, 3),
-        "driven_m": None if missing else round(float(way), 2),
-        "turned_rad": None if missing else round(float(turn), 2),
-        "missing": missing,
-        "notes": list(recording.notes),
-        "damage": list(recording.damage),
     }
-    if arguments.json:
-        print(json.dumps(facts))
-        return 0
-    print(f"{recording.path}: {recording.kind}")
-    print(f"  {len(recording)} images in {seconds:.1f} s, {facts['images_per_second']:g} a second", end="")
-    print(f", longest gap {facts['longest_gap_s']:g} s")
-    print(f"  camera {camera.width}x{camera.height} px, focal length {camera.fx:.0f} px, ", end="")
-    print(f"{camera.mount_height:.2f} m high, {camera.mount_forward:.2f} m ahead of the axle")
-    if not missing:
-        print(f"  odometry {way:.1f} m, {turn:.1f} rad of turns")
-    for words in missing:
+    if not camera_lacks:
+        out |= {
+            "focal_px": round(camera.fx, 1),
+            "camera_height_m": round(camera.mount_height, 3),
+            "camera_forward_m": round(camera.mount_forward, 3),
+        }
+    if odometry:
+        out |= {"driven_m": round(float(way), 2), "turned_rad": round(float(turn), 2)}
+    damage = [*recording.damage, *([unreadable] if unreadable else [])]
+    return {**out, "notes": list(recording.notes), "damage": damage}
+
+
+def _print(facts: dict[str, Any]) -> None:
+    """The same for people."""
+    print(f"{facts['recording']}: {facts['format']}")
+    if facts["images"]:
+        print(f"  {facts['images']} images in {facts['seconds']:.1f} s, ", end="")
+        print(f"{facts['images_per_second']:g} a second, longest gap {facts['longest_gap_s']:g} s")
+        print(f"  camera {facts['width']}x{facts['height']} px", end="")
+        if facts["focal_px"] is not None:
+            print(f", focal length {facts['focal_px']:.0f} px, {facts['camera_height_m']:.2f} m high", end="")
+            print(f", {facts['camera_forward_m']:.2f} m ahead of the axle", end="")
+        print()
+    else:
+        print(f"  no images in {facts['seconds']:.1f} s")
+    if facts["driven_m"] is not None:
+        print(f"  odometry {facts['driven_m']:.1f} m, {facts['turned_rad']:.1f} rad of turns")
+    for topic in facts["topics"]:
+        print(f"  {topic['name']} ({topic['type']}), {topic['count']} messages")
+    for words in facts["missing"]:
         print(f"  missing: {words}")
-    for note in (*recording.notes, *recording.damage):
+    for note in (*facts["notes"], *facts["damage"]):
         print(f"  {note}")
-    return 0

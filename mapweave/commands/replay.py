@@ -69,6 +69,9 @@ def add_recording(parser: argparse.ArgumentParser, optional: bool = False) -> No
     )  # fmt: skip
     parser.add_argument("--image-topic", metavar="TOPIC", help="of a bag (default: the one with most images)")
     parser.add_argument("--odometry-topic", metavar="TOPIC", help="of a bag (default: by its type and name)")
+    parser.add_argument(
+        "--camera-info-topic", metavar="TOPIC", help="of a bag (default: the one beside the images)"
+    )
 
 
 def options_of(arguments: argparse.Namespace) -> RecordingOptions:
@@ -76,13 +79,15 @@ def options_of(arguments: argparse.Namespace) -> RecordingOptions:
     from mapweave.agent.recordings.options import RecordingOptions
 
     a = arguments
-    return RecordingOptions(a.camera, a.camera_height, a.odometry, a.image_topic, a.odometry_topic)
+    return RecordingOptions(
+        a.camera, a.camera_height, a.odometry, a.image_topic, a.odometry_topic, a.camera_info_topic
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Play the recording to its end."""
     from mapweave.agent.drivers.replay import Replay
-    from mapweave.agent.recordings.recording import NoOdometry
+    from mapweave.agent.recordings.incomplete import NoOdometry
     from mapweave.hybridmap.mission_order import MissionKind
     from mapweave.processes.agent import AgentOptions
     from mapweave.processes.agent_process import run_agent

@@ -247,7 +247,7 @@ WRONG = {
     "camera of deep lists": (written("camera.toml", "width = " + "[" * 5000), "camera.toml"),
     "camera with a long number": (replaced("camera.toml", "0.05", "9" * 400), "has too many digits"),
     "one image": (single, "1 images are no drive; there must be two or more"),
-    "no odometry": (gone("odometry.csv"), "without odometry the map has no scale"),
+    "no odometry": (gone("odometry.csv"), "14 images, but no odometry: give --odometry FILE"),
     "odometry is a folder": (folder_at("odometry.csv"), "odometry.csv"),
     "odometry is empty": (written("odometry.csv", ""), "0 rows for 14 images"),
     "odometry without a turn": (replaced("odometry.csv", "turn_rad", "turn"), "no column 'turn_rad'"),

@@ -135,6 +135,18 @@ def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path: Path) -
     assert first[-1].stamp_ns < 2.5e9 <= second[0].stamp_ns
 
 
+def test_a_folder_of_images_without_odometry_is_mapped_as_the_video_is(made, video, tmp_path: Path) -> None:
+    path, _ = video
+    folder = tmp_path / "walk"
+    (folder / "images").mkdir(parents=True)
+    for k, image in enumerate(frames(path)):
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
+    (file,) = replayed(folder, path.with_name("camera.toml"), tmp_path / "maps")
+    nodes, _ = contents(file)
+    assert [node.stamp_ns for node in nodes] == [node.stamp_ns for node in contents(made)[0]]
+    assert len(np.loadtxt(file.with_suffix(".tum"))) == len(nodes), "a trajectory of the keyframes"
+
+
 def test_info_says_what_is_missing_and_damage_is_said(video, tmp_path: Path, capfd) -> None:
     path, _ = video
     camera = path.with_name("camera.toml")

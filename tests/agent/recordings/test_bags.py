@@ -23,6 +23,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings import bag
+from mapweave.agent.recordings.incomplete import Incomplete
 from mapweave.agent.recordings.mcap_writer import FLUSH_S
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
@@ -99,6 +100,7 @@ def write_bag(
     """Images at their stamps, odometry four times as often; both arrive late. `lifted` is by image."""
     store: Any = STORE1 if ros1 else STORE
     topics = {"image": "/cam/image_raw", "info": "/cam/camera_info", "odom": "/odom", **named}
+    other = topics.pop("second", "")
     kinds = {
         "image": "sensor_msgs/msg/" + ("CompressedImage" if encoding in ("jpeg", "png") else "Image"),
         "info": "sensor_msgs/msg/CameraInfo", "odom": "nav_msgs/msg/Odometry",
@@ -108,6 +110,8 @@ def write_bag(
     serialize: Callable[[Any, str], Any] = store.serialize_ros1 if ros1 else store.serialize_cdr
     with writer:
         opened = {key: writer.add_connection(topics[key], kinds[key], typestore=store) for key in topics}
+        if other:
+            opened["second"] = writer.add_connection(other, kinds["info"], typestore=store)
         for at, is_kidnapped in lifted.items():
             stamp = BEGUN_NS + round(at * STEP_NS)
             opened["kidnap"] = opened.get("kidnap") or writer.add_connection("/k", KIDNAP, typestore=store)
@@ -128,7 +132,9 @@ def write_bag(
             else:
                 message = image(store, stamp, grey, encoding)
             writer.write(opened["image"], late, serialize(message, kinds["image"]))
-            writer.write(opened["info"], late, serialize(camera_info(store, stamp, drive), kinds["info"]))
+            for name in opened.keys() & {"info", "second"}:
+                info = camera_info(store, stamp, drive)
+                writer.write(opened[name], late, serialize(info, kinds["info"]))
 
 
 @pytest.mark.parametrize(
@@ -304,3 +310,22 @@ def test_a_camera_topic_that_lost_its_messages_is_reported_in_one_line() -> None
     opened = SimpleNamespace(path="walk.mcap", topics=[topic], damage=[], messages=lambda name: iter(()))
     with pytest.raises(DeviceError, match="camera_info has no message"):
         bag._camera(opened, "/camera/image", RecordingOptions(), [])
+
+
+def test_the_topic_of_the_camera_may_be_given(drive: Drive, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive", drive, info="/elsewhere/info", second="/other/info")
+    given = replace(OPTIONS, camera_info_topic="/elsewhere/info")
+    assert open_recording(tmp_path / "drive", given).camera == drive.camera
+    with pytest.raises(DeviceError, match="no topic /none; it has"):
+        open_recording(tmp_path / "drive", replace(OPTIONS, camera_info_topic="/none"))
+
+
+def test_what_a_bag_lacks_is_said_with_what_is_in_it(drive: Drive, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive", drive, odom="/ground_truth/odom")
+    with pytest.raises(Incomplete, match="--camera-height METRES") as caught:
+        open_recording(tmp_path / "drive")
+    found = caught.value
+    assert found.recording is not None and len(found.recording) == COUNT and not found.odometry
+    assert found.bag is not None and found.bag.seconds == pytest.approx((COUNT - 1) * STEP_NS * 1e-9)
+    counts = {topic.name: topic.count for topic in found.bag.topics}
+    assert counts == {"/cam/image_raw": COUNT, "/cam/camera_info": COUNT, "/ground_truth/odom": 4 * COUNT - 3}

@@ -11,9 +11,10 @@ import pytest
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.camera_file import read_camera
+from mapweave.agent.recordings.incomplete import NoOdometry
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
-from mapweave.agent.recordings.recording import NoOdometry, reduced
+from mapweave.agent.recordings.recording import reduced
 from mapweave.agent.recordings.video import video_images
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
@@ -158,7 +159,7 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
         writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     writer.release()
     assert video_images(path).damage == ""
-    with pytest.raises(DeviceError, match="video, 9 frames, but no odometry"):
+    with pytest.raises(DeviceError, match="video, 9 images, but no odometry"):
         open_recording(path, RecordingOptions(camera=camera))
     rows = [f"{0.2 * k},{p.x!r},{p.y!r},{p.heading!r}" for k, p in enumerate(drive.poses)]
     path.with_suffix(".csv").write_text("\n".join(["stamp_s,x_m,y_m,heading_rad", *rows]) + "\n")
