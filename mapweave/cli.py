@@ -103,6 +103,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # FAISS reads this when it is imported. On a busy machine its threads spin while they wait for each other:
     # a search by two of them took three times the processor time of a search by one, and longer.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # OpenCV and its FFmpeg read these likewise. What they print comes beside the one line of an error.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     commands = parser()
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete

@@ -117,7 +117,7 @@ def images_folder(folder: Path, options: RecordingOptions) -> Recording:
     file = options.camera or folder / "camera.toml"
     if options.camera is None and not file.exists():
         optics = CameraGiven(
-            None, f"no {file.name}, which must give the camera's intrinsics; give --camera FILE"
+            None, f"no {file.name}; it must give the camera's intrinsics: give --camera FILE"
         )
     else:
         optics = CameraGiven(read_camera(file))

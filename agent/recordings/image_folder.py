@@ -55,8 +55,12 @@ def read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
         times = np.array([float(line) for line in read_whole(path).decode().split()])
     except (OSError, ValueError) as error:
         raise DeviceError(f"{path}: {error}") from None
-    if len(times) != count or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise DeviceError(f"{path}: {len(times)} times for {count} images; they must be one each and ascend")
+    if len(times) != count:
+        raise DeviceError(f"{path}: {len(times)} times for {count} images; there must be one each")
+    wrong = np.flatnonzero(~(np.isfinite(times) & (np.diff(times, prepend=-np.inf) > 0)))
+    if len(wrong):
+        line = int(wrong[0])
+        raise DeviceError(f"{path}: line {line + 1}: {float(times[line])}: times must be finite and ascend")
     if not 0.0 <= times[0] <= times[-1] <= MAX_STAMP_NS / 1e9:
         raise DeviceError(f"{path}: times are seconds since 1970 or since the start, not {times[0]:g}")
     return times

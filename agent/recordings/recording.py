@@ -204,7 +204,8 @@ def assembled(
     if len(stamps) < 2:
         raise DeviceError(f"{path}: {len(stamps)} images are no drive")
     if (np.diff(stamps) <= 0).any():
-        raise DeviceError(f"{path}: the images' stamps do not ascend")
+        first = int((np.diff(stamps) <= 0).argmax()) + 1
+        raise DeviceError(f"{path}: the images' stamps do not ascend: see image {first}, counted from 0")
     if isinstance(odometry, StampedPoses):
         try:
             inside, increments = increments_between(odometry, stamps)

@@ -104,7 +104,10 @@ def map_of(word: str) -> MapId:
     Raises:
         InvalidValue: it is none.
     """
-    end = read_end(word)
+    try:
+        end = read_end(word)
+    except InvalidValue:
+        raise InvalidValue(f"{word!r} is no map: write it as r0.1, the robot and the map's number") from None
     if isinstance(end, NodeId):
         raise InvalidValue(f"{word} is a node: give its map, {end.map}")
     return end

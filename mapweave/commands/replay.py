@@ -190,8 +190,9 @@ def name_of(arguments: argparse.Namespace) -> str:
 
     from mapweave.hybridmap.node import check_name
 
-    fallback = re.sub("[^a-z0-9_-]", "-", (arguments.robot or arguments.recording.resolve().stem).lower())
-    return check_name(arguments.name or fallback)
+    given = (arguments.robot or arguments.recording.resolve().stem).lower()
+    fallback = re.sub("[^a-z0-9_-]", "-", given).strip("-_")[:32]  # a longer name is refused
+    return check_name(arguments.name or fallback or "recording")
 
 
 def _report(damage: Sequence[str]) -> int:

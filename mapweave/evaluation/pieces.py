@@ -31,8 +31,9 @@ def pieces(folder: Path, robots: int | None) -> dict[str, Replay]:
     Raises:
         DeviceError: the recording lacks something, or cannot be cut like this.
     """
-    if not folder.is_dir():
-        raise DeviceError(f"{folder}: no such folder; give one with images/, camera.toml, odometry.csv")
+    check_folder(folder, "images/, camera.toml and odometry.csv")
+    if not (folder / "images").is_dir():
+        raise DeviceError(f"{folder}: has no images/; only folders of images can be cut and scored")
     if robots is None:
         file = folder / "splits.toml"
         if not file.exists():
@@ -51,6 +52,22 @@ def pieces(folder: Path, robots: int | None) -> dict[str, Replay]:
             f"{folder}: {count} images are too few for {robots} robots; each needs {LEAST_IMAGES} at least"
         )
     return {f"r{k}": Replay(folder, frames=frames) for k, frames in enumerate(cuts)}
+
+
+def check_folder(folder: Path, needs: str) -> None:
+    """Refuse what is no folder.
+
+    Args:
+        folder: of a recording that is to be scored.
+        needs: what must be in it, in words.
+
+    Raises:
+        DeviceError: it is missing, or a file: bags and videos have neither splits.toml nor truth.csv.
+    """
+    if folder.is_file():
+        raise DeviceError(f"{folder}: bags and videos cannot be scored; give a folder with {needs}")
+    if not folder.is_dir():
+        raise DeviceError(f"{folder}: no such folder; give one with {needs}")
 
 
 def cut(count: int, robots: int) -> list[range]:

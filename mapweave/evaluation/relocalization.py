@@ -18,6 +18,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.asking_again import Trial, trial_figures
 from mapweave.evaluation.drive import DriveMap
 from mapweave.evaluation.photographs import AppearanceMap, Photographs, photograph_trials
+from mapweave.evaluation.pieces import check_folder
 from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import Verdict, figures
 from mapweave.hybridmap.camera import Camera
@@ -85,8 +86,7 @@ def evaluate_relocalization(
     Raises:
         DeviceError: the folder lacks what is needed, or a file is wrong.
     """
-    if not folder.is_dir():
-        raise DeviceError(f"{folder}: no such folder; give a recording with images/")
+    check_folder(folder, "images/, and odometry.csv and splits.toml or lap_truth.csv")
     if (folder / "odometry.csv").exists() and (folder / "splits.toml").exists():
         if camera_file is not None or focal_px is not None:
             raise DeviceError(f"{folder}: a drive has its camera.toml; leave --camera and --focal out")
@@ -94,8 +94,8 @@ def evaluate_relocalization(
     if (folder / "lap_truth.csv").exists():
         return _examine_photographs(folder, camera_file, focal_px, console)
     raise DeviceError(
-        f"{folder}: two passes cannot be told apart; it needs odometry.csv and splits.toml with two robots, "
-        "or lap_truth.csv"
+        f"{folder}: two passes cannot be told apart; a folder with images/ needs odometry.csv and "
+        "splits.toml with two robots, or lap_truth.csv. Other recordings cannot be scored"
     )
 
 

@@ -258,7 +258,7 @@ WRONG = {
     "odometry is no text": (written("odometry.csv", b"\xff\xfe\x00" * 9), "odometry.csv"),
     "odometry with a huge field": (written("odometry.csv", ODOMETRY + "1" * 200_000), "odometry.csv"),
     "times too few": (written("times.txt", "1\n2\n"), "2 times for 14 images"),
-    "times go back": (written("times.txt", " ".join(map(str, [*range(13), 3]))), "one each and ascend"),
+    "times go back": (written("times.txt", "\n".join(map(str, [*range(13), 3]))), "line 14: 3.0: times must"),
     "times with text": (written("times.txt", "noon"), "times.txt"),
     "times not finite": (written("times.txt", "nan " * COUNT), "ascend"),
     "times are no text": (written("times.txt", b"\xff" * 9), "times.txt"),

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -113,6 +116,38 @@ def test_a_damaged_recording_is_mapped_as_far_as_it_can_be_read(
     assert output[-1] == line
     assert not any("Traceback" in line for line in output)
     assert (tmp_path / "data" / "walk.1.mapweave").exists(), "what was mapped is kept"
+
+
+def test_a_recording_with_a_long_name_is_mapped_under_a_shorter_one(recording, tmp_path, capfd):
+    long = recording.rename(tmp_path / f"-{'Walk ' * 9}")
+    assert main(["replay", str(long), "--offline", "--data", str(tmp_path / "data")]) == 0
+    (path,) = (tmp_path / "data").glob("*.mapweave")
+    assert path.name == f"{('walk-' * 9)[:32]}.1.mapweave"
+    capfd.readouterr()
+
+
+def test_a_bag_or_a_video_cannot_be_scored(tmp_path, capfd):
+    file = tmp_path / "walk.mcap"
+    file.write_bytes(b"")
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("")
+    for what in ("relocalize", "merge"):
+        assert "bags and videos cannot be scored; give a folder" in complaint(capfd, "eval", what, file)
+        assert "scored" in complaint(capfd, "eval", what, tmp_path / "bag")
+
+
+def test_ffmpeg_prints_nothing_beside_the_one_line(tmp_path):
+    """In a process of its own: OpenCV reads how much it shall say when it is imported."""
+    path = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 5.0, (64, 48), isColor=True)
+    for k in range(9):
+        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
+    writer.release()
+    path.write_bytes(path.read_bytes()[:-300])
+    command = [sys.executable, "-m", "mapweave", "info", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    (line,) = done.stderr.splitlines()
+    assert "an MP4 that was cut off has lost its index" in line
 
 
 def test_places_that_cannot_be_written(tmp_path, capfd, recording, closed):

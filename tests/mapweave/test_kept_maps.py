@@ -221,7 +221,11 @@ def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, 
 
 
 def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, closed, simulator):
-    output = complaint(capfd, "agent", "r0", "--connect", closed, "--data", tmp_path, "--resume", "r0.3")
+    arguments = "agent", "r0", "--connect", closed, "--data", tmp_path, "--resume"
+    assert complaint(capfd, *arguments, "foo") == (
+        "mapweave: 'foo' is no map: write it as r0.1, the robot and the map's number"
+    )
+    output = complaint(capfd, *arguments, "r0.3")
     assert "there is no journal of r0" in output
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 

@@ -147,7 +147,7 @@ def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
     [
         (lambda folder: shutil.rmtree(folder), (), "no such folder"),
         (lambda folder: (folder / "splits.toml").unlink(), (), "give --robots"),
-        (lambda folder: (folder / "odometry.csv").unlink(), (), "without odometry the map has no scale"),
+        (lambda folder: (folder / "odometry.csv").unlink(), (), "no odometry: give --odometry FILE"),
         (lambda folder: (folder / "camera.toml").unlink(), (), "it must give the camera's intrinsics"),
         (lambda folder: shutil.rmtree(folder / "images"), ("--robots", "2"), "no images"),
         (lambda folder: (folder / "splits.toml").write_text("robot = 5"), (), "write a [[robot]] table"),

@@ -12,6 +12,9 @@ from evo.core import metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 
+from mapweave.agent.calibration.online import OnlineCalibration
+from mapweave.agent.calibration.report import Cause
+from mapweave.agent.drive_geometry import Parameter
 from mapweave.cli import main
 from mapweave.evaluation.replaying import errors, rows
 from mapweave.hybridmap.pose import Pose2
@@ -65,6 +68,22 @@ def test_parts_are_aligned_one_by_one() -> None:
     assert ate == pytest.approx(0.0, abs=1e-9) and rpe == pytest.approx(0.0, abs=1e-9)
     assert turn == pytest.approx(0.0, abs=1e-6)
     assert errors(mine[:0], true[:0], np.zeros(0)) == (None, None, None)
+
+
+def test_a_geometry_that_is_declared_wrongly_is_named(
+    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `mapweave replay` does. What finds it is tested with the calibration."""
+    begin = OnlineCalibration.__init__
+    cause = Cause(Parameter.TURN_SCALE, 1.0, 1.1, 0.01, 10.0)
+
+    def found(self: OnlineCalibration, *arguments: object, **named: object) -> None:
+        begin(self, *arguments, **named)  # type: ignore[arg-type]
+        self.causes.append(cause)
+
+    monkeypatch.setattr(OnlineCalibration, "__init__", found)
+    assert main(["eval", "replay", str(recording), "--out", str(tmp_path / "out")]) == 0
+    assert str(cause) in " ".join(capfd.readouterr().err.split())
 
 
 def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
