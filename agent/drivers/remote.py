@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import secrets
 import threading
@@ -23,8 +24,10 @@ from mapweave.hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
 from mapweave.wire.bus import Bus, Closing
 from mapweave.wire.keys import Keys
 
-ASK_TIMEOUT = 3.0
-"""After what silence a question is asked again, s. A lost question costs no more than this."""
+log = logging.getLogger(__name__)
+
+ASK_TIMEOUT = 2.0
+"""After what silence a question is asked again, and the wait is logged, s. A lost question costs no more."""
 
 PATIENCE = 90.0
 """Longest silence of a base, s. A simulated base is silent while it waits for the agents of other robots."""
@@ -100,7 +103,8 @@ class RemoteRobot:
         if self._closed.is_set():
             return None
         # Counted when it is answered: a step that failed is asked again under its own number.
-        step = StepRequest(self._sequence + 1, self._command)
+        number = self._sequence + 1
+        step, standing = StepRequest(number, self._command), StepRequest(number, Command())
         description = self.describe()
 
         def decode(data: bytes) -> Observation:
@@ -108,7 +112,7 @@ class RemoteRobot:
             check_image(observation, description)
             return observation
 
-        observation = self._ask(self._step_key, encode_step(step), decode)
+        observation = self._ask(self._step_key, encode_step(step), decode, encode_step(standing))
         self._sequence += 1
         return observation
 
@@ -130,21 +134,31 @@ class RemoteRobot:
         self._closed.set()
         self._alive.close()
 
-    def _ask(self, key: str, payload: bytes, decode: Callable[[bytes], _T]) -> _T | None:
+    def _ask(
+        self, key: str, payload: bytes, decode: Callable[[bytes], _T], after_restart: bytes | None = None
+    ) -> _T | None:
         """Ask until there is an answer; None if there will be none, or this robot was closed.
 
-        An answer that is not valid is asked for once more: it may have been damaged on its way.
+        An answer that is not valid is asked for once more: it may have been damaged on its way. A base that
+        has been gone is asked `after_restart`, if given: it must not drive an old command.
         """
-        end = time.monotonic() + self._patience
+        begin = time.monotonic()
+        end = begin + self._patience
         reason = "no answer"
-        asked_again = False
+        asked_again = reported = False
         while True:
             # A short patience still gives every question time for its answer.
-            replies = self._bus.ask(key, payload, min(ASK_TIMEOUT, max(end - time.monotonic(), PAUSE)))
+            timeout = min(ASK_TIMEOUT, max(end - time.monotonic(), PAUSE))
+            asked_at = time.monotonic()
+            replies = self._bus.ask(key, payload, timeout)
+            # A question that nobody serves ends at once; a slow base keeps it until the time-out.
+            gone = not replies and time.monotonic() - asked_at < timeout
             answers = [reply.payload for reply in replies if not reply.error]
             if len(answers) > 1:
                 raise DeviceError(f"{key}: {len(answers)} bases answer; stop all but one")
             if answers:
+                if reported:
+                    log.warning("%s: the base answers", key)
                 try:
                     return decode(answers[0])
                 except InvalidMessage as error:
@@ -158,10 +172,24 @@ class RemoteRobot:
                     return None
                 if AGAIN not in reason:
                     raise DeviceError(f"{key}: refused: {reason}")
-            if time.monotonic() >= end:
+            now = time.monotonic()
+            if now >= end:
                 raise DeviceError(
                     f"{key}: {reason} for {self._patience:g} s; start the robot's base (for a simulated one: "
                     "mapweave sim serve) with the same fleet and endpoint"
                 )
+            if now - begin >= ASK_TIMEOUT and self._description is not None:
+                if not reported:
+                    log.warning("%s: %s; the agent waits up to %g s", key, _cause(gone), self._patience)
+                    reported = True
+                if gone and after_restart is not None:
+                    payload = after_restart
             if self._closed.wait(PAUSE):
                 return None
+
+
+def _cause(gone: bool) -> str:
+    """Why there is no answer, and what to do."""
+    if gone:
+        return "the base is gone, start it again"
+    return "no answer from the base (a simulated one waits for the agents of all its robots)"

@@ -37,6 +37,7 @@ from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.bus import Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.waiting import eventually
 
 DESCRIPTION = RobotDescription(
     camera=Camera(width=320, height=240, fx=277.1, fy=276.9, cx=159.4, cy=119.6, mount_height=0.3),
@@ -278,6 +279,51 @@ def test_a_step_that_failed_is_asked_again_under_its_own_number(body: Body, bus:
         robot.sense()
     assert robot.sense() is not None
     assert [step.sequence for step in body.steps] == [1, 1]
+
+
+def reported(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.name.endswith("drivers.remote")]
+
+
+def test_a_base_that_vanishes_is_reported_and_stands_when_it_is_back(
+    hub: MemoryHub, body: Body, bus: MemoryBus,
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("mapweave.agent.drivers.remote.ASK_TIMEOUT", 0.2)
+    robot = RemoteRobot(bus, "test", "r0")
+    robot.sense()
+    robot.act(Command(0.1, 0.0))
+    body.bus.close()
+    seen: list[Observation | None] = []
+    waiting = threading.Thread(target=lambda: seen.append(robot.sense()))
+    waiting.start()
+    eventually(lambda: reported(caplog))
+    assert reported(caplog) == [
+        f"{KEYS.robot_step('r0')}: the base is gone, start it again; the agent waits up to 90 s"
+    ]
+    again = Body(hub)
+    waiting.join()
+    assert seen != [None]
+    assert again.steps[0] == StepRequest(2, Command())
+    assert reported(caplog)[1:] == [f"{KEYS.robot_step('r0')}: the base answers"]
+    again.bus.close()
+
+
+def test_a_slow_simulation_is_not_taken_for_a_base_that_is_gone(
+    body: Body, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("mapweave.agent.drivers.remote.ASK_TIMEOUT", 0.05)
+    robot = RemoteRobot(bus, "test", "r0")
+    robot.sense()
+    robot.act(Command(0.1, 0.0))
+    body.answers = [silence, silence, silence, reply]
+    assert robot.sense() is not None
+    assert [step.command for step in body.steps[1:]] == [Command(0.1, 0.0)] * 4
+    assert [line.partition("; ")[0] for line in reported(caplog)] == [
+        f"{KEYS.robot_step('r0')}: no answer from the base (a simulated one waits for the agents of all its "
+        "robots)",
+        f"{KEYS.robot_step('r0')}: the base answers",
+    ]
 
 
 def test_the_end_of_the_simulation_is_no_failure(body: Body, bus: MemoryBus) -> None:
