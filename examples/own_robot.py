@@ -11,7 +11,7 @@ from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
 from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheeled import WheeledRobot
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.errors import DeviceError, SettingsError
 
 METRES_PER_STEP = 0.0002
 
@@ -53,4 +53,6 @@ class OwnRobot(WheeledRobot):
     """My robot."""
 
     def __init__(self, settings: RobotSettings) -> None:
+        if "port" not in settings.options:
+            raise SettingsError('[robot.options] lacks the port; give port = "/dev/ttyUSB0"')
         super().__init__(Board(settings.options["port"]), settings)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from numbers import Real
 
 import numpy as np
 
+from mapweave.agent.drivers.author_errors import driver_error
+from mapweave.agent.drivers.messages import encode_description
 from mapweave.agent.drivers.robot import Robot
-from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
+
+log = logging.getLogger(__name__)
 
 SMALLEST_SHARE = 0.01
 """Stamps that rise by less than this share of a tick are not in nanoseconds."""
@@ -42,17 +49,12 @@ class CheckedRobot:
         """Description of the robot.
 
         Raises:
-            DeviceError: it is no description, or its bearings are not in radians.
+            DeviceError: it is no description, or a value of it is wrong, or the driver has failed.
         """
         if self._description is None:
-            description = self._robot.describe()
-            if not isinstance(description, RobotDescription):
-                raise _mistake("describe()", f"must return a RobotDescription, not {_kind(description)}")
-            far = [b for b in description.ranger_bearings if not abs(b) <= math.tau]
-            if far:
-                raise _mistake("describe()", f"ranger_bearings are radians, not degrees: {far[0]:g}")
-            if description.ranger_bearings and not description.ranger_reach > 0.0:
-                raise _mistake("describe()", "there are ranger_bearings and no ranger_reach, m")
+            with _driver_code():
+                description = self._robot.describe()
+            _check_description(description)
             self._description = description
         return self._description
 
@@ -60,10 +62,11 @@ class CheckedRobot:
         """The next observation.
 
         Raises:
-            DeviceError: the observation is wrong.
+            DeviceError: the observation is wrong, or the driver has failed.
         """
         description = self.describe()
-        seen = self._robot.sense()
+        with _driver_code():
+            seen = self._robot.sense()
         if seen is None:
             return None
         if not isinstance(seen, Observation):
@@ -77,9 +80,10 @@ class CheckedRobot:
         """Send a command.
 
         Raises:
-            DeviceError: the driver returns no command.
+            DeviceError: the driver returns no command, or has failed.
         """
-        applied = self._robot.act(command)
+        with _driver_code():
+            applied = self._robot.act(command)
         if not isinstance(applied, Command):
             raise _mistake("act()", f"must return the Command that is applied, not {_kind(applied)}")
         if not (math.isfinite(applied.forward) and math.isfinite(applied.turn)):
@@ -87,8 +91,12 @@ class CheckedRobot:
         return applied
 
     def close(self) -> None:
-        """Stop the wheels and release the robot."""
-        self._robot.close()
+        """Stop the wheels and release the robot. A driver that fails at that is logged: the map is kept."""
+        try:
+            with _driver_code():
+                self._robot.close()
+        except DeviceError as error:
+            log.error("%s", error)
 
     def _check_unit(self, stamp_ns: int) -> None:
         """Of the first stamp alone: a clock since the start comes by such numbers later."""
@@ -118,6 +126,34 @@ class CheckedRobot:
             )
 
 
+@contextmanager
+def _driver_code() -> Iterator[None]:
+    """Runs code of the driver: what it raises becomes a DeviceError with its file and line."""
+    try:
+        yield
+    except MapweaveError:
+        raise
+    except Exception as error:
+        raise driver_error(error) from error
+
+
+def _check_description(description: object) -> None:
+    if not isinstance(description, RobotDescription):
+        raise _mistake("describe()", f"must return a RobotDescription, not {_kind(description)}")
+    bearings = description.ranger_bearings
+    if not isinstance(bearings, tuple | list):
+        raise _mistake("describe()", f"ranger_bearings must be a tuple of radians, not {_kind(bearings)}")
+    far = [b for b in bearings if isinstance(b, Real) and not abs(b) <= math.tau]
+    if far:
+        raise _mistake("describe()", f"ranger_bearings are radians, not degrees: {far[0]:g}")
+    try:
+        encode_description(description)
+    except InvalidValue as error:
+        raise _mistake("describe()", f"gives no {error}") from None
+    if bearings and not description.ranger_reach > 0.0:
+        raise _mistake("describe()", "there are ranger_bearings and no ranger_reach, m")
+
+
 def _check_image(seen: Observation, description: RobotDescription) -> None:
     image, camera = seen.image, description.camera
     if image is None:
@@ -136,16 +172,24 @@ def _check_image(seen: Observation, description: RobotDescription) -> None:
 
 
 def _check_numbers(seen: Observation, description: RobotDescription) -> None:
+    if not isinstance(seen.odometry, Odometry):
+        raise _mistake("odometry", f"must be an Odometry, not {_kind(seen.odometry)}")
     forward, turn = seen.odometry.forward, seen.odometry.turn
+    if not (isinstance(forward, Real) and isinstance(turn, Real)):
+        raise _mistake("odometry", f"must be two numbers, m and rad, not {forward!r} and {turn!r}")
     if not (math.isfinite(forward) and math.isfinite(turn)):
         raise _mistake("odometry", f"is not finite: {forward:g} m, {turn:g} rad")
+    if not isinstance(seen.proximity, np.ndarray):
+        raise _mistake("proximity", f"must be an array, not {_kind(seen.proximity)}")
     # An empty array means that the sensors have failed, which the agent handles.
-    readings, bearings = np.ndim(seen.proximity), len(description.ranger_bearings)
-    if readings != 1:
+    if seen.proximity.ndim != 1 or seen.proximity.dtype.kind not in "fiu":
         raise _mistake("proximity", "must be an array of one distance for each bearing, m")
-    count = len(seen.proximity)
+    count, bearings = len(seen.proximity), len(description.ranger_bearings)
     if count and count != bearings:
         raise _mistake("proximity", f"has {count} readings, but describe() gives {bearings} ranger_bearings")
+    battery = seen.battery
+    if battery is not None and not (isinstance(battery, Real) and 0.0 <= battery <= 1.0):
+        raise _mistake("battery", f"is {battery!r}; it must be a share from 0 to 1, or None")
 
 
 def _kind(value: object) -> str:

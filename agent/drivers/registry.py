@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from mapweave.agent.drivers.author_errors import driver_error
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.drivers.settings import REMOTE, RobotSettings
 from mapweave.hybridmap.errors import DeviceError, MapweaveError, SettingsError
@@ -79,6 +80,9 @@ def listing() -> list[Listed]:
 
 def find_driver(name: str) -> Driver:
     """Find a driver by name, or by `FILE.py:CLASS`.
+
+    Returns:
+        What opens it; raises DeviceError with the file and line of a constructor that fails.
 
     Raises:
         SettingsError: no driver has this name.
@@ -143,4 +147,18 @@ def _driver(found: object, name: str) -> Driver:
         raise DeviceError(
             f"driver {name}: needs a class with {', '.join(METHODS)}; lacks {', '.join(lacking)}"
         )
-    return found
+
+    def opened(settings: RobotSettings) -> Robot:
+        try:
+            inspect.signature(found).bind(settings)
+        except TypeError:
+            raise DeviceError(f"driver {name}: __init__ must take one argument, the settings") from None
+        try:
+            robot: Robot = found(settings)
+        except MapweaveError:
+            raise
+        except Exception as error:
+            raise driver_error(error) from error
+        return robot
+
+    return opened

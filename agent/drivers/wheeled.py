@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.drivers.author_errors import driver_error
 from mapweave.agent.drivers.base import Base, BaseReading, Wheels
 from mapweave.agent.drivers.camera import Capture, FrameSource
 from mapweave.agent.drivers.clock import now_ns
@@ -116,8 +117,7 @@ class WheeledRobot:
             if self._closing:
                 return None
             if self._mistake is not None:
-                what = f"{type(self._mistake).__name__}: {self._mistake}"
-                raise DeviceError(f"the driver of the base has failed: {what}") from self._mistake
+                raise driver_error(self._mistake) from self._mistake
             if frame is not None:
                 stamp_ns = frame.stamp_ns
                 self._age_ns = now_ns() - stamp_ns

@@ -104,7 +104,6 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its driver ends or the process is stopped."""
-    from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.claim import Claim
     from mapweave.agent.drivers.recorded import RecordedRobot
     from mapweave.commands.map_ends import map_of
@@ -164,7 +163,7 @@ def run(arguments: argparse.Namespace) -> int:
         agent = settings.agent
         if arguments.without_rangers:
             agent = replace(agent, exploration=replace(agent.exploration, without_rangers=True))
-        run_agent(CheckedRobot(robot), bus, keys, agent, options, stop)
+        run_agent(robot, bus, keys, agent, options, stop)
     finally:
         if robot is not None:
             robot.close()
@@ -220,7 +219,8 @@ def open_robot(
     name: str,
     lockstep: bool = False,
 ) -> tuple[Robot, Synchronization]:
-    """The robot, and how the loop is synchronised: a simulation may run in lock-step."""
+    """The robot, its output checked, and how the loop is synchronised: a simulation may run in lock-step."""
+    from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.registry import find_driver
     from mapweave.agent.drivers.remote import RemoteRobot
     from mapweave.agent.drivers.settings import REMOTE
@@ -229,15 +229,15 @@ def open_robot(
 
     driver = arguments.robot or settings.driver
     if driver == REMOTE and not lockstep:
-        return RemoteRobot(bus, fleet, name), FreeRunning()
+        return CheckedRobot(RemoteRobot(bus, fleet, name)), FreeRunning()
     if driver == REMOTE:
         from mapweave.sim.lockstep_robot import LockstepRobot
 
         robot = LockstepRobot(bus, fleet, name)
-        return robot, Lockstep(robot.rendezvous)
+        return CheckedRobot(robot), Lockstep(robot.rendezvous)
     if lockstep or arguments.body:
         raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
-    return find_driver(driver)(settings), FreeRunning()
+    return CheckedRobot(find_driver(driver)(settings)), FreeRunning()
 
 
 def bus_of(arguments: argparse.Namespace, settings: RobotSettings, network: NetworkSettings) -> ZenohBus:

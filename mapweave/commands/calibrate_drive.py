@@ -103,16 +103,14 @@ def _live(
     """What a robot senses from now on, for some seconds."""
     import threading
 
-    from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.terminal import Bar
 
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     stop = stop_on_signals()
     bus = bus_of(arguments, settings.robot, network)
-    opened, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
-    threading.Thread(target=close_on, args=(stop, opened), name="stop", daemon=True).start()
-    robot = CheckedRobot(opened)
+    robot, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
+    threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
 
     def observations() -> Iterator[Observation]:
         began = 0
@@ -126,7 +124,7 @@ def _live(
                     if passed >= arguments.seconds:
                         break
         finally:
-            opened.close()
+            robot.close()
             bus.close()
 
     return robot.describe(), observations()

@@ -31,7 +31,6 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Record until the robot ends or the process is stopped."""
-    from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.recorded import RecordedRobot
     from mapweave.hybridmap.node import check_name
     from mapweave.terminal import Bar, plain_or_terminal
@@ -49,10 +48,9 @@ def run(arguments: argparse.Namespace) -> int:
         recorded = RecordedRobot(robot, arguments.out, arguments.lossless, print_error)
         try:
             print_error(f"{name}: waits for its robot")
-            checked = CheckedRobot(recorded)
-            checked.describe()
+            recorded.describe()
             with Bar(plain_or_terminal(), f"{name}: observations in {arguments.out}", None) as bar:
-                while not stop.is_set() and checked.sense() is not None:
+                while not stop.is_set() and recorded.sense() is not None:
                     bar.update(recorded.written)
         finally:
             recorded.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -69,6 +70,13 @@ def good(**changes: Any) -> Observation:
         (good(odometry=Odometry(0.0, math.inf)), "odometry is not finite"),
         (good(proximity=np.ones(4)), r"proximity has 4 readings, but describe\(\) gives 5 ranger_bearings"),
         (good(proximity=np.ones((5, 2))), "proximity must be an array of one distance for each bearing"),
+        (good(odometry=None), "odometry must be an Odometry, not None"),
+        (good(odometry=(0.1, 0.0)), "odometry must be an Odometry, not tuple"),
+        (good(odometry=Odometry("0.1", 0.0)), "odometry must be two numbers, m and rad, not '0.1' and 0.0"),  # type: ignore[arg-type]
+        (good(proximity=[1.0] * 5), "proximity must be an array, not list"),
+        (good(proximity=np.full(5, "1")), "proximity must be an array of one distance for each bearing"),
+        (good(battery=80), "battery is 80; it must be a share from 0 to 1, or None"),
+        (good(battery="full"), "battery is 'full'; it must be a share from 0 to 1, or None"),
         ((GOOD,), r"sense\(\) must return an Observation or None, not tuple"),
     ],
 )
@@ -88,6 +96,65 @@ def test_bearings_in_degrees() -> None:
     robot = checked(GOOD, description=replace(DESCRIPTION, ranger_bearings=(0.0, 45.0, 90.0)))
     with pytest.raises(DeviceError, match="ranger_bearings are radians, not degrees: 45"):
         robot.sense()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"ranger_bearings": np.zeros(2)}, "ranger_bearings must be a tuple of radians, not ndarray"),
+        ({"axle": None}, r"gives no robot description: Expected `float`, got `null` - at `\$.axle`"),
+        ({"tick": 0.0}, r"gives no robot description: Expected `float` >= 0.0001 - at `\$.tick`"),
+    ],
+)
+def test_a_wrong_description(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(DeviceError, match=rf"^driver: describe\(\) {words}"):
+        checked(description=replace(DESCRIPTION, **changes)).describe()
+
+
+class Raises(Scripted):
+    """A driver each of whose methods has a mistake."""
+
+    def describe(self) -> Any:
+        return {}["camera"]
+
+    def sense(self) -> Any:
+        return np.zeros(3).reshape(2, 2)
+
+    def act(self, command: Command) -> Any:
+        return command.left  # type: ignore[attr-defined]
+
+    def close(self) -> None:
+        raise OSError("no\nport")
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda robot: robot.describe(), "KeyError: 'camera'"),
+        (lambda robot: robot.sense(), "ValueError: cannot reshape array of size 3"),
+        (lambda robot: robot.act(Command()), "AttributeError: 'Command' object has no attribute 'left'"),
+    ],
+)
+def test_an_error_of_the_drivers_own_code_names_its_file_and_line(
+    call: Callable[[CheckedRobot], object], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "KeyError" not in words:
+        monkeypatch.setattr(Raises, "describe", lambda self: DESCRIPTION)
+    with pytest.raises(DeviceError, match=rf"^driver: {__file__}, line \d+: {words}") as error:
+        call(CheckedRobot(Raises()))
+    assert "\n" not in str(error.value)
+
+
+def test_a_driver_that_fails_to_close_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    CheckedRobot(Raises()).close()
+    assert [record.getMessage().partition(": OSError")[2] for record in caplog.records] == [": no port"]
+
+
+def test_a_mistake_of_this_package_is_not_blamed_on_the_driver() -> None:
+    robot = checked(GOOD)
+    robot._robot = None  # type: ignore[assignment]
+    with pytest.raises(AttributeError):
+        robot.describe()
 
 
 def test_a_description_that_is_none() -> None:

@@ -85,6 +85,32 @@ def test_a_file_that_is_no_driver(text: str | None, name: str, words: str, tmp_p
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            CLASS.replace("self, settings", "self"),
+            r"^driver .*rover.py:Rover: __init__ must take one argument, the settings$",
+        ),
+        (
+            CLASS.replace("self.settings = settings", "self.settings = settings.options['gate']"),
+            r"^driver: .*rover.py, line \d+: KeyError: 'gate'$",
+        ),
+    ],
+)
+def test_a_constructor_that_fails(text: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "rover.py"
+    path.write_text(text)
+    with pytest.raises(DeviceError, match=words):
+        find_driver(f"{path}:Rover")(RobotSettings())
+
+
+def test_the_example_says_which_option_it_lacks() -> None:
+    example = Path(__file__).parents[3] / "examples" / "own_robot.py"
+    with pytest.raises(SettingsError, match=r'^\[robot.options\] lacks the port; give port = "/dev/ttyUSB0"$'):
+        find_driver(f"{example}:OwnRobot")(RobotSettings())
+
+
 def test_an_unknown_name() -> None:
     with pytest.raises(SettingsError, match="did you mean 'koala'"):
         find_driver("koalla")

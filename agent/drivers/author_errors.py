@@ -1,0 +1,32 @@
+"""Errors that a driver's own code raises, as one line with the file and line of that code."""
+
+from __future__ import annotations
+
+import traceback
+
+from mapweave.hybridmap.errors import DeviceError
+
+
+def driver_error(error: Exception) -> DeviceError:
+    """An error of the code of a driver, for its author.
+
+    Args:
+        error: was caught.
+
+    Returns:
+        One line that names the file, the line and the error.
+
+    Raises:
+        Exception: `error` itself, if no code outside of this package was running: then the mistake is here.
+    """
+    frames = [
+        (frame.f_code.co_filename, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if not frame.f_globals.get("__name__", "").startswith("mapweave.")
+    ]
+    if not frames:
+        raise error
+    # The driver calls libraries; their lines do not help its author.
+    path = frames[0][0]
+    line = [line for file, line in frames if file == path][-1]
+    return DeviceError(f"driver: {path}, line {line}: {type(error).__name__}: {' '.join(str(error).split())}")
