@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from mapweave.agent.replication import journal
-from mapweave.agent.replication.retained_map import RetainedMap
+from mapweave.agent.replication.salvage import salvage as salvage_journal
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from mapweave.merge.settings import MergeSettings
 
 Value = TypeVar("Value")
+UNREAD = "pages that cannot be read: how many changes they had is not known"
 OTHER = "is neither a map file nor an agent's journal nor a server's store"
 
 
@@ -166,6 +167,10 @@ def source_of(path: Path) -> MapSource:
     except sqlite3.Error as error:
         raise InvalidFile(f"{path}: cannot be read ({error})") from None
     if kind == journal.APPLICATION_ID:
+        if version != journal.VERSION:
+            raise InvalidFile(
+                f"{path}: agent journal of format {version}, this program uses {journal.VERSION}"
+            )
         return MapSource.JOURNAL
     if kind != sqlite_store.APPLICATION_ID:
         raise InvalidFile(f"{path}: {OTHER}")
@@ -175,10 +180,12 @@ def source_of(path: Path) -> MapSource:
 
 
 def _of_journal(path: Path) -> OpenedMap:
-    with closing(journal.Journal(path)) as of_agent:
-        kept = {map_id: RetainedMap.of(of_agent, map_id) for map_id in of_agent.maps()}
+    salvaged = salvage_journal(path)
+    kept = salvaged.maps
     changes = tuple(body for retained in kept.values() for body in retained.contents)
     complaints: dict[MapId | None, str] = {m: one.complaint for m, one in kept.items() if one.complaint}
+    if not salvaged.whole:
+        complaints[None] = f"{path} had {UNREAD}"
     return OpenedMap(
         path, MapSource.JOURNAL, MapFile("agent", _title(kept), changes), tuple(kept), complaints
     )
@@ -245,7 +252,5 @@ def _lost(path: Path | str, salvaged: Salvage, unread: int) -> str:
     if salvaged.whole and not lost:
         return ""
     damaged = f"{lost} damaged changes" if lost else "no damaged change"
-    pages = (
-        "" if salvaged.whole else ", and pages that cannot be read: how many changes they had is not known"
-    )
+    pages = "" if salvaged.whole else f", and {UNREAD}"
     return f"{path} had {damaged}{pages}"

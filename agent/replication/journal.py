@@ -40,6 +40,10 @@ CREATE TABLE ack (
 """
 
 READ_AT_ONCE = 256
+ADVICE = (
+    "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: the agent "
+    "begins a new map"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +74,14 @@ class Draft:
         return Draft(element.map, element.number, put, stamp_ns, encoded)
 
 
+def body_of(encoded: bytes, crc: int) -> ChangeBody | None:
+    """The body of a row; None if the disk has damaged it."""
+    try:
+        return decode_body(encoded) if zlib.crc32(encoded) == crc else None
+    except InvalidMessage:
+        return None
+
+
 class Journal:
     """The change logs of one agent in one SQLite file. Its methods may be called from any thread.
 
@@ -91,7 +103,7 @@ class Journal:
             check_name(agent)
         self._lock = threading.RLock()
         self._database = Database(
-            path, "agent journal", APPLICATION_ID, VERSION, SCHEMA, read_only=agent is None
+            path, "agent journal", APPLICATION_ID, VERSION, SCHEMA, None, ADVICE, read_only=agent is None
         )
         try:
             self.agent = self._owner(path) if agent is None else self._own(path, agent)
@@ -227,11 +239,7 @@ class Journal:
         """Every change that is still there, in order; damaged ones without a body."""
         query = "SELECT sequence, element, put, body, crc FROM change WHERE epoch = ? ORDER BY sequence"
         for sequence, number, put, body, crc in self._read(query, self._epoch(map_id)):
-            try:
-                decoded = self._decode(sequence, body if zlib.crc32(body) == crc else None)
-            except InvalidFile:
-                decoded = None
-            yield Entry(sequence, NodeId(*map_id, number), bool(put), decoded)
+            yield Entry(sequence, NodeId(*map_id, number), bool(put), body_of(body, crc))
 
     def acknowledge(self, server: str, map_id: MapId, watermark: int, reset: bool = False) -> None:
         """Remember that a server has every change up to the watermark; it never goes back.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.log_entry import Entry
 from mapweave.hybridmap.change import ChangeBody, EdgeRetired, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
@@ -26,18 +28,29 @@ class RetainedMap:
 
     @staticmethod
     def of(journal: Journal, map_id: MapId) -> RetainedMap:
-        """Read a map that was opened in a journal.
-
-        What the disk has damaged is left out, with the edges at nodes that are missing for it. A damaged
-        retirement still retires. Where a newer state of an element is damaged an older one is used.
+        """Read a map that was opened in a journal; see `of_entries`.
 
         Raises:
             InvalidValue: the map is another agent's.
             InvalidFile: the journal cannot be read at all.
         """
-        hybrid, next_number = HybridMap(), 1
+        return RetainedMap.of_entries(map_id, journal.entries(map_id))
+
+    @staticmethod
+    def of_entries(map_id: MapId, entries: Iterable[Entry]) -> RetainedMap:
+        """Replay the changes of a map.
+
+        What the disk has damaged is left out, with the edges at nodes that are missing for it. A damaged
+        retirement still retires. Where a newer state of an element is damaged an older one is used.
+
+        Args:
+            map_id: of the map.
+            entries: its changes, in order.
+        """
+        hybrid, next_number, head = HybridMap(), 1, 0
         damaged: list[int] = []
-        for entry in journal.entries(map_id):
+        for entry in entries:
+            head = entry.sequence
             next_number = max(next_number, entry.element.number + 1)
             if entry.body is not None:
                 hybrid.apply(entry.body)
@@ -58,7 +71,7 @@ class RetainedMap:
         if damaged:
             also = f" and without {len(loose)} edges at nodes that are missing" if loose else ""
             complaint = (
-                f"{len(damaged)} of {journal.head(map_id)} changes of map {map_id} are damaged on the disk, "
+                f"{len(damaged)} of {head} changes of map {map_id} are damaged on the disk, "
                 f"the first is {damaged[0]}: the map goes on without them{also}"
             )
         return RetainedMap(tuple(hybrid.contents()), next_number, complaint)

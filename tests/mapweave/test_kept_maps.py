@@ -220,6 +220,39 @@ def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, 
     assert (tmp_path / "out" / "r0.2.mapweave").exists()
 
 
+def test_what_is_left_of_a_damaged_journal_is_extracted_and_the_agent_says_how(tmp_path, capfd):
+    path = tmp_path / "r0.sqlite"
+    journal = Journal(path, "r0")
+    map_id, (put,) = journal.open_map(1), one_node()
+    nodes = [replace(put, node=replace(put.node, id=NodeId("r0", 1, k))) for k in range(1, 2001)]
+    journal.append(map_id, nodes, 0)
+    journal.close()
+    data = bytearray(path.read_bytes())
+    # Leaves of the b-tree with changes; those of its index have more cells.
+    pages = [page for page in range(0, len(data), 4096) if data[page] == 10 and data[page + 3] == 0]
+    leaves = [page for page in pages if 10 < data[page + 4] < 100]
+    # Two of them, so that what lies between them is reached from neither end.
+    for page in (leaves[len(leaves) // 3], leaves[2 * len(leaves) // 3]):
+        data[page : page + 4096] = bytes(4096)
+    path.write_bytes(data)
+    with pytest.raises(InvalidFile, match=r"agent journal is damaged \(.*\); save what can be read with `map"):
+        Journal(path, "r0")
+    assert main(["map", "extract", str(path), "-o", str(tmp_path / "out")]) == 1
+    assert f"mapweave: {path} had pages that cannot be read" in capfd.readouterr().err
+    assert path.read_bytes() == data, "the file is not changed"
+    left = HybridMap(read_map_file(tmp_path / "out" / "r0.1.mapweave", "agent").changes)
+    missing = sorted(set(range(1, 2001)) - {node.number for node in left.nodes})
+    runs = [a for a, b in zip(missing, [*missing[1:], 0], strict=True) if b != a + 1]
+    assert len(runs) == 2 and len(missing) < 100
+
+
+def test_a_journal_of_which_nothing_can_be_read_is_one_line(tmp_path, capfd):
+    path = journal_with(tmp_path / "r0.sqlite", 1)
+    data = path.read_bytes()
+    path.write_bytes(data[:4096] + bytes(len(data) - 4096))
+    assert "nothing can be read (" in complaint(capfd, "map", "extract", path, "-o", tmp_path / "out")
+
+
 def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, closed, simulator):
     arguments = "agent", "r0", "--connect", closed, "--data", tmp_path, "--resume"
     assert complaint(capfd, *arguments, "foo") == (

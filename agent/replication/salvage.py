@@ -1,0 +1,121 @@
+"""What can still be read of a journal, also of one that no agent can open any more."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mapweave.agent.replication.journal import body_of
+from mapweave.agent.replication.log_entry import Entry
+from mapweave.agent.replication.retained_map import RetainedMap
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.node import MapId, NodeId, check_name
+from mapweave.storage.database_reader import reading
+from mapweave.wire.codec import element_of
+from mapweave.wire.keys import check_epoch
+
+COLUMNS = "SELECT epoch, sequence, element, put, body, crc FROM change"
+
+Row = tuple[int, int, int, int, bytes, int]
+
+
+@dataclass(frozen=True)
+class SalvagedJournal:
+    """Result of a salvage.
+
+    Attributes:
+        maps: what is left of each map, oldest first.
+        whole: whether all pages could be read.
+    """
+
+    maps: Mapping[MapId, RetainedMap]
+    whole: bool
+
+
+def salvage(path: Path) -> SalvagedJournal:
+    """Read all undamaged changes; the file is not modified.
+
+    Raises:
+        InvalidFile: nothing in it can be read, or an agent uses it.
+    """
+    with reading(path, "agent journal") as connection:
+        owners, owner_error = _read(connection, "SELECT agent FROM owner")
+        maps, maps_error = _read(connection, "SELECT epoch FROM map ORDER BY epoch")
+        rows, rows_error = _changes(connection)
+    error = owner_error or maps_error or rows_error
+    agent = _agent(rows.values(), owners)
+    if not agent:
+        raise InvalidFile(f"{path}: nothing can be read ({error or 'this journal has no owner'})")
+    epochs = {epoch for (epoch,) in maps if _is_epoch(epoch)} | {epoch for epoch, _ in rows}
+    kept = {}
+    for map_id in (MapId(agent, epoch) for epoch in sorted(epochs)):
+        kept[map_id] = RetainedMap.of_entries(map_id, _entries(map_id, rows))
+    return SalvagedJournal(kept, not error)
+
+
+def _read(connection: sqlite3.Connection, query: str, *values: object) -> tuple[list[Any], str]:
+    """The rows before the first page that cannot be read, and why that is so; empty if all could be read."""
+    rows: list[Any] = []
+    try:
+        for row in connection.execute(query, values):
+            rows.append(row)  # noqa: PERF402 - an error ends the loop, and what came before it counts
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        # SQLite quotes a damaged schema in its error, which then is no text, or has line breaks.
+        return rows, " ".join(str(error).split())
+    return rows, ""
+
+
+def _changes(connection: sqlite3.Connection) -> tuple[dict[tuple[int, int], Row], str]:
+    """Rows that have the types of the schema, by epoch and sequence; and why some cannot be read."""
+    found, error = _read(connection, f"{COLUMNS} ORDER BY epoch, sequence")
+    if error:
+        found += _read(connection, f"{COLUMNS} ORDER BY epoch DESC, sequence DESC")[0]
+    rows = {(row[0], row[1]): row for row in found if _is_row(row)}
+    if error:
+        # A page that cannot be read stops a scan from either end; what lies between is looked up one by one.
+        heads: dict[int, int] = {}
+        for epoch, sequence in rows:
+            heads[epoch] = max(heads.get(epoch, 0), sequence)
+        for epoch, head in heads.items():
+            for sequence in range(1, head):
+                if (epoch, sequence) not in rows:
+                    one, _ = _read(connection, f"{COLUMNS} WHERE epoch = ? AND sequence = ?", epoch, sequence)
+                    rows.update({(epoch, sequence): row for row in one if _is_row(row)})
+    return rows, error
+
+
+def _is_row(row: tuple[Any, ...]) -> bool:
+    epoch, *numbers, body, crc = row
+    return _is_epoch(epoch) and all(isinstance(n, int) for n in (*numbers, crc)) and isinstance(body, bytes)
+
+
+def _is_epoch(epoch: object) -> bool:
+    try:
+        return isinstance(epoch, int) and check_epoch(epoch) == epoch
+    except InvalidValue:
+        return False
+
+
+def _agent(rows: Iterable[Row], owners: Iterable[tuple[Any]]) -> str:
+    """Whose journal it is: as its changes say, which have checksums, else as its owner is written; or empty."""
+    for *_, encoded, crc in rows:
+        if (body := body_of(encoded, crc)) is not None:
+            return element_of(body).agent
+    for (owner,) in owners:
+        try:
+            return check_name(owner)
+        except InvalidValue:
+            continue
+    return ""
+
+
+def _entries(map_id: MapId, rows: Mapping[tuple[int, int], Row]) -> Iterator[Entry]:
+    for (epoch, sequence), (*_, number, put, encoded, crc) in sorted(rows.items()):
+        if epoch == map_id.epoch:
+            body = body_of(encoded, crc)
+            if body is not None and element_of(body).map != map_id:
+                body = None
+            yield Entry(sequence, NodeId(*map_id, number), bool(put), body)
