@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import struct
@@ -9,7 +10,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -22,15 +23,20 @@ from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.equidistant import Equidistant
 
+if TYPE_CHECKING:
+    from rosbags.interfaces import Qos
+
 PART_S = 60.0
 """A recording is a row of files, none longer than this, s: what a disk's failure can damage."""
 FLUSH_S = 2.0
-"""So often everything is on the disk, and the file complete, s: a robot whose power fails loses no more."""
+"""So often everything is on the disk, and file and metadata complete, s: a robot whose power fails loses no more."""
 MCAP_END = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 0, 0) + b"\x89MCAP0\r\n"
 """A data end and a footer without checksums, summary and index (https://mcap.dev/spec): a reader scans."""
 WAITING = 200
 """Observations that wait for the disk; more are dropped, and counted."""
 JPEG_QUALITY = 95
+KEPT = ("/tf_static", "/kidnap_status")
+"""Topics whose last message holds: who subscribes later gets it too (durability transient-local)."""
 OPTICAL, ODOM = "camera_optical_frame", "odom"
 """Frames of REP 105 and REP 103."""
 
@@ -52,7 +58,7 @@ def check_new(folder: Path) -> None:
 class McapWriter:
     """Writes a robot's observations and commands, in a thread of its own.
 
-    Topics: /camera/image/compressed, /camera/camera_info, /odom, /tf_static, /cmd_vel, /bumper,
+    Topics: /camera/image/compressed, /camera/camera_info, /odom, /tf, /tf_static, /cmd_vel, /bumper,
     /kidnap_status (when it changes), /proximity/N.
     """
 
@@ -151,15 +157,17 @@ class _Part:
         self._kidnapped: bool | None = None
         self._store = typestore()
         self._types = self._store.types
-        self._header, self._pose, self._twist = (
-            partial(function, self._make) for function in (making.header, making.pose, making.twist)
+        self._header, self._pose, self._twist, self._transform = (
+            partial(function, self._make)
+            for function in (making.header, making.pose, making.twist, making.transform)
         )
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         self._connections: dict[str, Any] = {}
         self._description = description
         self._info = self._camera_info()
-        self._put("/tf_static", "tf2_msgs/msg/TFMessage", begun_ns, transforms=[self._mount()])
+        self._put("/tf_static", "tf2_msgs/msg/TFMessage", begun_ns, transforms=[self._mount(), *self._ranger_mounts()])
+        self._flush()
 
     def write(self, observation: Observation, command: Command, odom_from_robot: Pose2) -> None:
         stamp = observation.stamp_ns
@@ -181,6 +189,8 @@ class _Part:
         )
         header, name = self._header(stamp, ODOM), "nav_msgs/msg/Odometry"
         self._put("/odom", name, stamp, header=header, child_frame_id=BASE, pose=pose, twist=twist)
+        moved = self._transform(stamp, ODOM, BASE, odom_from_robot)
+        self._put("/tf", "tf2_msgs/msg/TFMessage", stamp, transforms=[moved])
         name = "geometry_msgs/msg/TwistStamped"
         self._put("/cmd_vel", name, stamp, header=self._header(stamp, BASE), twist=self._twist(command))
         if observation.bumped:
@@ -213,10 +223,19 @@ class _Part:
         storage.bio.flush()
         os.fsync(storage.bio.fileno())
         storage.bio.seek(end)
+        # rosbags writes the metadata, atomically, when it closes a bag: it closes a stand-in here.
+        self._writer.storage = _KeptOpen(storage.path)  # type: ignore[assignment]
+        try:
+            self._writer.close()
+        finally:
+            self._writer.storage = storage
 
     def _put(self, topic: str, name: str, stamp_ns: int, **fields: Any) -> None:
         if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(topic, name, typestore=self._store)
+            profiles = [_transient_local()] if topic in KEPT else []
+            self._connections[topic] = self._writer.add_connection(
+                topic, name, typestore=self._store, offered_qos_profiles=profiles
+            )
         data = self._store.serialize_cdr(self._make(name, **fields), name)
         self._writer.write(self._connections[topic], stamp_ns, data)
 
@@ -249,3 +268,31 @@ class _Part:
         name = "geometry_msgs/msg/TransformStamped"
         header = self._header(self.begun_ns, BASE)
         return self._make(name, header=header, child_frame_id=OPTICAL, transform=transform)
+
+    def _ranger_mounts(self) -> list[Any]:
+        """The proximity sensors, each at the robot's edge along its bearing."""
+        d, mounts = self._description, []
+        for k, bearing in enumerate(d.ranger_bearings):
+            at = Pose2(d.radius * math.cos(bearing), d.radius * math.sin(bearing), bearing)
+            mounts.append(self._transform(self.begun_ns, BASE, f"proximity_{k}", at))
+        return mounts
+
+
+class _KeptOpen:
+    """Stands for the storage of a bag that stays open."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def close(self, version: int, metadata: str) -> None:
+        """Nothing: the storage itself is written on."""
+
+
+def _transient_local() -> Qos:
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    default = QosTime(0, 0)
+    return Qos(
+        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
+        default, default, QosLiveliness.AUTOMATIC, default, False,
+    )  # fmt: skip

@@ -289,7 +289,8 @@ def test_all_of_a_killed_recorder_but_the_last_seconds_is_there(drive: Drive, tm
     stamps = [observation.stamp_ns for observation in iter(replay.sense, None)]
     assert stamps == [BEGUN_NS + k * 100_000_000 for k in range(len(stamps))]
     assert 95 - len(stamps) <= 10 * FLUSH_S and not replay.damage
-    with AnyReader([folder / "walk_0" / "walk_0.mcap"]) as reader:
+    # The folder is a bag for other programs as well: its metadata was written with the messages.
+    with AnyReader([folder / "walk_0"]) as reader:
         assert {c.topic: c.msgcount for c in reader.connections}["/odom"] == len(stamps)
         assert sum(1 for _ in reader.messages()) == reader.message_count
 

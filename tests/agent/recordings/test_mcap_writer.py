@@ -106,6 +106,7 @@ def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> No
             "/camera/image/compressed": ("sensor_msgs/msg/CompressedImage", COUNT),
             "/camera/camera_info": ("sensor_msgs/msg/CameraInfo", COUNT),
             "/odom": ("nav_msgs/msg/Odometry", COUNT),
+            "/tf": ("tf2_msgs/msg/TFMessage", COUNT),
             "/cmd_vel": ("geometry_msgs/msg/TwistStamped", COUNT),
             "/kidnap_status": ("irobot_create_msgs/msg/KidnapStatus", 4),
             "/proximity/0": ("sensor_msgs/msg/Range", COUNT),
@@ -116,8 +117,19 @@ def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> No
             if connection.topic == "/cmd_vel":
                 assert message.twist.linear.x == (0.0 if stamp == BEGUN_NS else 0.3)
             if connection.topic == "/tf_static":
-                (mount,) = message.transforms
+                mount, ahead, left = message.transforms
                 assert mount.transform.translation.z == 0.3 and mount.header.frame_id == "base_footprint"
+                assert [ahead.child_frame_id, left.child_frame_id] == ["proximity_0", "proximity_1"]
+                at, turn = left.transform.translation, left.transform.rotation
+                assert (at.x, at.y) == pytest.approx((0.16 * np.cos(0.5), 0.16 * np.sin(0.5)))
+                assert (turn.z, turn.w) == pytest.approx((np.sin(0.25), np.cos(0.25)))
+            if connection.topic == "/tf":
+                (moved,) = message.transforms
+                assert (moved.header.frame_id, moved.child_frame_id) == ("odom", "base_footprint")
+        kept = {c.topic for c in reader.connections if c.ext.offered_qos_profiles}  # type: ignore[union-attr]
+        assert kept == {"/tf_static", "/kidnap_status"}
+        (profile,) = next(c for c in reader.connections if c.topic == "/tf_static").ext.offered_qos_profiles  # type: ignore[union-attr]
+        assert profile.durability.name == "TRANSIENT_LOCAL" and profile.reliability.name == "RELIABLE"
 
 
 def test_a_long_recording_is_a_row_of_files(drive: Drive, tmp_path: Path) -> None:
