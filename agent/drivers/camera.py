@@ -1,10 +1,6 @@
 """Images from a video device, a file or a stream with OpenCV: the newest frame, stamped at capture.
 
-On a Raspberry Pi with libcamera (Bookworm and later) the camera is no video device for OpenCV. Either run
-`rpicam-vid -t 0 --codec mjpeg --inline --listen -o tcp://0.0.0.0:8888` and give `source =
-"tcp://127.0.0.1:8888"`, or write a `FrameSource` over picamera2: `capture_request()` gives the image and, in
-`SensorTimestamp` of its metadata, the monotonic time of the exposure, which `clock.of_monotonic_ns` makes a
-stamp.
+For a Raspberry Pi's own camera see docs/robot.md.
 """
 
 from __future__ import annotations

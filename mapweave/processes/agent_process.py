@@ -134,6 +134,9 @@ def _hand_over(
 ) -> None:
     if not replicator.flush(10.0):
         return  # closing it says what is lost
+    status = replicator.status()
+    if not (status.newest or status.unacknowledged):
+        return  # nothing was mapped, and no server may be there
     if options.patience <= 0:
         line = "offline: the map stays in the journal and is sent when a server can be reached"
     elif not bus.wait_connected(min(2.0, options.patience)):

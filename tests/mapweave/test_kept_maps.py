@@ -359,3 +359,14 @@ def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_pat
     journal = Journal(tmp_path / "r0.sqlite", "r0")  # in use, as long as the agent has not closed it
     assert journal.maps() == [MapId("r0", 1)]
     journal.close()
+
+
+def test_an_agent_that_has_mapped_nothing_says_of_no_server_that_it_has_it_all(tmp_path, capfd):
+    """There is a router, and no map server."""
+    bus = ZenohBus(BusSettings(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",)))
+    robot = Ended(tmp_path / "folder")
+    run_agent(robot, bus, KEYS, AgentSettings(), AgentOptions("r0", tmp_path, epoch=1), threading.Event())
+    bus.close()
+    output = capfd.readouterr()
+    assert "r0: 0 nodes and 0 edges in" in output.out + output.err
+    assert "s0 has" not in output.out + output.err
