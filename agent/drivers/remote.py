@@ -151,7 +151,7 @@ class RemoteRobot:
             timeout = min(ASK_TIMEOUT, max(end - time.monotonic(), PAUSE))
             asked_at = time.monotonic()
             replies = self._bus.ask(key, payload, timeout)
-            # A question that nobody serves ends at once; a slow base keeps it until the time-out.
+            # A question that no base serves ends at once; a slow base keeps it until the time-out.
             gone = not replies and time.monotonic() - asked_at < timeout
             answers = [reply.payload for reply in replies if not reply.error]
             if len(answers) > 1:

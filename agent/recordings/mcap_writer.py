@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PART_S = 60.0
 """A recording is a row of files, none longer than this, s: what a disk's failure can damage."""
 FLUSH_S = 2.0
-"""So often everything is on the disk, and file and metadata complete, s: a robot whose power fails loses no more."""
+"""So often all is on the disk, and file and metadata complete, s: a robot whose power fails loses no more."""
 MCAP_END = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 0, 0) + b"\x89MCAP0\r\n"
 """A data end and a footer without checksums, summary and index (https://mcap.dev/spec): a reader scans."""
 WAITING = 200
@@ -166,7 +166,12 @@ class _Part:
         self._connections: dict[str, Any] = {}
         self._description = description
         self._info = self._camera_info()
-        self._put("/tf_static", "tf2_msgs/msg/TFMessage", begun_ns, transforms=[self._mount(), *self._ranger_mounts()])
+        self._put(
+            "/tf_static",
+            "tf2_msgs/msg/TFMessage",
+            begun_ns,
+            transforms=[self._mount(), *self._ranger_mounts()],
+        )
         self._flush()
 
     def write(self, observation: Observation, command: Command, odom_from_robot: Pose2) -> None:
@@ -279,7 +284,7 @@ class _Part:
 
 
 class _KeptOpen:
-    """Stands for the storage of a bag that stays open."""
+    """In place of the storage of a bag that stays open."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

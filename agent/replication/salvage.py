@@ -83,7 +83,7 @@ def _changes(connection: sqlite3.Connection) -> tuple[dict[tuple[int, int], Row]
             for sequence in range(1, head):
                 if (epoch, sequence) not in rows:
                     one, _ = _read(connection, f"{COLUMNS} WHERE epoch = ? AND sequence = ?", epoch, sequence)
-                    rows.update({(epoch, sequence): row for row in one if _is_row(row)})
+                    rows.update({(row[0], row[1]): row for row in one if _is_row(row)})
     return rows, error
 
 
@@ -100,7 +100,7 @@ def _is_epoch(epoch: object) -> bool:
 
 
 def _agent(rows: Iterable[Row], owners: Iterable[tuple[Any]]) -> str:
-    """Whose journal it is: as its changes say, which have checksums, else as its owner is written; or empty."""
+    """Whose journal it is: by its changes, which have checksums, else by its table `owner`; or empty."""
     for *_, encoded, crc in rows:
         if (body := body_of(encoded, crc)) is not None:
             return element_of(body).agent

@@ -235,7 +235,9 @@ def test_what_is_left_of_a_damaged_journal_is_extracted_and_the_agent_says_how(t
     for page in (leaves[len(leaves) // 3], leaves[2 * len(leaves) // 3]):
         data[page : page + 4096] = bytes(4096)
     path.write_bytes(data)
-    with pytest.raises(InvalidFile, match=r"agent journal is damaged \(.*\); save what can be read with `map"):
+    with pytest.raises(
+        InvalidFile, match=r"agent journal is damaged \(.*\); save what can be read with `map"
+    ):
         Journal(path, "r0")
     assert main(["map", "extract", str(path), "-o", str(tmp_path / "out")]) == 1
     assert f"mapweave: {path} had pages that cannot be read" in capfd.readouterr().err

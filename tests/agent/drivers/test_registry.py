@@ -107,7 +107,9 @@ def test_a_constructor_that_fails(text: str, words: str, tmp_path: Path) -> None
 
 def test_the_example_says_which_option_it_lacks() -> None:
     example = Path(__file__).parents[3] / "examples" / "own_robot.py"
-    with pytest.raises(SettingsError, match=r'^\[robot.options\] lacks the port; give port = "/dev/ttyUSB0"$'):
+    with pytest.raises(
+        SettingsError, match=r'^\[robot.options\] lacks the port; give port = "/dev/ttyUSB0"$'
+    ):
         find_driver(f"{example}:OwnRobot")(RobotSettings())
 
 
