@@ -53,6 +53,7 @@ from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
+from mapweave.hybridmap.view_image import ViewImage, ViewRequest
 from mapweave.storage.map_file import MapFile, RefusedPair, pack_map_file, unpack_map_file
 from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.codec import decode_change, encode_change
@@ -329,6 +330,7 @@ def answers() -> dict[str, tuple[Any, ...]]:
         "server/s0/robots": (FleetStatus(robots),),
         "agent/r0/mission": (mission().order, mission()),
         "agent/r0/status": (status(),),
+        "agent/r0/view": (ViewRequest(NODE), ViewImage(NODE, b"\xff\xd8\xff\xd9")),
         "agent/r0/portal": (PortalDone("r0", "anna"),),
         "agent/r0/drive": (DriveRequest(7, 0.25, -0.5, STAMP, True), DriveAnswer(status(), STAMP, 0.5, 0.75)),
     }  # fmt: skip

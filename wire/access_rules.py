@@ -98,7 +98,7 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
     return [
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/mission/*",
-                  f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive",
+                  f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive", f"{agent}/view",
                   f"{base}/describe", f"{base}/step"]),
         # A publisher hears who listens to its key, under any pattern. If it hears of none it sends nothing.
         ("egress", ("declare_subscriber",), ["**"]),

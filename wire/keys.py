@@ -8,6 +8,7 @@
     mapweave/1/<fleet>/agent/<agent>/mission          question: a mission order
     mapweave/1/<fleet>/agent/<agent>/drive            question: a person's velocity command
     mapweave/1/<fleet>/agent/<agent>/portal           question: it was taken through a portal
+    mapweave/1/<fleet>/agent/<agent>/view             question: the image of a node; liveliness: it keeps some
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, constrain,
@@ -131,6 +132,14 @@ class Keys:
         """Where an agent takes reports that it was taken through a portal."""
         return f"{self.root}/agent/{check_name(agent)}/portal"
 
+    def view(self, agent: str) -> str:
+        """Where an agent that keeps images of its nodes gives them to servers, and under which it says so."""
+        return f"{self.root}/agent/{check_name(agent)}/view"
+
+    def views(self) -> str:
+        """Pattern: every agent that keeps images."""
+        return f"{self.root}/agent/*/view"
+
     # Keys of a server.
 
     def ack(self, server: str, agent: str) -> str:
@@ -241,6 +250,10 @@ class Keys:
     def parse_agent_status(self, key: str) -> str:
         """Which agent."""
         return self._parse_names("agent/*/status", key)[0]
+
+    def parse_view(self, key: str) -> str:
+        """Which agent."""
+        return self._parse_names("agent/*/view", key)[0]
 
     def parse_robot_driver(self, key: str) -> tuple[str, int]:
         """Which robot, and the number of who drives it."""

@@ -41,6 +41,7 @@ from mapweave.hybridmap.query import (
     RouteRequest,
     View,
 )
+from mapweave.hybridmap.view_image import MAX_BYTES, ViewImage, ViewRequest
 from mapweave.wire import typed
 from mapweave.wire.codec import MAX_BODY_BYTES
 from mapweave.wire.landmark_codec import MAX_LANDMARKS_BYTES, pack_features, unpack_features
@@ -140,6 +141,8 @@ LIMITS: dict[type, Limit] = {
     MissionRequest: Limit("mission request", 2048),
     Missions: Limit("missions", 2**22, 50_000),
     PortalDone: Limit("portal done", 256),
+    ViewRequest: Limit("request for a view", 256),
+    ViewImage: Limit("view of a node", MAX_BYTES + 256),
     PlacedPlans: Limit("plans", 2**24, 1_000_000),
     PlanPiece: Limit("piece of a plan", PIECE + 1024),
     PlanReceived: Limit("plan image", 2048),

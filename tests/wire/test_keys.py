@@ -39,6 +39,7 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
         KEYS.heads(): KEYS.head(one),
         KEYS.agents_alive(): KEYS.agent_alive(one),
         KEYS.agent_statuses(): KEYS.agent_status(one.agent),
+        KEYS.views(): KEYS.view(one.agent),
         KEYS.acks(one.agent): KEYS.ack(server, one.agent),
         KEYS.all_poses(server): KEYS.poses(server, one.agent),
         KEYS.any_relocalize(): KEYS.relocalize(server),
@@ -63,6 +64,7 @@ def test_a_key_is_parsed(one: MapId, server: str) -> None:
     assert KEYS.parse_log(KEYS.log(one)) == one
     assert KEYS.parse_agent_alive(KEYS.agent_alive(one)) == one
     assert KEYS.parse_agent_status(KEYS.agent_status(one.agent)) == one.agent
+    assert KEYS.parse_view(KEYS.view(one.agent)) == one.agent
     assert KEYS.parse_ack(KEYS.ack(server, one.agent)) == (server, one.agent)
     assert KEYS.parse_robot_driver(KEYS.robot_driver(server, one.epoch)) == (server, one.epoch)
 

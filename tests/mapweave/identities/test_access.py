@@ -201,6 +201,25 @@ def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
     assert not asked(bob, KEYS.drive("r0"))
 
 
+def test_the_views_of_a_robot_are_for_servers_alone(fleet: Fleet) -> None:
+    """People get them by a server, which checks them; other robots do not get them."""
+    alive: list[str] = []
+    fleet.router.watch(KEYS.views(), lambda key, is_alive: alive.append(key) if is_alive else None)
+    r0 = fleet.join("r0")
+    for name in ("r1", "r0"):
+        r0.serve(KEYS.view(name), answer)
+        r0.announce(KEYS.view(name))
+    r0.serve(KEYS.agent_status("r0"), answer)
+    eventually(lambda: asked(fleet.router, KEYS.view("r0")) and alive)
+    assert alive == [KEYS.view("r0")]
+    assert not asked(fleet.router, KEYS.view("r1"))
+    for name in ("anna", "bob"):
+        bus = fleet.join(name)
+        eventually(lambda bus=bus: asked(bus, KEYS.agent_status("r0")))
+        assert not asked(bus, KEYS.view("r0"))
+    assert not asked(fleet.join("r1"), KEYS.view("r0"))
+
+
 def test_an_operator_commands_under_the_own_name_alone(fleet: Fleet) -> None:
     """Whatever a message says, its key has the name that is recorded; patterns are no way around it."""
     senders: list[tuple[str, str]] = []
