@@ -24,6 +24,7 @@ from mapweave.agent.localization.fix import Fix
 from mapweave.agent.map_making import MapMaking
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.node_retirement import Released, alone
+from mapweave.agent.mapping.view import RawImage
 from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
@@ -36,7 +37,7 @@ from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 
@@ -55,6 +56,7 @@ class Step:
         questions: for the fleet's map; answers come with a later observation.
         status: for people.
         fault: the sensor that cannot be believed now, if any.
+        images: of the nodes that were made.
     """
 
     command: Command
@@ -62,6 +64,7 @@ class Step:
     questions: tuple[Question, ...]
     status: Status
     fault: Fault | None = None
+    images: tuple[tuple[NodeId, RawImage], ...] = ()
 
 
 class Pipeline:
@@ -268,7 +271,8 @@ class Pipeline:
         changes = self._map_making.take_changes()
         own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
         self._command = safe if own else None
-        return Step(safe, changes, tuple(questions), self._status(warning), self._fault)
+        images = self.mapper.take_images()
+        return Step(safe, changes, tuple(questions), self._status(warning), self._fault, images)
 
     def _make_room(self) -> None:
         """Drive out of the way of another robot, if this one has done its mission, and may."""

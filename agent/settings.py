@@ -172,6 +172,8 @@ class AgentSettings:
         seed: seed of all that the robot does by chance.
         without_server: what it does while no map server is in reach: "go on" with its mission, "stand", or go
             "home", to the first node of its map. Its mission goes on when the server is back.
+        keep_views: whether it keeps a small image of each node in a folder beside its maps. The map server
+            shows it to people who may read the map. If not, no image leaves the robot.
         sift: features of an image.
         landmarks: which landmarks a node keeps.
         tracker: of image points.
@@ -185,6 +187,7 @@ class AgentSettings:
 
     seed: Annotated[int, Meta(ge=0)] = 0
     without_server: WithoutServer = WithoutServer.GO_ON
+    keep_views: bool = False
     sift: SiftSettings = field(default_factory=SiftSettings)
     landmarks: SelectionSettings = field(default_factory=SelectionSettings)
     tracker: TrackerSettings = field(default_factory=TrackerSettings)

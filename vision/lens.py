@@ -89,7 +89,11 @@ class Lens:
         A webcam's distortion is removed from points, as every interpolation costs detail. A fisheye bends
         patches too much on their way through the image: see docs/decisions/fisheye.md.
         """
-        if self._fisheye is None:
+        return image if self._fisheye is None else self.undistorted(image)
+
+    def undistorted(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The (H, W) grey image of the ideal camera."""
+        if self._ideal:
             return image
         if self._maps is None:
             width, height = self.camera.width, self.camera.height

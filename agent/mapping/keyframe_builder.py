@@ -14,7 +14,7 @@ from mapweave.agent.ekf.triangulation import triangulate
 from mapweave.agent.mapping.anchored_keyframe import HERE, AnchoredKeyframe
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
-from mapweave.agent.mapping.view import View
+from mapweave.agent.mapping.view import RawImage, View
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -93,6 +93,7 @@ class KeyframeBuilder:
         self._last: AnchoredKeyframe | None = None
         self._next_number = next_number
         self._new: list[ChangeBody] = []
+        self._images: list[tuple[NodeId, RawImage]] = []
         self._to_close: tuple[Node, NodeId | None] | None = None
         self._rng = np.random.default_rng(0)
 
@@ -116,6 +117,11 @@ class KeyframeBuilder:
         """What was changed in the map since the last call, in order: it is to leave the robot."""
         new, self._new = tuple(self._new), []
         return new
+
+    def take_images(self) -> tuple[tuple[NodeId, RawImage], ...]:
+        """The images of the nodes that were made since the last call."""
+        images, self._images = tuple(self._images), []
+        return images
 
     def place(
         self, anchor: View, leaves: list[View], tracking: Tracking, trajectory: TrajectoryRecorder
@@ -245,6 +251,8 @@ class KeyframeBuilder:
         node = Node(
             self.new_id(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius, ranges, segment
         )
+        if view.image is not None:
+            self._images.append((node.id, view.image))
         return AnchoredKeyframe(node, tracks)
 
     def _landmarks(self, view: View, tracking: Tracking) -> tuple[Landmarks, NDArray[np.int64]]:

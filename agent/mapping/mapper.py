@@ -17,13 +17,13 @@ from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.mapping.node_retirement import NodeRetirement, Released, alone
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
-from mapweave.agent.mapping.view import View
+from mapweave.agent.mapping.view import RawImage, View
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.track_quality import TrackQuality
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, Node
+from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.recognition import Recognition
 from mapweave.vision.lens import Lens
@@ -177,6 +177,10 @@ class Mapper:
     def take_changes(self) -> tuple[ChangeBody, ...]:
         """What was changed in the map since the last call; the only way by which nodes and edges leave."""
         return self._keyframes.take_changes()
+
+    def take_images(self) -> tuple[tuple[NodeId, RawImage], ...]:
+        """The images of the nodes that were made since the last call."""
+        return self._keyframes.take_images()
 
     def drove(self, traverse: Traverse | None, refined: Node | None) -> None:
         """Take in what was measured on a drive while nothing was mapped; see KeyframeBuilder."""

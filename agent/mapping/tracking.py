@@ -17,7 +17,7 @@ from mapweave.agent.mapping.kidnap_detection import KidnapDetector, turned
 from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.agent.mapping.prediction_offset import PredictionOffset
 from mapweave.agent.mapping.track_history import TrackHistory
-from mapweave.agent.mapping.view import View, associate, even_choice
+from mapweave.agent.mapping.view import RawImage, View, associate, even_choice
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.occluded_tracks import OccludedTracks
@@ -202,7 +202,8 @@ class Tracking:
     def take(self, observation: Observation, features: Features, anchor_from_view: PoseGaussian) -> View:
         """Make a view of an image that was just tracked, and match its features with tracks."""
         tracks = associate(features, self._tracker.ids, self._tracker.raw, ASSOCIATE_PX)
-        return View(observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity)
+        image = None if observation.image is None else RawImage(observation.image, self._lens)
+        return View(observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity, image)
 
     def follow(self, view: View, expected_depth: float) -> None:
         """Make tracks of a view's features that have none, and give the filter an even choice of them."""

@@ -8,7 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
+
+
+@dataclass(frozen=True, eq=False)
+class RawImage:
+    """An image of the camera, with the lens's distortion still in it.
+
+    Attributes:
+        pixels: (H, W) grey.
+        lens: through which it was seen.
+    """
+
+    pixels: NDArray[np.uint8]
+    lens: Lens
 
 
 @dataclass(eq=False)
@@ -21,6 +35,7 @@ class View:
         features: its features.
         tracks: (N,) id of the track of each feature, -1 where it has none.
         proximity: (K,) m, free distances from the robot's edge at that time.
+        image: of which the features are; None if it is not known.
     """
 
     stamp_ns: int
@@ -28,6 +43,7 @@ class View:
     features: Features
     tracks: NDArray[np.int64]
     proximity: Array = field(default_factory=lambda: np.zeros(0))
+    image: RawImage | None = None
 
 
 def associate(features: Features, ids: NDArray[np.int64], raw: Array, within_px: float) -> NDArray[np.int64]:

@@ -24,6 +24,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.replication.retained_map import RetainedMap
+from mapweave.agent.replication.view_keeper import ViewKeeper
 from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
@@ -31,7 +32,7 @@ from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path
+from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path, views_path
 from mapweave.processes.portal_command import PortalCommand
 from mapweave.processes.server_watch import ServerWatch
 from mapweave.storage.map_file import MapFile, write_map_file
@@ -145,6 +146,7 @@ class Agent:
         self._print, self._server_watch = print_line, ServerWatch(options.server)
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
+        self._views: ViewKeeper | None = None
         try:
             self.missions = MissionControl(
                 options.name, self.journal.missions(), self.journal.keep_missions, settings.without_server,
@@ -157,6 +159,9 @@ class Agent:
                 options.name, settings.portals, self.missions.portal_done, self._say
             )
             self._description = measured(describe(), options.calibration)
+            if settings.keep_views:
+                folder = views_path(options.data, options.name)
+                self._views = ViewKeeper(self._bus, keys, options.name, folder)
             explores = settings.exploration.without_rangers
             for line in announcement(self._description, options.name, explores):
                 print_line(f"{options.name}: {line}")
@@ -169,6 +174,8 @@ class Agent:
                     self._write(left, RetainedMap.of(self.journal, left))
                 self._begin()
         except BaseException:
+            if self._views is not None:
+                self._views.close()
             self.journal.close()
             raise
 
@@ -207,6 +214,8 @@ class Agent:
         if kept.complaint:
             self._say(kept.complaint)
             self._set_aside(map_id)
+        if self._views is not None:
+            self._views.keep_only(map_id, pipeline.map.nodes)
         self._start(map_id, pipeline)
 
     def _chosen(self, maps: list[MapId]) -> MapId:
@@ -252,6 +261,8 @@ class Agent:
         self._print(f"{self._options.name}: {line}")
 
     def _stepped(self, observation: Observation, step: Step) -> None:
+        if self._views is not None:
+            self._views.keep(step.images, step.changes)
         if self._trajectory is not None:
             pose = step.status.map_from_robot if step.status.located else None
             self._trajectory.add(observation.stamp_ns, observation.odometry.motion(), pose)
@@ -348,5 +359,7 @@ class Agent:
         """Commit what was mapped and leave the fleet. The bus stays open."""
         self._portal_command.close()
         self._leave()
+        if self._views is not None:
+            self._views.close()
         self.missions.save()
         self.journal.close()

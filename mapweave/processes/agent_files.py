@@ -17,6 +17,11 @@ def trajectory_path(folder: Path, map_id: MapId) -> Path:
     return folder / f"{map_id}.tum"
 
 
+def views_path(folder: Path, agent: str) -> Path:
+    """Where an agent keeps images of its nodes, for example `r0.views/r0.3.17.jpg`."""
+    return folder / f"{agent}.views"
+
+
 def epochs_of_files(folder: Path, agent: str) -> list[int]:
     """Numbers of the maps of an agent that have a file in a folder."""
     numbers = (path.name.split(".")[1] for path in folder.glob(f"{agent}.*.mapweave"))
