@@ -22,7 +22,7 @@ from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.annotator import AnnotationRecord, Annotator
@@ -43,6 +43,7 @@ from mapweave.mapserver.metrics import Metrics, Sources
 from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
 from mapweave.mapserver.mission_relay import KEPT as MISSIONS
 from mapweave.mapserver.mission_relay import MissionRelay
+from mapweave.mapserver.node_views import NodeViews
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.plan_service import PlanService
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
@@ -193,6 +194,7 @@ class MapServer:
             self._bus, self._keys, self._name, self._named_places, self._annotations, self._plans.check,
             lambda: self._constraints.constraints, self._apply_annotations,
         )  # fmt: skip
+        self._views = NodeViews(self._bus, self._keys, lambda: worker.current().merged)
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         self._metrics.read(self._sources())
         clock.every(STATUS_EVERY, self._publish)
@@ -210,6 +212,7 @@ class MapServer:
         self._explainer.close()
         self._annotator.close()
         self._plans.close()
+        self._views.close()
         self._admission.close()
         self._ingest.close()
         self._broadcast.close()
@@ -327,6 +330,19 @@ class MapServer:
             InvalidValue: it is no image, or too large.
         """
         return self._plans.put(data, negate)
+
+    def may_have_view(self, node: NodeId) -> bool:
+        """Whether it is worth asking for the image of a node, from any thread."""
+        return self._views.may_have(node)
+
+    def view(self, node: NodeId) -> bytes:
+        """The image of a node, a JPEG file, from any thread; waits for its robot.
+
+        Raises:
+            InvalidValue: there is no such node.
+            NoView: its robot is away, or has kept none.
+        """
+        return self._views.view(node)
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words, from any thread.

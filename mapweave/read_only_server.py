@@ -18,11 +18,13 @@ from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
+from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.mapserver.explanations import explained
 from mapweave.mapserver.floor_plans import placed_plans
+from mapweave.mapserver.node_views import NoView
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -197,6 +199,18 @@ class ReadOnlyServer:
             InvalidValue: always.
         """
         self._refuse("there are no robots")
+
+    def may_have_view(self, node: NodeId) -> bool:
+        """Maps have no images."""
+        return False
+
+    def view(self, node: NodeId) -> bytes:
+        """Refuse.
+
+        Raises:
+            NoView: always.
+        """
+        raise NoView("a map file has no views")
 
     def constraints(self) -> ConstraintList:
         """What people decided, in order."""

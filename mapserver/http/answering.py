@@ -12,10 +12,11 @@ from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Mission
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.http.annotations import Annotating
 from mapweave.mapserver.http.live import Shown
+from mapweave.mapserver.http.nodes import Showing
 from mapweave.mapserver.http.plans import Planning
 
 
-class Answering(Annotating, Planning, Shown, Protocol):
+class Answering(Annotating, Planning, Showing, Shown, Protocol):
     """The questions, as of a MapServer or a map file: from any thread; a MapweaveError refuses one."""
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:

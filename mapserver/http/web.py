@@ -4,7 +4,7 @@
     GET /             the page: the merged map live, robots, and where a photograph was taken
     GET /why          the same page, with an explanation: ?a=r0.1.17&b=r1.1.5
     WebSocket /live   what the page draws, see live.py
-    GET /nodes/NODE   one node, JSON
+    GET /nodes/NODE   one node, JSON; /nodes/NODE/view its image, if its robot has kept one
     GET /status       what the server holds, JSON
     GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
@@ -53,11 +53,10 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
-from mapweave.hybridmap.explanation import route_over
+from mapweave.hybridmap.explanation import PairExplanation, route_over
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
 from mapweave.hybridmap.mission_order import MissionKind, Missions
-from mapweave.hybridmap.node import NodeId
 from mapweave.identities.logins import Logins
 from mapweave.mapserver.http.annotations import annotate, annotations_json
 from mapweave.mapserver.http.answering import Answering
@@ -68,7 +67,7 @@ from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.live import Live
 from mapweave.mapserver.http.login import PERSON, PUBLIC, Access, address_of
-from mapweave.mapserver.http.node_details import node_details
+from mapweave.mapserver.http.nodes import node_answers
 from mapweave.mapserver.http.plans import plan_answers
 from mapweave.mapserver.http.rates import LIMITED, Rates
 from mapweave.mapserver.http.reply import PATIENCE, Reply, busy, refusal
@@ -99,7 +98,7 @@ METHODS = {
         ),
         "GET",
     ),
-    **dict.fromkeys(("/nodes/NODE", "/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
+    **dict.fromkeys(("/nodes/NODE", "/nodes/NODE/view", "/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
     **dict.fromkeys(("/relocalize", MISSION, *OF_ROBOTS, "/stop", "/login", "/logout"), "POST"),
 }
@@ -213,7 +212,7 @@ class Questions:
             ("GET", "/missions", "missions", self._missions),
             ("GET", "/metrics", "robots", self._metrics),
             ("GET", "/map", "map", self._map),
-            ("GET", "/nodes/{node}", "map", self._node),
+            *node_answers(server),
             ("GET", "/annotations", "annotations", self._annotations),
             ("POST", "/annotations", "annotate", self._annotate),
             *plan_answers(server, lambda request: read_body(request, (*IMAGE, FORM), patience)),
@@ -295,15 +294,6 @@ class Questions:
         by = request.query_params.get("by", BY)
         return await run_in_threadpool(annotate, self._server, body, by, request.scope[PERSON].name)
 
-    async def _node(self, request: Request) -> Mapping[str, Any]:
-        node = NodeId.parse(request.path_params["node"])
-
-        def details() -> Mapping[str, Any]:
-            floors = self._server.annotations().floors
-            return json_values(node_details(self._server.merged(), node, floors))
-
-        return await run_in_threadpool(details)
-
     async def _map(self, _: Request) -> Response:
         data = await self._result(self._server.map_file)
         headers = {"Content-Disposition": 'attachment; filename="merged.mapweave"'}
@@ -357,7 +347,11 @@ class Questions:
         path, query, resolve = request.url.path, request.query_params, self._server.resolve
         asked = await run_in_threadpool(read_questions, path, query, resolve)
         first, *more = [await self._result(partial(self._server.explain, one)) for one in asked]
-        return await run_in_threadpool(json_values, route_over([first, *more]) if more else first)
+        values = await run_in_threadpool(json_values, route_over([first, *more]) if more else first)
+        if isinstance(first, PairExplanation):
+            nodes = (first.a.id, first.b.id)
+            return {**values, "views": [str(node) for node in nodes if self._server.may_have_view(node)]}
+        return values
 
     async def _relocalize(self, request: Request) -> Mapping[str, Any]:
         body = await read_body(request, (*IMAGE, FORM), self._patience)

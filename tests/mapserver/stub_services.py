@@ -26,6 +26,7 @@ from mapweave.hybridmap.query import (
     View,
     Whereabouts,
 )
+from mapweave.mapserver.node_views import NoView
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
@@ -64,6 +65,7 @@ class StubServices:
         self.said = Annotations()
         self.ways: list[tuple[str, tuple[str, ...]]] = []
         self.read_only = False
+        self.images: dict[NodeId, bytes] = {}
 
     def merged(self) -> MergedMap:
         return self.map or two_maps()
@@ -88,6 +90,14 @@ class StubServices:
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         return Places(Router(self.merged()), self.annotations()).answer(request)
+
+    def may_have_view(self, node: NodeId) -> bool:
+        return node in self.images
+
+    def view(self, node: NodeId) -> bytes:
+        if node not in self.images:
+            raise NoView(f"{node.agent} is away, or keeps no views")
+        return self.images[node]
 
     def metrics(self) -> bytes:
         return b"mapweave_nodes 12.0\n"

@@ -1,5 +1,6 @@
 // Why two nodes or maps are one, or are not, and why a route leads as it does: GET /explain and GET /route.
 import { add, ask, button, byId, degrees, draw, metres, percent } from "./dom.js";
+import { drawView } from "./views.js";
 
 const BAD_PX = 10;
 const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
@@ -10,14 +11,22 @@ function colour(px) {
   const at = 4 * Math.min(px === null ? BAD_PX : px, BAD_PX) / BAD_PX, k = Math.min(Math.floor(at), 3);
   return "rgb(" + COLOURS[k].map((c, i) => Math.round(c + (at - k) * (COLOURS[k + 1][i] - c))) + ")";
 }
-// Both views with the landmarks that match; images are not kept.
+// Both views with the landmarks that match; the images where their robots have kept them.
 function picture(parent, pair) {
   const nodes = [pair.a, pair.b], [left, right] = nodes.map(node => node.image);
   const gap = 0.06 * left[0], shift = [0, left[0] + gap];
+  const agreement = `${pair.shared.length} landmarks of ${pair.a.id} and ${pair.b.id} agree`;
   const svg = draw(parent, "svg", { role: "img", class: "picture",
-    "aria-label": `${pair.shared.length} landmarks of ${pair.a.id} and ${pair.b.id} agree`,
+    "aria-label": agreement,
     viewBox: [-2, -14, shift[1] + right[0] + 4, Math.max(left[1], right[1]) + 16].join(" ") });
-  nodes.forEach(({ id, image: [width, height] }, k) => {
+  const seen = [];
+  nodes.forEach((node, k) => {
+    const { id, image: [width, height] } = node;
+    if (pair.views.includes(id)) drawView(svg, node, shift[k], () => {
+      seen.push(id);
+      svg.setAttribute("aria-label", `${agreement}, drawn over the view of ${seen.sort().join(" and ")}`);
+      dots.textContent = "Dots are landmarks.";
+    });
     draw(svg, "rect", { x: shift[k], y: 0, width, height, class: "frame" });
     draw(svg, "text", { x: shift[k], y: -4, "font-size": 9 }).textContent = id;
   });
@@ -33,8 +42,8 @@ function picture(parent, pair) {
   nodes.forEach(({ pixels }, k) => pixels.forEach(([x, y]) =>
     draw(svg, "circle", { cx: x + shift[k], cy: y, r: 1.3, class: "landmark" })));
   const alike = pair.matches.filter(match => !agree.has(String(match))).length;
-  add(parent, "small", "Dots are landmarks; images are not kept. " +
-    `${pair.shared.length} agree on one pose: dark where it predicts them, yellow where it is ` +
+  const words = add(parent, "small"), dots = add(words, "span", "Dots are landmarks; there is no image.");
+  words.append(` ${pair.shared.length} agree on one pose: dark where it predicts them, yellow where it is ` +
     `${BAD_PX} px off. ${alike} match and do not agree: grey.`);
 }
 function pose({ mean, sigma }) {

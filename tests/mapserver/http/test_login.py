@@ -50,7 +50,7 @@ TABLE: dict[tuple[str, str], set[str]] = {
     ("WS", "/live"): READ,
     ("GET", "/status"): ANY, ("GET", "/history"): READ, ("GET", "/explain"): READ, ("GET", "/route"): READ,
     ("GET", "/robots"): READ, ("GET", "/missions"): READ, ("GET", "/map"): READ, ("GET", "/metrics"): READ,
-    ("GET", "/nodes/{node}"): READ,
+    ("GET", "/nodes/{node}"): READ, ("GET", "/nodes/{node}/view"): READ,
     ("GET", "/annotations"): READ, ("POST", "/annotations"): COMMAND,
     ("GET", "/plan-images/{sha256}.png"): READ,
     ("GET", "/plans"): READ, ("GET", "/plans/{name:path}.png"): READ, ("POST", "/plans"): COMMAND,

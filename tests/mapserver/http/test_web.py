@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.http.web import Web
 from tests.mapserver.http.client import ask, post
-from tests.mapserver.stub_services import ANSWER, StubServices, picture
+from tests.mapserver.stub_services import ANSWER, StubServices, picture, two_maps
 
 
 def test_an_image_in_and_json_out(served: Web, services: StubServices) -> None:
@@ -33,6 +34,19 @@ def test_an_image_in_and_json_out(served: Web, services: StubServices) -> None:
         assert np.sqrt(np.diag(pose["covariance"])).tolist() == pose["sigma"]
         assert (place["merged_from_robot"], place["inliers"]) == (None, 31)
     assert all(len(view) > 20 for view in services.views)
+
+
+def test_the_view_of_a_node_is_an_image_and_nothing_else(served: Web, services: StubServices) -> None:
+    node = next(iter(two_maps().maps[MapId("r0", 1)].nodes))
+    status, headers, content = ask(served, "GET", f"/nodes/{node}/view")
+    assert status == 404 and json.loads(content) == {"error": "r0 is away, or keeps no views"}
+    assert json.loads(ask(served, "GET", f"/nodes/{node}")[2])["view"] is False
+    services.images[node] = picture(kind=".jpg")
+    status, headers, content = ask(served, "GET", f"/nodes/{node}/view")
+    assert status == 200 and content == services.images[node]
+    assert headers["Content-Type"] == "image/jpeg" and headers["X-Content-Type-Options"] == "nosniff"
+    assert json.loads(ask(served, "GET", f"/nodes/{node}")[2])["view"] is True
+    assert ask(served, "GET", "/nodes/r0/view")[0] == 400
 
 
 def test_the_camera_as_it_is_given(served: Web, services: StubServices) -> None:

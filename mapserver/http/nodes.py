@@ -1,0 +1,61 @@
+"""Nodes over HTTP: what is known of one, as JSON, and its image, if its robot has kept one."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping
+from http import HTTPStatus
+from typing import Any, Protocol
+
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.node import NodeId
+from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.http.node_details import node_details
+from mapweave.mapserver.node_views import NoView
+from mapweave.merge.pose_graph.merged_map import MergedMap
+
+Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
+
+
+class Showing(Protocol):
+    """What a map server offers, see MapServer."""
+
+    def merged(self) -> MergedMap:
+        """The newest merged map."""
+
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+
+    def may_have_view(self, node: NodeId) -> bool:
+        """Whether it is worth asking for the image of a node."""
+
+    def view(self, node: NodeId) -> bytes:
+        """The image of a node, a JPEG file; NoView says why there is none."""
+
+
+def node_answers(server: Showing) -> list[tuple[str, str, str, Answer]]:
+    """Method, path, question and answer of what is asked about a node."""
+
+    async def node(request: Request) -> Mapping[str, Any]:
+        asked = NodeId.parse(request.path_params["node"])
+
+        def details() -> Mapping[str, Any]:
+            known = node_details(server.merged(), asked, server.annotations().floors)
+            return {**json_values(known), "view": server.may_have_view(asked)}
+
+        return await run_in_threadpool(details)
+
+    async def view(request: Request) -> Response:
+        asked = NodeId.parse(request.path_params["node"])
+        try:
+            jpeg = await run_in_threadpool(server.view, asked)
+        except NoView as error:
+            raise HTTPException(HTTPStatus.NOT_FOUND, str(error)) from None
+        return Response(jpeg, media_type="image/jpeg")
+
+    # Who may read the map may see the images of which it was made.
+    return [("GET", "/nodes/{node}", "map", node), ("GET", "/nodes/{node}/view", "map", view)]

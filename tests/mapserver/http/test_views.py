@@ -1,0 +1,162 @@
+"""The views of nodes on the page in a real browser, with agents that keep them and a map server behind."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapweave.agent.observation import Observation
+from mapweave.agent.settings import AgentSettings
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.mission_order import MissionKind
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.server import MapServer
+from mapweave.processes.agent import Agent, AgentOptions
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.agent.conftest import CAMERA, DESCRIPTION, PhotoWalls
+from tests.agent.test_loop_waits_for_nothing import Player
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.mapserver.http.client import ask
+from tests.mapweave.test_kept_maps import WAY
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+KEYS = Keys("views")
+SHOWN = "return document.querySelectorAll('{} svg.seen image').length"
+LABEL = "return document.querySelector('{} svg').getAttribute('aria-label')"
+
+
+class Fleet:
+    """Robots that were carried before the same photographs, and a map server.
+
+    Attributes:
+        folder: of all files.
+        agents: of the robots, by name; they are done with their drives.
+        server: the map server.
+        web: over HTTP.
+    """
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.folder, hub = folder, MemoryHub()
+        self.server = MapServer(MemoryBus(hub), KEYS, folder / "s0.sqlite", "s0")
+        stack.enter_context(self.server)
+        self.agents: dict[str, Agent] = {}
+        for seed, (name, keeps) in enumerate({"r0": True, "r1": True, "r2": False}.items()):
+            robot = drive(seed)
+            options = AgentOptions(name, folder, epoch=1, mission=MissionKind.CARRIED)
+            settings = AgentSettings(keep_views=keeps)
+            agent = Agent(robot.describe, MemoryBus(hub), KEYS, settings, options)
+            stack.callback(agent.close)
+            agent.run(robot, threading.Event())
+            assert agent.replicator.wait_acknowledged(60.0)
+            self.agents[name] = agent
+        assert self.server.settle(60.0)
+        self.web = Web(("127.0.0.1", 0), self.server)
+        stack.enter_context(self.web)
+
+    def node(self, name: str) -> NodeId:
+        return min(self.agents[name].pipeline.map.nodes)
+
+
+def drive(seed: int) -> Player:
+    """Forth and back; no two cameras give the same bits."""
+    walls, noise = PhotoWalls(), np.random.default_rng(seed)
+    poses = [Pose2(float(x)) for x in WAY]
+    before = [poses[0], *poses]
+    seen: list[Observation] = []
+    for k in range(len(poses)):
+        sensed = walls.observe(before[k], poses[k], k + 1)
+        grain = noise.normal(0.0, 2.0, (CAMERA.height, CAMERA.width))
+        image = np.clip(walls.render(poses[k]) + grain, 0, 255).astype(np.uint8)
+        seen.append(Observation(sensed.stamp_ns, sensed.odometry, image))
+    return Player(DESCRIPTION, seen)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    with ExitStack() as stack:
+        yield Fleet(tmp_path_factory.mktemp("fleet"), stack)
+
+
+@pytest.fixture(scope="module")
+def page(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("profile")) as page:
+        page.open(f"http://127.0.0.1:{fleet.web.port}/")
+        eventually(lambda: page.run("return window.mapweave?.model?.order.length"))
+        yield page
+
+
+@pytest.fixture
+def show(page: Browser) -> Callable[[NodeId], None]:
+    def select(node: NodeId) -> None:
+        page.run(
+            f"document.getElementById('query').value = '{node}';"
+            "document.getElementById('search').requestSubmit()"
+        )
+        heading = "return document.querySelector('#selected h2')?.textContent"
+        eventually(lambda: page.run(heading) == f"Node {node}")
+
+    return select
+
+
+def test_a_node_is_shown_with_its_view(fleet: Fleet, page: Browser, show: Callable[[NodeId], None]) -> None:
+    node = fleet.node("r0")
+    show(node)
+    eventually(lambda: page.run(SHOWN.format("#selected")) == 1)
+    landmarks = len(fleet.agents["r0"].pipeline.map.nodes[node].landmarks)
+    assert page.run(LABEL.format("#selected")) == f"The view of {node} with its {landmarks} landmarks"
+    # The image lies where the landmarks are: it fills the frame of the camera's size.
+    boxes = page.run(
+        "return ['image', 'rect'].map(one => document.querySelector('#selected svg ' + one).getBBox())"
+        ".map(box => [box.x, box.y, box.width, box.height])"
+    )
+    assert boxes == [[-0.5, -0.5, CAMERA.width, CAMERA.height], [0, 0, CAMERA.width, CAMERA.height]]
+    assert page.run("return document.querySelectorAll('#selected svg image ~ circle').length") == landmarks
+
+
+def test_a_node_without_a_view_is_shown_as_before(
+    fleet: Fleet, page: Browser, show: Callable[[NodeId], None]
+) -> None:
+    """Of a robot that keeps none nothing is asked."""
+    page.errors()
+    node = fleet.node("r2")
+    show(node)
+    assert page.run("return document.querySelector('#selected svg image')") is None
+    assert "landmarks in the image of" in page.run(LABEL.format("#selected"))
+    assert page.errors() == []
+    status, _, content = ask(fleet.web, "GET", f"/nodes/{node}/view")
+    assert status == 404 and b"r2 is away, or keeps no views" in content
+
+
+def test_a_link_is_shown_over_both_views(fleet: Fleet, page: Browser) -> None:
+    a, b = fleet.node("r0"), fleet.node("r1")
+    page.run(
+        "document.getElementById('tab-why').click(); const form = document.getElementById('form');"
+        f"form.a.value = '{a}'; form.b.value = '{b}'; form.requestSubmit()"
+    )
+    eventually(lambda: page.run(SHOWN.format("#result")) == 2)
+    assert page.run("return document.querySelectorAll('#result svg image ~ line.agree').length") >= 10
+    eventually(lambda: f"drawn over the view of {a} and {b}" in page.run(LABEL.format("#result")))
+    first, second = page.run(
+        "return [...document.querySelectorAll('#result svg image')].map(image => image.getBBox().x)"
+    )
+    assert second - first > CAMERA.width
+
+
+def test_a_view_that_is_lost_is_left_out(fleet: Fleet, page: Browser, show: Callable[[NodeId], None]) -> None:
+    """The robot keeps views, but the one of this node is gone from its disk."""
+    node = max(fleet.agents["r1"].pipeline.map.nodes)
+    (fleet.folder / "r1.views" / f"{node}.jpg").unlink()
+    with pytest.raises(MapweaveError, match=f"r1 has kept no view of {node}"):
+        fleet.server.view(node)
+    show(node)
+    eventually(lambda: page.run("return document.querySelector('#selected svg image')") is None)
+    assert "landmarks in the image of" in page.run(LABEL.format("#selected"))

@@ -1,0 +1,166 @@
+"""What a map server takes of a robot as the image of a node, and passes on."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.view_image import MAX_BYTES, ViewImage, ViewRequest
+from mapweave.mapserver import node_views
+from mapweave.mapserver.node_views import NodeViews, NoView
+from mapweave.wire.bus import Request
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import decode, encode
+from mapweave.wire.packing import pack
+from tests.mapserver.stub_services import picture, two_maps
+from tests.waiting import eventually
+
+KEYS = Keys("fleet")
+NODE, OTHER = NodeId("r0", 1, 1), NodeId("r1", 1, 1)
+CAMERA = two_maps().maps[NODE.map].nodes[NODE].camera
+JPEG = picture(CAMERA.width, CAMERA.height, ".jpg")
+
+
+class HandRobot:
+    """Gives what the test says, and counts how often it was asked."""
+
+    def __init__(self, hub: MemoryHub, name: str = "r0") -> None:
+        self.bus = MemoryBus(hub)
+        self.asked: list[NodeId] = []
+        self.gives: Callable[[NodeId], bytes | str | None] = lambda node: encode(ViewImage(node, JPEG))
+        self.bus.serve(KEYS.view(name), self._answer)
+        self.bus.announce(KEYS.view(name))
+
+    def give(self, jpeg: bytes) -> None:
+        self.gives = lambda node: pack({"node": [*node], "jpeg": jpeg})
+
+    def _answer(self, request: Request) -> None:
+        self.asked.append(decode(request.payload, ViewRequest).node)
+        given = self.gives(self.asked[-1])
+        if isinstance(given, str):
+            request.refuse(given)
+        elif given is not None:
+            request.reply(given)
+
+
+@pytest.fixture
+def hub() -> MemoryHub:
+    return MemoryHub()
+
+
+@pytest.fixture
+def views(hub: MemoryHub) -> Iterator[NodeViews]:
+    views = NodeViews(MemoryBus(hub), KEYS, two_maps)
+    yield views
+    views.close()
+
+
+@pytest.fixture
+def robot(hub: MemoryHub, views: NodeViews) -> HandRobot:
+    robot = HandRobot(hub)
+    eventually(lambda: views.may_have(NODE))
+    return robot
+
+
+def pixels(jpeg: bytes) -> np.ndarray:
+    return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_UNCHANGED))
+
+
+def test_a_view_is_encoded_again_and_asked_for_once(views: NodeViews, robot: HandRobot) -> None:
+    hidden = b"<script>alert(1)</script>"
+    robot.give(JPEG[:2] + b"\xff\xfe" + struct.pack(">H", 2 + len(hidden)) + hidden + JPEG[2:])
+    got = views.view(NODE)
+    assert got == views.view(NODE) and robot.asked == [NODE]
+    assert hidden not in got
+    assert np.abs(pixels(got).astype(int) - pixels(JPEG)).mean() < 6.0
+
+
+def test_few_views_are_remembered(views: NodeViews, robot: HandRobot, monkeypatch) -> None:
+    monkeypatch.setattr(node_views, "MOST_CACHED", 2)
+    first, second, third = sorted(two_maps().maps[NODE.map].nodes)[:3]
+    for node in (first, second, first, third, first, second):
+        views.view(node)
+    assert robot.asked == [first, second, third, second]
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A small file with a head that says so many pixels."""
+    at = JPEG.index(b"\xff\xc0")
+    return JPEG[: at + 5] + struct.pack(">HH", height, width) + JPEG[at + 9 :]
+
+
+GARBAGE = {
+    "nothing": (b"", "no whole JPEG file"),
+    "text": (b"<html>", "no whole JPEG file"),
+    "a PNG": (picture(CAMERA.width, CAMERA.height), "no whole JPEG file"),
+    "cut off": (JPEG[:-300], "no whole JPEG file"),
+    "a JPEG in name alone": (b"\xff\xd8\xff" + b"no image" * 20 + b"\xff\xd9", "JPEG or PNG"),
+    "another size": (picture(CAMERA.width // 2, CAMERA.height, ".jpg"), "px instead of"),
+    "a bomb of pixels": (bomb(65_500, 65_500), "65500x65500 px instead of"),
+    "many scans": (JPEG[:-2] + b"\xff\xda" * 30 + b"\xff\xd9", "more than 20 scans"),
+    "too large": (b"\xff\xd8\xff" + bytes(MAX_BYTES) + b"\xff\xd9", "view of a node"),
+}
+
+
+@pytest.mark.parametrize(("sent", "words"), GARBAGE.values(), ids=GARBAGE)
+def test_garbage_is_refused_in_one_line(views: NodeViews, robot: HandRobot, sent: bytes, words: str) -> None:
+    robot.give(sent)
+    with pytest.raises(NoView) as refused:
+        views.view(NODE)
+    assert f"what r0 gave as its view of {NODE} is refused: " in str(refused.value)
+    assert words in str(refused.value) and "\n" not in str(refused.value)
+    robot.give(JPEG)
+    assert views.view(NODE)
+
+
+def test_a_size_that_is_no_size_in_the_head_is_not_decoded(
+    views: NodeViews, robot: HandRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A decoder allocates memory for as many pixels as the head says."""
+
+    def decoder(*_: object) -> None:
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr(cv2, "imdecode", decoder)
+    for sent in (bomb(65_500, 65_500), bomb(CAMERA.width, 65_500)):
+        robot.give(sent)
+        with pytest.raises(NoView, match="px instead of"):
+            views.view(NODE)
+
+
+def test_the_view_of_another_node_is_refused(views: NodeViews, robot: HandRobot) -> None:
+    robot.gives = lambda node: encode(ViewImage(OTHER, JPEG))
+    with pytest.raises(NoView, match=f"it is of {OTHER}"):
+        views.view(NODE)
+
+
+def test_why_there_is_none(hub: MemoryHub, views: NodeViews, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InvalidValue, match="has no node 9999"):
+        views.view(NodeId("r0", 1, 9999))
+    with pytest.raises(NoView, match="r0 is away, or keeps no views"):
+        views.view(NODE)
+    robot = HandRobot(hub)
+    eventually(lambda: views.may_have(NODE))
+    assert not views.may_have(OTHER)
+    robot.gives = lambda node: f"r0 has kept no view of {node}"
+    with pytest.raises(NoView, match=f"^r0 has kept no view of {NODE}$"):
+        views.view(NODE)
+    # It hangs.
+    robot.gives = lambda node: None
+    monkeypatch.setattr(node_views, "PATIENCE", 0.05)
+    with pytest.raises(NoView, match="r0 does not answer"):
+        views.view(NODE)
+    robot.give(JPEG)
+    monkeypatch.undo()
+    seen = views.view(NODE)
+    robot.bus.close()
+    eventually(lambda: not views.may_have(NodeId("r0", 1, 2)))
+    # What was given once is remembered.
+    assert views.may_have(NODE) and views.view(NODE) == seen
