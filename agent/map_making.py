@@ -205,15 +205,13 @@ class MapMaking:
         return str(self._explorer.phase), self._explorer.detail, self._explorer.finished
 
     def _act(self, behaviour: Explorer | CarriedMapping, observation: Observation) -> Command:
-        """The behaviour's command for this tick; what it asks of the mapper before that is done first.
+        """The behaviour's command for this tick; what it asks of the mapper before that is done at once.
 
-        The views of an episode become nodes when the next tick begins. The robot stands until then: what
-        behaviours do next depends on the new anchor.
+        Only here do the views of an episode become nodes. They leave with the step's changes.
         """
         while isinstance(move := behaviour.next_move(), EpisodeRequest):
             self.mapper.meet(move, observation)
-            if move is EpisodeRequest.FINISH:
-                return Command()
+            self._see_changes()
         return move
 
     def _see_changes(self) -> None:

@@ -68,8 +68,9 @@ class Mapper:
         self._trajectory = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
-        # A thread extracts features. They are used when the next tick begins, which waits for them: no
-        # result depends on speed.
+        # A thread extracts features. Those of a further view are used in the next tick, which begins by
+        # waiting for them: no result depends on speed. The next anchor's are needed at once: episodes that
+        # begin a tick later cost a robot a quarter of its nodes.
         self._extraction = ThreadPoolExecutor(1, "features")
         self._extracting: tuple[Future[Features], Callable[[Features], None]] | None = None
 
@@ -201,7 +202,7 @@ class Mapper:
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
         self._keyframes.close_loops()
-        self.use_extracted()
+        self._use_extracted()
         self._tracking.step(observation)
         if self._tracking.acceptance.carried_off or self._tracking.disputed:
             self.lose()
@@ -244,7 +245,6 @@ class Mapper:
 
         With nodes it is astray and must `resume`; without any it may `begin` again.
         """
-        self.use_extracted()
         self._keyframes.lose(self._tracking.pose)
         self._take_up_pending()
         self._tracking = Tracking(self._description, self._lens, self._settings)
@@ -285,30 +285,24 @@ class Mapper:
         def take(features: Features) -> None:
             self._leaves.append(self._tracking.take(observation, features, pose))
 
-        self.use_extracted()
+        self._use_extracted()
         self._extracting = self._extract(observation.image, observation.left_out), take
 
-    def finish(self, observation: Observation) -> None:
+    def finish(self, observation: Observation) -> bool:
         """End the episode: its views become nodes, and the current image becomes the next anchor.
 
-        When the next tick begins, that is: see `use_extracted`. Without an image nothing is done.
+        Returns:
+            Whether the anchor view became a node. False without an image.
         """
-        self.use_extracted()
+        self._use_extracted()
         if observation.image is None or self._anchor is None:
-            return
+            return False
+        features = self._extract(observation.image, observation.left_out)
         self._tracking.remember(force=True)
-
-        def take(features: Features) -> None:
-            self._finish(observation, features)
-
-        self._extracting = self._extract(observation.image, observation.left_out), take
-
-    def _finish(self, observation: Observation, features: Features) -> None:
-        assert self._anchor is not None
         node = self._keyframes.place(self._anchor, self._leaves, self._tracking, self._trajectory)
         if node is not None:
             self.typical_depth = float(np.median(node.landmarks.depths))
-        anchor = self._tracking.take(observation, features, HERE)
+        anchor = self._tracking.take(observation, features.result(), HERE)
         moved = self._tracking.reanchor()
         self._keyframes.move_anchor(moved)
         if node is not None:
@@ -323,13 +317,14 @@ class Mapper:
             self.begin(observation)
         else:
             self._tracking.follow(anchor, self.typical_depth)
+        return node is not None
 
     def _extract(self, image: NDArray[np.uint8], left_out: Array) -> Future[Features]:
         """Have the features of an image extracted, without those of some regions."""
         return self._extraction.submit(self._sift.extract, image, left_out)
 
-    def use_extracted(self) -> None:
-        """Use the features of the image before, as the next tick would. Nothing was tracked since."""
+    def _use_extracted(self) -> None:
+        """Use the features of the image before. Nothing was tracked since."""
         if self._extracting is not None:
             (features, take), self._extracting = self._extracting, None
             take(features.result())

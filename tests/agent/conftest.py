@@ -78,7 +78,6 @@ class PhotoWalls:
                 mapper.begin(observation)
             before = Pose2(x)
         mapper.finish(observation)
-        mapper.use_extracted()
         (node,) = mapper.map.nodes.values()
         return node
 

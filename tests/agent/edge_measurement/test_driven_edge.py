@@ -113,7 +113,6 @@ def two_nodes(walls) -> HybridMap:
             mapper.leaf(observation)
         before = Pose2(x)
     mapper.finish(observation)
-    mapper.use_extracted()
     assert len(mapper.map.nodes) == 2
     return mapper.map
 

@@ -33,8 +33,7 @@ def test_depths_of_a_node_are_those_of_the_walls(walls, description):
     there = np.arange(0.0, 0.6, 0.025)
     last = drive(mapper, walls, [*there, *there[::-1]])
     assert mapper.take_changes() == ()
-    mapper.finish(last)
-    mapper.use_extracted()
+    assert mapper.finish(last)
     (node,) = mapper.map.nodes.values()
     assert mapper.take_changes() == (NodePut(node),)
     assert mapper.take_changes() == (), "each change leaves once"
@@ -50,10 +49,8 @@ def test_an_edge_is_the_drive_between_two_views(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
     first = drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025)))
     mapper.finish(first)
-    mapper.use_extracted()
     second = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
     mapper.finish(second)
-    mapper.use_extracted()
     (edge,) = mapper.map.edges.values()
     a, b = mapper.map.nodes[edge.a], mapper.map.nodes[edge.b]
     assert abs(edge.a_from_b.mean.x - 0.5) < 0.01
@@ -75,11 +72,9 @@ def test_a_camera_found_further_ahead_moves_the_robot_and_no_landmark(walls, des
     known = replace(description, camera=replace(description.camera, mount_forward=mounted))
     mapper.recalibrate(known, Lens(known.camera, known.distortion), Pose2(-forward))
     mapper.finish(first)
-    mapper.use_extracted()
     assert mapper.map_from_robot.mean.x == pytest.approx(0.5 - forward, abs=0.01)
     second = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
     mapper.finish(second)
-    mapper.use_extracted()
     a, b = mapper.map.nodes.values()
     assert b.map_from_robot.mean.distance(Pose2(0.5 - forward)) < 0.015
     (edge,) = mapper.map.edges.values()
@@ -101,8 +96,7 @@ def test_a_view_without_features_gives_no_node(walls, description):
         if not mapper.started:
             mapper.begin(observation)
     assert mapper.anchor_features == 0
-    mapper.finish(observation)
-    mapper.use_extracted()
+    assert not mapper.finish(observation)
     assert mapper.take_changes() == ()
     assert not mapper.map.nodes
 
@@ -111,7 +105,6 @@ def test_standing_still_gives_no_depth(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
     last = drive(mapper, walls, [0.0] * 30)
     mapper.finish(last)
-    mapper.use_extracted()
     assert not mapper.map.nodes
 
 

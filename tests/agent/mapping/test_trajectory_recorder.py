@@ -97,7 +97,6 @@ def test_a_mapped_drive_records_the_trajectory(walls, clocked):
             mapper.begin(observation)
         before = Pose2(x)
     mapper.finish(observation)
-    mapper.use_extracted()
     (node,) = mapper.map.nodes.values()
     ticks = np.rint((node.segment.ages * 1e9 + node.stamp_ns) / 1e8).astype(int)
     assert len(ticks) == 3 and (np.diff(ticks) == 10).all()
@@ -107,5 +106,4 @@ def test_a_mapped_drive_records_the_trajectory(walls, clocked):
     assert node.segment.distances[:, 0] == pytest.approx(true + clocked.radius)
     # The next node begins with none of it.
     mapper.finish(replace(observation, stamp_ns=observation.stamp_ns + 1))
-    mapper.use_extracted()
     assert sum(len(one.segment) for one in mapper.map.nodes.values()) == 3
