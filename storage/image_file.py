@@ -20,6 +20,8 @@ MAX_SEGMENTS = 1024
 """Segments of a JPEG before its image. Phones write tens; Exif and colour profiles at most 255 each."""
 MAX_SCANS = 20
 """Scans of a progressive JPEG. Encoders write about ten; each one costs a pass over all pixels."""
+BARE = (0x00, 0x01, *range(0xD0, 0xDA))
+"""Markers of a JPEG that have no segment: none belongs before the image."""
 PNG = b"\x89PNG\r\n\x1a\n"
 PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 
@@ -133,6 +135,9 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
         if at + 9 > len(data) or data[at] != 0xFF:
             break
         kind = data[at + 1]
+        if kind in BARE:
+            # The decoder goes on behind such a marker: what is skipped here could hide a frame of gigabytes.
+            break
         # Start of frame, except the tables that have numbers in between.
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", data[at + 5 : at + 9])

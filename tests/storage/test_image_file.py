@@ -80,6 +80,21 @@ def test_a_png_whose_chunk_claims_gigabytes_is_not_decoded(chunk, monkeypatch):
         decode_grey(begin + struct.pack(">I", 0x7FFFFFF0) + chunk + bytes(40))
 
 
+@pytest.mark.parametrize("marker", [0x00, 0x01, 0xD0, 0xD7, 0xD8, 0xD9])
+def test_a_frame_hidden_behind_a_bare_marker_is_not_decoded(marker, monkeypatch):
+    """The decoder sees a segment where a reader of the head skipped one: an image of 16000x16000 px."""
+    data = cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes()
+    at = data.index(b"\xff\xc0")
+    end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    frame = data[at:end]
+    large = frame[:5] + struct.pack(">HH", 16_000, 16_000) + frame[9:]
+    hidden = large + data[2:at] + b"\xff\xfe" + struct.pack(">H", 2 + len(frame))
+    skipped = bytes([0xFF, marker]) + struct.pack(">H", 2 + len(hidden))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(InvalidValue, match="send a JPEG or PNG image"):
+        decode_grey(data[:2] + skipped + hidden + frame + data[end:])
+
+
 def test_a_bomb_in_a_recording_is_not_decoded(tmp_path, monkeypatch):
     path = tmp_path / "1.png"
     path.write_bytes(png(20_000, 2_600))
