@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mapweave.agent.mapping.view import RawImage
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
-from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError
+from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.view_image import ViewImage, ViewRequest
 from mapweave.storage.atomic_file import read_whole, write_whole
@@ -49,7 +49,7 @@ class ViewKeeper:
         """
         self._agent, self._folder = agent, folder
         self._kept: dict[NodeId, Path] = {}
-        self._failure = ""
+        self._failed = False
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._tasks.put(self._look)
         self._thread = threading.Thread(target=self._work, name="views", daemon=True)
@@ -94,12 +94,12 @@ class ViewKeeper:
         while (task := self._tasks.get()) is not None:
             try:
                 task()
-                self._failure = ""
-            except (MapweaveError, OSError) as error:
+            except Exception as error:  # noqa: BLE001 - a thread that ends without a word answers no one again
                 # A disk that stays full is reported once.
-                if not self._failure:
-                    log.warning("an image of a node is not kept: %s", error)
-                self._failure = str(error)
+                if not self._failed:
+                    words = " ".join(str(error).split()) or type(error).__name__
+                    log.warning("an image of a node is not kept: %s", words)
+                self._failed = True
 
     def _look(self) -> None:
         """Find what was kept before, the oldest first."""
@@ -117,6 +117,8 @@ class ViewKeeper:
         self._folder.mkdir(parents=True, exist_ok=True)
         path = self._folder / f"{node}{SUFFIX}"
         write_whole(path, jpeg)
+        # Not with each task: an answer says nothing of what can be written.
+        self._failed = False
         self._kept[node] = path
         while len(self._kept) > MOST_VIEWS:
             self._remove(next(iter(self._kept)))

@@ -167,11 +167,26 @@ def test_a_full_disk_is_reported_once(begin: Robot, hub, image, monkeypatch, cap
         patched.setattr(view_keeper, "write_whole", full)
         for number in range(3):
             keeper.keep([(node(number), image)], [])
-        eventually(lambda: "r0.1.0.jpg: cannot be written" in caplog.text)
-        assert kept(hub, node(2)) == b""
+            # That someone asks meanwhile does not make the disk good.
+            assert kept(hub, node(number)) == b""
+        assert "r0.1.0.jpg: cannot be written" in caplog.text
     keeper.keep([(node(4), image)], [])
     assert kept(hub, node(4))
     assert len(caplog.records) == 1
+
+
+def test_an_image_that_cannot_be_encoded_ends_nothing(begin: Robot, hub, image, monkeypatch, caplog) -> None:
+    def broken(pixels: np.ndarray, camera: object) -> bytes:
+        raise cv2.error("OpenCV(4.0)\nassertion failed")
+
+    keeper = begin()
+    with monkeypatch.context() as patched:
+        patched.setattr(view_keeper, "view_file", broken)
+        keeper.keep([(node(1), image)], [])
+        assert kept(hub, node(1)) == b""
+    assert "not kept: OpenCV(4.0) assertion failed" in caplog.text
+    keeper.keep([(node(2), image)], [])
+    assert kept(hub, node(2))
 
 
 def test_what_is_no_question_is_refused(begin: Robot, hub) -> None:
