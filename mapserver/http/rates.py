@@ -32,8 +32,8 @@ class Rates:
         self._rate, self._clock = rate, clock
         self._buckets: dict[str, TokenBucket] = {}
 
-    def ask(self, who: str) -> None:
-        """Someone asks.
+    def ask(self, who: str, questions: int = 1) -> None:
+        """Someone asks so many questions at once; refused ones do not count.
 
         Raises:
             HTTPException: 429, that one asks too much.
@@ -44,9 +44,9 @@ class Rates:
             if len(self._buckets) >= MOST_PEOPLE:
                 del self._buckets[next(iter(self._buckets))]
             bucket = self._buckets[who] = TokenBucket(self._rate, now)
-        wait = bucket.wait(1.0, now)
+        wait = bucket.wait(questions, now)
         if wait <= 0.0:
-            bucket.spend(1.0, now)
+            bucket.spend(questions, now)
             return
         seconds = math.ceil(wait)
         raise HTTPException(

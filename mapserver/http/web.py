@@ -245,9 +245,9 @@ class Questions:
             self._open += 1
             try:
                 if question != PUBLIC:
-                    person = request.scope[PERSON] = self._access.check(request, question)
+                    request.scope[PERSON] = self._access.check(request, question)
                     if question in LIMITED:
-                        self._rates.ask(person.name or address_of(request))
+                        self._rates.ask(_asker(request))
                 content = await answer(request)
                 return content if isinstance(content, Response) else Reply(content)
             except HTTPException as error:
@@ -346,7 +346,11 @@ class Questions:
     async def _explain(self, request: Request) -> Mapping[str, Any]:
         path, query, resolve = request.url.path, request.query_params, self._server.resolve
         asked = await run_in_threadpool(read_questions, path, query, resolve)
-        first, *more = [await self._result(partial(self._server.explain, one)) for one in asked]
+        if more_legs := len(asked) - 1:
+            # Each leg of a route is as much work as a question of its own; one is counted already.
+            self._rates.ask(_asker(request), more_legs)
+        async with asyncio.timeout(self._patience):
+            first, *more = [await self._result(partial(self._server.explain, one)) for one in asked]
         values = await run_in_threadpool(json_values, route_over([first, *more]) if more else first)
         if isinstance(first, PairExplanation):
             nodes = (first.a.id, first.b.id)
@@ -365,6 +369,11 @@ class Questions:
         """Ask on a thread, since in lock-step the asking thread does the work; then wait for the answer."""
         async with asyncio.timeout(self._patience):
             return await asyncio.wrap_future(await run_in_threadpool(ask))
+
+
+def _asker(request: Request) -> str:
+    """By whom questions are counted."""
+    return request.scope[PERSON].name or address_of(request)
 
 
 def _author(request: Request) -> str:

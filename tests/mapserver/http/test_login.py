@@ -386,6 +386,23 @@ def test_one_who_asks_without_end_gets_the_time_to_retry_and_no_other_waits(
         assert keyed.ask("GET", "/explain", "otto") == 429
 
 
+def test_a_route_counts_as_many_questions_as_it_has_legs(
+    tmp_path: Path, services: StubServices, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else one question by way of sixteen places would be worth seventeen."""
+    now = 0.0
+    monkeypatch.setattr("mapweave.mapserver.http.web.Rates", lambda: Rates(clock=lambda: now))
+    keyed = Keyed(tmp_path / "keys", services)
+    way = "/route?a=r0.1.1&b=r1.1.1" + 15 * "&via=r1.1.7"
+    with keyed.web:
+        asked = [keyed.ask("GET", way, "otto") for _ in range(4)]
+        assert asked == [200, 200, 429, 429]
+        assert keyed.ask("GET", way, "vera") == 200
+        # A way that is refused takes nothing away from the next attempt, but for itself.
+        now = 5.5
+        assert keyed.ask("GET", way, "otto") == 200
+
+
 def test_without_keys_addresses_have_rates() -> None:
     now = 0.0
     rates = Rates(clock=lambda: now)
