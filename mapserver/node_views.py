@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 
-from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
+from mapweave.hybridmap.errors import Busy, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.view_image import ViewImage, ViewRequest
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -19,6 +19,8 @@ PATIENCE = 1.0
 """How long a robot may take to answer, s."""
 MOST_CACHED = 256
 """Images in memory, 16 MiB at most."""
+MOST_ASKED = 8
+"""Questions to robots at once: one that hangs must not hold up all that people ask of the server."""
 
 
 class NoView(MapweaveError):
@@ -40,6 +42,7 @@ class NodeViews:
         self._agents: set[str] = set()
         self._cache: OrderedDict[NodeId, bytes] = OrderedDict()
         self._turn = threading.Lock()
+        self._asking = threading.BoundedSemaphore(MOST_ASKED)
         self._watching = bus.watch(keys.views(), self._see)
 
     def close(self) -> None:
@@ -56,6 +59,7 @@ class NodeViews:
         Raises:
             InvalidValue: there is no such node.
             NoView: the robot is away, has kept none, or does not answer with one.
+            Busy: too many wait for robots, or the robot's disk is busy.
         """
         merged = self._merged()
         merged.check(node)
@@ -66,10 +70,14 @@ class NodeViews:
         if node.agent not in self._agents:
             raise NoView(f"{node.agent} is away, or keeps no views")
         camera = merged.maps[node.map].nodes[node].camera
+        if not self._asking.acquire(blocking=False):
+            raise Busy(PATIENCE)
         try:
             jpeg = checked_view(self._asked(node), camera)
         except (InvalidMessage, InvalidValue) as error:
             raise NoView(f"what {node.agent} gave as its view of {node} is refused: {error}") from None
+        finally:
+            self._asking.release()
         with self._turn:
             self._cache[node] = jpeg
             while len(self._cache) > MOST_CACHED:
@@ -79,15 +87,17 @@ class NodeViews:
     def _asked(self, node: NodeId) -> bytes:
         """What its robot gives."""
         key, question = self._keys.view(node.agent), encode(ViewRequest(node))
-        reason = f"{node.agent} does not answer"
+        reason, retry_after = f"{node.agent} does not answer", 0.0
         for reply in self._bus.ask(key, question, PATIENCE, lambda reply: not reply.error):
             if reply.error:
-                reason = reply.error.removeprefix("refused: ")
+                reason, retry_after = reply.error.removeprefix("refused: "), reply.retry_after
                 continue
             answer = decode(reply.payload, ViewImage)
             if answer.node != node:
                 raise InvalidMessage(f"it is of {answer.node}")
             return answer.jpeg
+        if retry_after > 0.0:
+            raise Busy(retry_after)
         raise NoView(reason)
 
     def _see(self, key: str, alive: bool) -> None:

@@ -341,6 +341,7 @@ class MapServer:
         Raises:
             InvalidValue: there is no such node.
             NoView: its robot is away, or has kept none.
+            Busy: it may be had later.
         """
         return self._views.view(node)
 

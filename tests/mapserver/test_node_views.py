@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.view_image import MAX_BYTES, ViewImage, ViewRequest
 from mapweave.mapserver import node_views
@@ -32,9 +33,9 @@ class HandRobot:
     """Gives what the test says, and counts how often it was asked."""
 
     def __init__(self, hub: MemoryHub, name: str = "r0") -> None:
-        self.bus = MemoryBus(hub)
+        self.hub, self.bus = hub, MemoryBus(hub)
         self.asked: list[NodeId] = []
-        self.gives: Callable[[NodeId], bytes | str | None] = lambda node: encode(ViewImage(node, JPEG))
+        self.gives: Callable[[NodeId], bytes | str | Busy | None] = lambda node: encode(ViewImage(node, JPEG))
         self.bus.serve(KEYS.view(name), self._answer)
         self.bus.announce(KEYS.view(name))
 
@@ -46,6 +47,8 @@ class HandRobot:
         given = self.gives(self.asked[-1])
         if isinstance(given, str):
             request.refuse(given)
+        elif isinstance(given, Busy):
+            request.refuse(str(given), given.retry_after)
         elif given is not None:
             request.reply(given)
 
@@ -139,6 +142,35 @@ def test_the_view_of_another_node_is_refused(views: NodeViews, robot: HandRobot)
     robot.gives = lambda node: encode(ViewImage(OTHER, JPEG))
     with pytest.raises(NoView, match=f"it is of {OTHER}"):
         views.view(NODE)
+
+
+def test_a_robot_that_hangs_holds_up_few_people(
+    views: NodeViews, robot: HandRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(node_views, "PATIENCE", 60.0)
+    held: list[Request] = []
+    robot.bus.close()
+    robot.bus = MemoryBus(robot.hub)
+    robot.bus.serve(KEYS.view("r0"), held.append)
+    robot.bus.announce(KEYS.view("r0"))
+    eventually(lambda: views.may_have(NODE))
+    with ThreadPoolExecutor(node_views.MOST_ASKED) as people:
+        waiting = [people.submit(views.view, NODE) for _ in range(node_views.MOST_ASKED)]
+        eventually(lambda: len(held) == node_views.MOST_ASKED)
+        with pytest.raises(Busy):
+            views.view(NODE)
+        for request in held:
+            request.reply(encode(ViewImage(NODE, JPEG)))
+        assert len({one.result(60.0) for one in waiting}) == 1
+    assert views.view(NODE)
+
+
+def test_a_busy_robot_is_asked_again_later(views: NodeViews, robot: HandRobot) -> None:
+    """That it has no view would be wrong."""
+    robot.gives = lambda node: Busy(3.0)
+    with pytest.raises(Busy) as refused:
+        views.view(NODE)
+    assert refused.value.retry_after == pytest.approx(3.0)
 
 
 def test_why_there_is_none(hub: MemoryHub, views: NodeViews, monkeypatch: pytest.MonkeyPatch) -> None:
