@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from mapweave.storage.database_reader import reading
 from mapweave.wire.codec import element_of
 from mapweave.wire.keys import check_epoch
 
+MOST_LOOKUPS = 1_000_000
+"""Changes that are looked up one by one, some ten seconds: a damaged number may be any."""
 COLUMNS = "SELECT epoch, sequence, element, put, body, crc FROM change"
 
 Row = tuple[int, int, int, int, bytes, int]
@@ -44,7 +47,7 @@ def salvage(path: Path) -> SalvagedJournal:
     with reading(path, "agent journal") as connection:
         owners, owner_error = _read(connection, "SELECT agent FROM owner")
         maps, maps_error = _read(connection, "SELECT epoch FROM map ORDER BY epoch")
-        rows, rows_error = _changes(connection)
+        rows, rows_error = _changes(connection, [epoch for (epoch,) in maps if _is_epoch(epoch)])
     error = owner_error or maps_error or rows_error
     agent = _agent(rows.values(), owners)
     if not agent:
@@ -68,23 +71,41 @@ def _read(connection: sqlite3.Connection, query: str, *values: object) -> tuple[
     return rows, ""
 
 
-def _changes(connection: sqlite3.Connection) -> tuple[dict[tuple[int, int], Row], str]:
-    """Rows that have the types of the schema, by epoch and sequence; and why some cannot be read."""
+def _changes(connection: sqlite3.Connection, epochs: Iterable[int]) -> tuple[dict[tuple[int, int], Row], str]:
+    """Rows that have the types of the schema, by epoch and sequence; and why some cannot be read.
+
+    Args:
+        connection: to the journal.
+        epochs: of maps that are known otherwise.
+    """
     found, error = _read(connection, f"{COLUMNS} ORDER BY epoch, sequence")
-    if error:
-        found += _read(connection, f"{COLUMNS} ORDER BY epoch DESC, sequence DESC")[0]
-    rows = {(row[0], row[1]): row for row in found if _is_row(row)}
-    if error:
-        # A page that cannot be read stops a scan from either end; what lies between is looked up one by one.
-        heads: dict[int, int] = {}
-        for epoch, sequence in rows:
-            heads[epoch] = max(heads.get(epoch, 0), sequence)
-        for epoch, head in heads.items():
-            for sequence in range(1, head):
-                if (epoch, sequence) not in rows:
-                    one, _ = _read(connection, f"{COLUMNS} WHERE epoch = ? AND sequence = ?", epoch, sequence)
-                    rows.update({(row[0], row[1]): row for row in one if _is_row(row)})
+    rows = _by_number(found)
+    if not error:
+        return rows, ""
+    # A page that cannot be read stops a scan from either end: each map is scanned from both of its ends.
+    rows |= _by_number(_read(connection, f"{COLUMNS} ORDER BY epoch DESC, sequence DESC")[0])
+    for epoch in {*epochs, *(epoch for epoch, _ in rows)}:
+        for order in ("ASC", "DESC"):
+            query = f"{COLUMNS} WHERE epoch = ? ORDER BY sequence {order}"
+            rows |= _by_number(_read(connection, query, epoch)[0])
+    heads: dict[int, int] = {}
+    for epoch, sequence in rows:
+        heads[epoch] = max(heads.get(epoch, 0), sequence)
+    # What lies between is looked up one by one, the shortest map first: a damaged head is most probably long.
+    missing = (
+        (epoch, sequence)
+        for epoch, head in sorted(heads.items(), key=lambda item: item[1])
+        for sequence in range(1, head)
+        if (epoch, sequence) not in rows
+    )
+    query = f"{COLUMNS} WHERE epoch = ? AND sequence = ?"
+    for number in islice(missing, MOST_LOOKUPS):
+        rows |= _by_number(_read(connection, query, *number)[0])
     return rows, error
+
+
+def _by_number(found: Iterable[Row]) -> dict[tuple[int, int], Row]:
+    return {(row[0], row[1]): row for row in found if _is_row(row)}
 
 
 def _is_row(row: tuple[Any, ...]) -> bool:

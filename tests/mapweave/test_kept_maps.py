@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import pytest
 
 from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.replication import salvage
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
@@ -246,6 +249,56 @@ def test_what_is_left_of_a_damaged_journal_is_extracted_and_the_agent_says_how(t
     missing = sorted(set(range(1, 2001)) - {node.number for node in left.nodes})
     runs = [a for a, b in zip(missing, [*missing[1:], 0], strict=True) if b != a + 1]
     assert len(runs) == 2 and len(missing) < 100
+
+
+def with_broken_pages(path: Path, *changes: tuple[int, int]) -> None:
+    """Break the pages that have the changes, each given by epoch and sequence."""
+    with closing(sqlite3.connect(path)) as connection:
+        query = "SELECT body FROM change WHERE epoch = ? AND sequence = ?"
+        bodies = [connection.execute(query, one).fetchone()[0] for one in changes]
+    data = bytearray(path.read_bytes())
+    for body in bodies:
+        page = data.index(body) // 4096 * 4096
+        data[page : page + 4096] = bytes(4096)
+    path.write_bytes(data)
+
+
+def two_maps(path: Path) -> Path:
+    """A journal with two maps of 400 nodes."""
+    journal, (put,) = Journal(path, "r0"), one_node()
+    for epoch in (1, 2):
+        nodes = [replace(put, node=replace(put.node, id=NodeId("r0", epoch, k))) for k in range(1, 401)]
+        journal.append(journal.open_map(epoch), nodes, 0)
+    journal.close()
+    return path
+
+
+def left_in(path: Path) -> list[list[int]]:
+    """The nodes of each map of which nothing can be read."""
+    maps = salvage.salvage(path).maps.values()
+    known = [{node.number for node in HybridMap(kept.contents).nodes} for kept in maps]
+    return [sorted(set(range(1, 401)) - one) for one in known]
+
+
+def test_what_lies_between_damaged_pages_of_two_maps_is_read(tmp_path):
+    """From neither end is the end of the first map reached, nor the begin of the second one."""
+    path = two_maps(tmp_path / "r0.sqlite")
+    with_broken_pages(path, (1, 100), (2, 300))
+    first, second = left_in(path)
+    assert 100 in first and 300 in second
+    assert max(*map(len, (first, second)), first[-1] - first[0], second[-1] - second[0]) < 30
+
+
+def test_a_damaged_number_does_not_make_a_salvage_endless(tmp_path, monkeypatch):
+    """Each number below it would be looked up; those of maps that are as long as they say come first."""
+    monkeypatch.setattr(salvage, "MOST_LOOKUPS", 1000)
+    path = two_maps(tmp_path / "r0.sqlite")
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("UPDATE change SET sequence = 1 << 60 WHERE epoch = 1 AND sequence = 400")
+    with_broken_pages(path, (1, 100), (2, 100), (2, 300))
+    first, second = left_in(path)
+    assert 100 in first and {100, 300} <= set(second)
+    assert len(first) < 30 and len(second) < 60
 
 
 def test_a_journal_of_which_nothing_can_be_read_is_one_line(tmp_path, capfd):
