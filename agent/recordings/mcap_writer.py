@@ -205,7 +205,8 @@ class _Part:
             header = self._header(stamp, BASE)
             self._put("/kidnap_status", KIDNAP_TYPE, stamp, header=header, is_kidnapped=self._kidnapped)
         d = self._description
-        for k, (distance, _) in enumerate(zip(observation.proximity, d.ranger_bearings, strict=True)):
+        # There are none while the sensors have failed.
+        for k, distance in enumerate(observation.proximity):
             self._put(
                 f"/proximity/{k}", "sensor_msgs/msg/Range", stamp,
                 header=self._header(stamp, f"proximity_{k}"), radiation_type=1, field_of_view=0.1,

@@ -81,6 +81,27 @@ def test_what_a_robot_recorded_is_replayed_as_it_sensed_it(drive: Drive, tmp_pat
         )
 
 
+def test_failed_proximity_sensors_do_not_end_a_recording(drive: Drive, tmp_path: Path) -> None:
+    """A driver gives no readings then, see `mapweave.agent.drivers.checked`."""
+
+    class Blind(Driven):
+        def sense(self) -> Observation | None:
+            seen = super().sense()
+            failed = seen is not None and seen.stamp_ns in drive.stamps_ns[2:5]
+            return replace(seen, proximity=np.zeros(0)) if seen is not None and failed else seen
+
+    robot, lines = Blind(drive), list[str]()
+    recorded = RecordedRobot(robot, tmp_path / "walk", False, lines.append)
+    recorded.describe()
+    while recorded.sense() is not None:
+        recorded.act(Command())
+    recorded.close()
+    assert lines == [] and recorded.written == COUNT
+    with AnyReader([tmp_path / "walk" / "walk_0"]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    assert counts["/odom"] == COUNT and counts["/proximity/0"] == counts["/proximity/1"] == COUNT - 3
+
+
 def test_a_fisheyes_recording_names_its_lens_as_ros_does(drive: Drive, tmp_path: Path) -> None:
     fisheye = Equidistant(115.0, 115.5, 158.7, 120.9, (-0.02, 0.004, -0.003, 0.0005))
     ideal = fisheye.ideal(320, 240, drive.camera.mount_height)
@@ -158,7 +179,7 @@ def test_a_recording_overwrites_nothing(drive: Drive, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, tmp_path: Path) -> None:
-    """One reading instead of two. What came before is kept, and the robot goes on."""
+    """No number in the place of a reading. What came before is kept, and the robot goes on."""
     lines: list[str] = []
     robot = Driven(drive)
     recorded = RecordedRobot(robot, tmp_path / "walk", print_line=lines.append)
@@ -169,7 +190,7 @@ def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, t
         observation = whole()
         if observation is None or observation.stamp_ns <= drive.stamps_ns[4]:
             return observation
-        return replace(observation, proximity=np.ones(1))
+        return replace(observation, proximity=np.array([None, 1.0]))
 
     robot.sense = sense  # type: ignore[method-assign]
     assert len(list(iter(recorded.sense, None))) == COUNT
