@@ -153,6 +153,8 @@ def _driver(found: object, name: str) -> Driver:
             inspect.signature(found).bind(settings)
         except TypeError:
             raise DeviceError(f"driver {name}: __init__ must take one argument, the settings") from None
+        except ValueError:
+            pass  # a class of a compiled library may tell no signature
         try:
             robot: Robot = found(settings)
         except MapweaveError:

@@ -65,6 +65,15 @@ def test_a_class_in_a_file(tmp_path: Path) -> None:
     assert robot.settings is settings  # type: ignore[attr-defined]
 
 
+def test_a_class_that_tells_no_signature(tmp_path: Path) -> None:
+    """Classes of compiled libraries often tell none."""
+    path = tmp_path / "rover.py"
+    text = CLASS.replace("class Rover:", "class Rover(str):")
+    path.write_text("\n".join(line for line in text.splitlines() if "__init__" not in line))
+    settings = RobotSettings()
+    assert find_driver(f"{path}:Rover")(settings) == str(settings)
+
+
 @pytest.mark.parametrize(
     ("text", "name", "words"),
     [
