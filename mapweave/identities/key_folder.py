@@ -165,26 +165,32 @@ class KeyFolder:
         )  # fmt: skip
         new = not path.exists()
         path.mkdir(parents=True, exist_ok=True)
-        path.chmod(0o700)
         try:
-            # A full disk leaves nothing, and not an authority without a server: moving takes no room.
-            with locked(path), TemporaryDirectory(dir=path, prefix=".") as beside:
+            with locked(path):
                 if (path / CATALOGUE).exists():
                     raise SettingsError(
                         f"{path}: there are keys already; add to them with `mapweave keys add`"
                     )
-                try:
-                    cls._fill(Path(beside), catalogue, server)
-                except InvalidFile as error:
-                    raise InvalidFile(str(error).replace(str(Path(beside).resolve()), str(path))) from None
-                for file in sorted(Path(beside).iterdir(), key=lambda file: file.name == CATALOGUE):
-                    file.replace(path / file.name)
+                path.chmod(0o700)
+                cls._make(path, catalogue, server)
         except BaseException:
             if new:
                 with suppress(OSError):
                     path.rmdir()
             raise
         return cls(path)
+
+    @classmethod
+    def _make(cls, path: Path, catalogue: Catalogue, server: str) -> None:
+        """Write all files, or none."""
+        # A full disk leaves nothing, and not an authority without a server: moving takes no room.
+        with TemporaryDirectory(dir=path, prefix=".") as beside:
+            try:
+                cls._fill(Path(beside), catalogue, server)
+            except InvalidFile as error:
+                raise InvalidFile(str(error).replace(str(Path(beside).resolve()), str(path))) from None
+            for file in sorted(Path(beside).iterdir(), key=lambda file: file.name == CATALOGUE):
+                file.replace(path / file.name)
 
     @classmethod
     def _fill(cls, path: Path, catalogue: Catalogue, server: str) -> None:

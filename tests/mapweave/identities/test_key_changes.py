@@ -78,6 +78,14 @@ def test_tokens_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
     assert {name: names.count(name) for name in names} == {"r0": 10, "r2": 10, "s0": 10}
 
 
+def test_to_make_keys_again_changes_nothing(folder: KeyFolder) -> None:
+    """The mode of the folder neither: the server of another user may read it by its group."""
+    folder.path.chmod(0o750)
+    with pytest.raises(SettingsError, match="there are keys already"):
+        KeyFolder.create(folder.path, "demo", Profile.LAB, [], "s0")
+    assert folder.path.stat().st_mode & 0o777 == 0o750
+
+
 def test_of_two_authorities_at_once_one_is_made(tmp_path: Path) -> None:
     create = (
         "try:\n    KeyFolder.create(path, 'demo', Profile.PRODUCTION, [], 's0')\n"
