@@ -40,7 +40,7 @@ class VisualMotion(NamedTuple):
 
 
 def visual_motion(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Camera) -> VisualMotion | None:
-    """Compare two grey images (H, W) of a camera; None if there is too little to follow."""
+    """Compare two grey images (H, W) of a camera, both possibly reduced; None if there is too little to follow."""
     start = cv2.goodFeaturesToTrack(before, POINTS, 0.01, 7)
     if start is None or len(start) < LEAST_POINTS:
         return None
@@ -53,7 +53,9 @@ def visual_motion(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Cam
     good = (found[:, 0] == 1) & (found_back[:, 0] == 1) & (np.linalg.norm(back - start, axis=2)[:, 0] < 1.0)
     if good.sum() < LEAST_POINTS:
         return None
-    middle, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+    reduced = np.array(before.shape[::-1]) / (camera.width, camera.height)
+    middle = (np.array([camera.cx, camera.cy]) + 0.5) * reduced - 0.5
+    focal = np.array([camera.fx, camera.fy]) * reduced
     first = (start[good, 0].astype(np.float64) - middle) / focal
     flow = (there[good, 0].astype(np.float64) - middle) / focal - first
     x, y = first.T
