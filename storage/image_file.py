@@ -23,7 +23,8 @@ MAX_SCANS = 20
 BARE = (0x00, 0x01, *range(0xD0, 0xDA))
 """Markers of a JPEG that have no segment: none belongs before the image."""
 PNG = b"\x89PNG\r\n\x1a\n"
-PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
+PNM = re.compile(rb"P[1-6](?:\s|#[^\r\n]*[\r\n])+(\d{1,9})\s(?:\s|#[^\r\n]*[\r\n])*(\d{1,9})\s")
+"""As the decoder reads it. What stands between the numbers must match in one way, or this takes for ever."""
 
 
 def read_grey(path: Path, camera: Camera | None = None, source: str = "the camera") -> NDArray[np.uint8]:

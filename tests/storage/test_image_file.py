@@ -105,6 +105,23 @@ def test_a_bomb_in_a_recording_is_not_decoded(tmp_path, monkeypatch):
         read_grey(path, CAMERA)
 
 
+@pytest.mark.parametrize(
+    "head",
+    [b"P5 #\r16000 16000 255\n64 48\n255\n", b"P5 64#16000 255\n48\n255\n", b"P5" + 4000 * b" " + b"x"],
+    ids=["hidden in a comment", "hidden behind a number", "blanks"],
+)
+def test_a_pgm_is_refused_at_once_unless_its_size_is_plain(head, monkeypatch):
+    """The decoder ends a comment at each line end, and knows none right behind a number."""
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(InvalidValue):
+        decode_grey(head + bytes(64 * 48))
+
+
+@pytest.mark.parametrize("head", [b"P5 64 48 255\n", b"P5\n# by GIMP\n64 # wide\n#\n48\n255\n"])
+def test_a_pgm_may_have_comments(head):
+    assert decode_grey(head + bytes(64 * 48)).shape == (48, 64)
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".pgm", ".bmp"])
 @pytest.mark.parametrize("size", [(48, 64), (5, 3)])
 def test_the_size_is_read_from_the_head(size, suffix):
