@@ -13,6 +13,8 @@ NANOSECONDS = 1_000_000_000
 FORMS = (
     "write 14:00, 2026-03-01 14:00 (local time), 2026-03-01 14:00 UTC, 2026-03-01T14:00+01:00, or +2h, +30min"
 )
+LONGEST = 64
+"""Characters of a time. Of a longer text of blanks the expressions below would take hours."""
 CLOCK = re.compile(r"(\d{1,2}):(\d{2})")
 LATER = re.compile(r"\+(\d+(?:\.\d+)?)\s*(min|h|d)")
 HOURS = {"min": 1.0 / 60.0, "h": 1.0, "d": 24.0}
@@ -39,6 +41,8 @@ def read_time(text: str, now_ns: int, zone: tzinfo | None = None) -> int:
     Raises:
         InvalidValue: it is no time.
     """
+    if len(text) > LONGEST:
+        raise InvalidValue(f"{text[:LONGEST]!r}... is no time: {FORMS}")
     words, now = text.strip(), datetime.fromtimestamp(now_ns / NANOSECONDS, UTC).astimezone(zone)
     if (later := LATER.fullmatch(words)) is not None:
         hours = float(later[1]) * HOURS[later[2]]

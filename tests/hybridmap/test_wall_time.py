@@ -48,3 +48,10 @@ def test_what_is_no_time_is_refused(text) -> None:
 def test_a_time_is_written_in_both_zones() -> None:
     assert utc_words(NOW_NS) == "2026-03-01 13:30 UTC"
     assert local_words(NOW_NS, EAST) == "2026-03-01 15:30 +0200"
+
+
+def test_a_long_text_is_refused_at_once() -> None:
+    """It may come over HTTP, with megabytes of blanks."""
+    with pytest.raises(InvalidValue, match=r"is no time") as refused:
+        read_time("a" + 500_000 * " " + "az", 0)
+    assert len(str(refused.value)) < 300
