@@ -121,7 +121,7 @@ class MissionControl:
         if order.robot != self._robot:
             raise InvalidValue(f"a mission of {order.robot} came to {self._robot}")
         with self._lock:
-            if self._refusal:
+            if self._refusal and order.id not in self._reports:
                 report = self._note(MissionReport(order, MissionState.REFUSED, 0.0, self._refusal))
             else:
                 report = self._taken(order)

@@ -247,3 +247,6 @@ def test_a_recording_takes_no_orders() -> None:
     assert isinstance(control.next(True, 0.0, None), Carried)
     held = control.report
     assert held is not None and held.order.kind is MissionKind.CARRIED
+    # Nor in the place of the mission that holds, by its id.
+    again = control.take(order(2**62, MissionKind.STOP, held.order.id))
+    assert again == control.report == held
