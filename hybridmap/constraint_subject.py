@@ -21,7 +21,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import MAX_STAMP_NS, Key, LandmarkCount, Stamp
 from mapweave.hybridmap.node import NUMBER, MapId, Node, NodeId, check_name
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
-from mapweave.hybridmap.wall_time import NANOSECONDS, read_time
+from mapweave.hybridmap.wall_time import LONGEST, NANOSECONDS, read_time
 
 Ends = tuple[NodeId, NodeId] | tuple[MapId, MapId]
 """Two nodes, or two maps; the smaller first."""
@@ -352,7 +352,7 @@ def read_window(
     """
     stamps = []
     for word, default in ((begin, 0), (end, MAX_STAMP_NS)):
-        if isinstance(word, int) or word.isdecimal():
+        if isinstance(word, int) or (word.isdecimal() and len(word) <= LONGEST):
             stamps.append(min(int(word), MAX_STAMP_NS))
         else:
             stamps.append(read_time(word, now_ns, zone) if word else default)

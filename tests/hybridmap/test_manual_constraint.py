@@ -139,6 +139,7 @@ def test_subjects_as_people_write_them() -> None:
     for wrong in (
         lambda: read_retired(["a.1", "b.1"]), lambda: read_retired([]), lambda: read_corner("1;2"),
         lambda: read_pose([1.0, float("nan"), 0.0]), lambda: read_window(A.map, "noon", "", 0),
+        lambda: read_window(A.map, 5000 * "9", "", 0),
         lambda: read_window(A.map, 5, 4, 0), lambda: Area(A, ((0.0, 0.0), (1.0, 0.0), (1e5, 1.0))),
     ):  # fmt: skip
         with pytest.raises(InvalidValue):
