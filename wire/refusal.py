@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 
+from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.wire.bus import Reply
 
 MARK = b"refused: "
@@ -26,10 +27,11 @@ def encode_refusal(reason: str, retry_after: float = 0.0) -> bytes:
 
 
 def decode_refusal(data: bytes) -> Reply | None:
-    """What a server refused; None for what is no server's word."""
+    """What a server or robot refused, in words that a message can hold; None for what is none's word."""
     if not data.startswith(MARK):
         return None
     words, _, pause = data[len(MARK) :].partition(_END)
     (seconds,) = struct.unpack("<f", pause) if len(pause) == 4 else (0.0,)
     usable = math.isfinite(seconds) and 0.0 < seconds <= LONGEST_PAUSE
-    return Reply(error=words.decode(errors="replace") or "refused", retry_after=seconds if usable else 0.0)
+    reason = "".join(c if c.isprintable() else " " for c in words[: 4 * MAX_WORDS].decode(errors="replace"))
+    return Reply(error=reason[:MAX_WORDS] or "refused", retry_after=seconds if usable else 0.0)

@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.wire.bus import Reply
+from mapweave.wire.messages import decode, encode
 from mapweave.wire.refusal import LONGEST_PAUSE, MARK, decode_refusal, encode_refusal
 
 
@@ -34,8 +36,19 @@ def test_any_input_is_a_refusal_or_none(data: bytes) -> None:
     assert decode_refusal(data) is None or data.startswith(MARK)
     reply = decode_refusal(MARK + data)
     assert isinstance(reply, Reply)
-    assert reply.error
+    assert reply.error and reply.error.isprintable()
     assert 0.0 <= reply.retry_after <= LONGEST_PAUSE
+
+
+@pytest.mark.parametrize("reason", [b"line\nby\x1b[31m line", 10**6 * b"a", b"\n", b"\xff\xfe"])
+def test_a_reason_can_be_passed_on_in_a_message(reason: bytes) -> None:
+    """A robot may refuse with what no message may hold, and the record of missions holds its reason."""
+    reply = decode_refusal(MARK + reason)
+    assert reply is not None
+    report = MissionReport(
+        MissionOrder.new("r0", MissionKind.STOP, "anna"), MissionState.REFUSED, 0.0, reply.error
+    )
+    assert decode(encode(report), MissionReport) == report
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -1.0, 1e9, 0.0])
