@@ -197,7 +197,10 @@ class MissionRelay:
             if reply.error:
                 return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reply.error))
             try:
-                report = self._note(decode(reply.payload, MissionReport))
+                said = decode(reply.payload, MissionReport)
+                if (said.order.id, said.order.robot) != (order.id, order.robot):
+                    raise InvalidMessage(f"{order.robot} answers with the report of another mission")
+                report = self._note(said)
             except InvalidMessage as error:
                 return self._note(MissionReport(order, MissionState.REFUSED, 0.0, str(error)))
             if report.state is MissionState.RUNNING:

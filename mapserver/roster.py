@@ -16,6 +16,7 @@ from mapweave.hybridmap.agent_status import (
     RobotEntry,
     one_line,
 )
+from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.known_logs import Lag
@@ -163,6 +164,9 @@ class Roster:
     def _take(self, sample: Sample) -> None:
         robot = self._keys.parse_agent_status(sample.key)
         status = decode(sample.payload, AgentStatus)
+        named = {status.robot or robot, robot if status.mission is None else status.mission.order.robot}
+        if named != {robot}:
+            raise InvalidMessage(f"a status of {robot} is about {' and '.join(sorted(named - {robot}))}")
         with self._turn:
             if robot in self._heard or len(self._heard) < MAX_ROBOTS:
                 self._heard[robot] = status, self._clock()

@@ -9,18 +9,19 @@ from dataclasses import replace
 
 import pytest
 
-from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import mission_relay
 from mapweave.mapserver.http.same_site import is_loopback
 from mapweave.mapserver.http.web import Web
 from mapweave.storage.map_file import unpack_map_file
+from mapweave.wire.messages import encode
 from tests.mapserver.conftest import MappedRoom
-from tests.mapserver.house import House
+from tests.mapserver.house import KEYS, House
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)
@@ -119,6 +120,30 @@ def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch
 def test_a_robot_that_was_never_heard_of_gets_no_mission(house: House) -> None:
     with pytest.raises(InvalidValue, match="no robot r7 has been heard of"):
         house.person.explore("r7")
+
+
+def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
+    """Neither in its status, nor as the answer to an order of its own."""
+    link, control = house.robot()
+    report = house.person.explore("r0")
+    lie = MissionReport(replace(report.order, stamp_ns=report.order.stamp_ns + 1), MissionState.DONE, 1.0)
+    newer = replace(lie, order=replace(lie.order, id="newer"))
+    liar, gives = house.bus(), [lie]
+    liar.announce(KEYS.agent_alive(MapId("r1", 1)))
+    liar.serve(KEYS.mission("r1"), lambda request: request.reply(encode(gives[0])))
+    status = AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, "r1", 1)
+    liar.publish(KEYS.agent_status("r1"), encode(status))
+    eventually(lambda: house.entry("r1").status == status)
+    for gives[0] in (lie, newer):
+        for one in (replace(status, mission=gives[0]), replace(status, robot="r0")):
+            liar.publish(KEYS.agent_status("r1"), encode(one))
+        answer = house.person.explore("r1")
+        assert answer.state is MissionState.REFUSED and "report of another mission" in answer.reason
+    link.report(Status("standing", "", 7, 0, Pose2(), False), 2)
+    held = [one for one in house.person.missions("r0") if one.order.id == report.order.id]
+    assert held == [control.report] == [report]
+    assert house.entry("r1").status == status
+    link.close()
 
 
 def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
