@@ -15,6 +15,7 @@ from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
+    MAX_VIA,
     OPEN,
     MissionKind,
     MissionOrder,
@@ -138,6 +139,8 @@ class MissionRelay:
         report = None if status is None else status.mission
         stamp_ns = max(self._time_ns(), 0 if report is None else report.order.stamp_ns + 1)
         mission_id = check_name(mission_id) if mission_id else new_id()
+        if len(via) > MAX_VIA:
+            raise InvalidValue(f"a mission passes at most {MAX_VIA} places, not {len(via)}")
         return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal[:64], via)
 
     def hear(self, status: AgentStatus) -> None:
@@ -210,7 +213,13 @@ class MissionRelay:
         return self._note(MissionReport(order, MissionState.SENT, 0.0, reason))
 
     def _note(self, report: MissionReport) -> MissionReport:
-        """Keep a report, on the disk if the state is new; returns what holds."""
+        """Keep a report, on the disk if the state is new; returns what holds.
+
+        Raises:
+            InvalidValue: no message may hold it.
+        """
+        # Before it is kept: with it the whole record could be neither written nor sent, and no robot stopped.
+        encode(report)
         with self._turn:
             before = self._reports.get(report.order.id)
             if before is not None and not report.supersedes(before):

@@ -259,6 +259,12 @@ def test_a_robot_at_a_portal_takes_it_from_any_client_that_it_was_taken_through(
         ("/robots/R%200/stop", 400, "name"),
         ("/robots/r0/fly", 404, "there is no mission 'fly'"),
         ("/robots/r0/stop?id=No%20Name", 400, "name"),
+        ("/robots/r0/explore?by=a%0Ab", 400, "text must be one printable line"),
+        (
+            f"/robots/r0/go?goal={THERE}{17 * '&via=r0.1.2'}",
+            400,
+            "a mission passes at most 16 places, not 17",
+        ),
     ],
 )
 def test_over_http_nonsense_is_refused(house: House, path: str, status: int, reason: str) -> None:
@@ -267,7 +273,11 @@ def test_over_http_nonsense_is_refused(house: House, path: str, status: int, rea
         got, answer = ask(web, "POST", path)
         assert got == status and reason in answer["error"]
         assert ask(web, "GET", "/robots/r0/stop")[0] == 405
-    assert control.report is None
+        assert control.report is None and ask(web, "GET", "/missions")[1]["reports"] == []
+        # It has spoiled nothing: the robot can be stopped.
+        assert ask(web, "POST", "/robots/r0/stop")[0] == 200
+        assert len(house.person.missions()) == 1
+    assert control.report is not None
     link.close()
 
 
