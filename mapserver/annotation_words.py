@@ -55,6 +55,8 @@ def body_of_words(
         raise InvalidValue(f"there are no annotations of kind {kind!r}: {', '.join(BODIES)}")
     plain = dict(fields)
     corners, radius, near = (plain.pop(name, None) for name in ("corners", "radius", "near"))
+    if not isinstance(near, str | None):
+        raise InvalidValue(f"`near` is a node or the name of a place, not {near!r:.40}")
     for name in TIMES:
         if isinstance(plain.get(name), str):
             plain[name] = read_time(plain[name], now_ns, UTC)

@@ -118,6 +118,9 @@ def test_places_over_http(house: House) -> None:
         corners = [[-2, -2], [3, -2], [3, 3], [-2, 3]]
         hall = {"name": "hall", "body": {"kind": "place", "corners": corners}}
         assert ask(web, "POST", "/annotations", hall)[0] == 200
+        nowhere = {"name": "hall", "body": {**hall["body"], "near": 5}}
+        status, refused = ask(web, "POST", "/annotations", nowhere)
+        assert status == 400 and "`near`" in refused["error"]
         gone = {"name": "hall", "body": {"kind": "place"}, "removed": True}
         assert "withdrawn" in ask(web, "POST", "/annotations", gone)[1]["said"]
         entries = ask(web, "GET", "/annotations")[1]["annotations"]
