@@ -70,7 +70,11 @@ ALIKE = 0.5
 
 
 def choose(
-    landmarks: Landmarks, likely: NDArray[Any], camera: Camera, settings: SelectionSettings | None = None
+    landmarks: Landmarks,
+    likely: NDArray[Any],
+    camera: Camera,
+    settings: SelectionSettings | None = None,
+    most: int | None = None,
 ) -> NDArray[np.int64]:
     """Choose landmarks, the best first.
 
@@ -79,12 +83,14 @@ def choose(
         likely: (N,) positive, how likely each is found again, see `worth`.
         camera: that saw them.
         settings: what they may cost.
+        most: so many at most; any number if None.
 
     Returns:
         (K,) int64, indices; as many as fit.
     """
     s = settings or SelectionSettings()
-    order = _ranked(landmarks.pixels / camera.width, likely * distinctness(landmarks, ALIKE), CROWD)
+    most = len(landmarks) if most is None else min(most, len(landmarks))
+    order = _ranked(landmarks.pixels / camera.width, likely * distinctness(landmarks, ALIKE), CROWD, most)
     fits = _bytes_of_first(landmarks.take(order), camera) <= s.most_bytes
     return order[: int(fits.sum())]
 
@@ -99,15 +105,14 @@ def distinctness(landmarks: Landmarks, alike: float) -> Array:
     return distinct
 
 
-def _ranked(places: Array, value: Array, crowd: float) -> NDArray[np.int64]:
-    """All indices in greedy order of worth, given those before."""
-    away = ((places[:, None] - places[None]) ** 2).sum(axis=2)
-    nearness = np.exp(-away / (2 * crowd**2))
+def _ranked(places: Array, value: Array, crowd: float, most: int) -> NDArray[np.int64]:
+    """The first indices in greedy order of worth, given those before."""
     crowded, left = np.ones(len(places)), np.array(value, np.float64)
-    order = np.empty(len(places), np.int64)
-    for k in range(len(places)):
+    order = np.empty(most, np.int64)
+    for k in range(most):
         order[k] = best = int((left / crowded).argmax())
-        crowded += nearness[best]
+        away = ((places - places[best]) ** 2).sum(axis=1)
+        crowded += np.exp(-away / (2 * crowd**2))
         left[best] = -1.0
     return order
 

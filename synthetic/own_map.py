@@ -81,7 +81,7 @@ class OwnMap:
             self.truth[node.id] = here
             began = time.perf_counter()
             self.builder.join(AnchoredKeyframe(replace(node, stamp_ns=stamp_ns), self._new_tracks(node)))
-            self.builder.close_loops()
+            self.builder.finish_pending()
             self.times.append(time.perf_counter() - began)
         return self.builder.take_changes()
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from mapweave.agent.edge_measurement.driven_edge import driven_edge
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.triangulation import triangulate
 from mapweave.agent.mapping.anchored_keyframe import HERE, AnchoredKeyframe
-from mapweave.agent.mapping.tracking import Tracking
+from mapweave.agent.mapping.tracking import EpisodeEstimate
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import RawImage, View
 from mapweave.agent.observation import RobotDescription
@@ -94,7 +96,7 @@ class KeyframeBuilder:
         self._next_number = next_number
         self._new: list[ChangeBody] = []
         self._images: list[tuple[NodeId, RawImage]] = []
-        self._to_close: tuple[Node, NodeId | None] | None = None
+        self._pending: deque[Callable[[], None]] = deque()
         self._rng = np.random.default_rng(0)
 
     def recalibrate(self, description: RobotDescription, old_from_new: Pose2) -> None:
@@ -104,6 +106,7 @@ class KeyframeBuilder:
             description: of the robot.
             old_from_new: of its frame.
         """
+        self.finish_pending()
         clock = self._description.clock
         self._description, self._camera = replace(description, clock=clock), description.camera
         self._move(PoseGaussian(old_from_new, np.zeros((3, 3))))
@@ -124,28 +127,39 @@ class KeyframeBuilder:
         return images
 
     def place(
-        self, anchor: View, leaves: list[View], tracking: Tracking, trajectory: TrajectoryRecorder
+        self, anchor: View, leaves: list[View], estimate: EpisodeEstimate, trajectory: TrajectoryRecorder
     ) -> Node | None:
-        """Make nodes of an episode's views, and edges between them and to the episode before.
+        """Make a node of an episode's anchor, and edges to the episode before.
+
+        Nodes of its further views, and loop closures, are left for `continue_pending`.
 
         Args:
             anchor: the view where the episode began.
             leaves: further views of the episode.
-            tracking: the landmarks.
+            estimate: what it is known by.
             trajectory: trajectory since the last node; it goes with the anchor, if that becomes a node.
 
         Returns:
             The anchor's node; None, and nothing is changed, if the anchor shows too little.
         """
-        placed = self._node(anchor, tracking, trajectory)
+        self.finish_pending()
+        placed = self._node(anchor, estimate, self.map_from_anchor, trajectory)
         if placed is None:
             return None
         self.join(placed)
-        for leaf in leaves:
-            beside = self._node(leaf, tracking)
-            if beside is not None:
-                self._write(beside.node, self._edge(placed, beside, self._sober(leaf.anchor_from_view)))
+        for leaf in reversed(leaves):
+            self._pending.appendleft(
+                partial(self._place_beside, placed, leaf, estimate, self.map_from_anchor)
+            )
         return placed.node
+
+    def _place_beside(
+        self, placed: AnchoredKeyframe, leaf: View, estimate: EpisodeEstimate, map_from_anchor: PoseGaussian
+    ) -> None:
+        """Make a node of a further view of an episode whose anchor has become a node."""
+        beside = self._node(leaf, estimate, map_from_anchor)
+        if beside is not None:
+            self._write(beside.node, self._edge(placed, beside, self._sober(leaf.anchor_from_view)))
 
     def join(self, placed: AnchoredKeyframe) -> None:
         """Put the node of an episode into the map, with edges to the one before and to places known already.
@@ -153,7 +167,7 @@ class KeyframeBuilder:
         Args:
             placed: at the current anchor.
         """
-        self.close_loops()
+        self.finish_pending()
         last = self._last
         if last is not None and last.evidence:
             loops = self._loops(placed.node, None)
@@ -164,18 +178,26 @@ class KeyframeBuilder:
         else:
             joined = [] if last is None else [self._edge(last, placed, last.node_from_anchor)]
             self._write(placed.node, *joined)
-            self._to_close = placed.node, None if last is None else last.node.id
+            before = None if last is None else last.node.id
+            self._pending.append(partial(self._close_loops, placed.node, before))
         self._last = placed
 
-    def close_loops(self) -> None:
-        """Put loop closures of the newest node into the map, if that is not done yet.
+    def continue_pending(self) -> None:
+        """Do one piece of what is left of the last episode, if any.
 
-        A tick of its own: what makes a node takes long enough.
+        A tick for each: the one in which an anchor becomes a node takes long enough.
         """
-        if self._to_close is not None:
-            (node, before), self._to_close = self._to_close, None
-            if node.id in self.map.nodes:
-                self._write(*self._loops(node, before))
+        if self._pending:
+            self._pending.popleft()()
+
+    def finish_pending(self) -> None:
+        """Do all that is left of the last episode."""
+        while self._pending:
+            self.continue_pending()
+
+    def _close_loops(self, node: Node, before: NodeId | None) -> None:
+        if node.id in self.map.nodes:
+            self._write(*self._loops(node, before))
 
     def recognise(self, node: Node, view_tracks: NDArray[np.int64], recognition: Recognition) -> None:
         """The next episode begins at a view that shows a node of this map, however the robot came there.
@@ -185,6 +207,7 @@ class KeyframeBuilder:
             view_tracks: (K,) of the features of the anchor view; all have one.
             recognition: of the node in the view's features.
         """
+        self.finish_pending()
         tracks = np.full(len(node.landmarks), -1, np.int64)
         tracks[recognition.pairs[:, 0]] = view_tracks[recognition.pairs[:, 1]]
         self.map_from_anchor = node.map_from_robot @ recognition.node_from_robot
@@ -195,6 +218,7 @@ class KeyframeBuilder:
 
         A map without nodes may begin anywhere.
         """
+        self.finish_pending()
         self.map_from_anchor = self.map_from_anchor @ moved if self.map.nodes else HERE
         self._last = None
 
@@ -214,6 +238,7 @@ class KeyframeBuilder:
 
     def retire(self, node: NodeId) -> None:
         """Take a node out of the map, with its edges."""
+        self.finish_pending()
         change = NodeRetired(node)
         self.map.apply(change)
         self._new.append(change)
@@ -239,12 +264,16 @@ class KeyframeBuilder:
         return number
 
     def _node(
-        self, view: View, tracking: Tracking, trajectory: TrajectoryRecorder | None = None
+        self,
+        view: View,
+        estimate: EpisodeEstimate,
+        map_from_anchor: PoseGaussian,
+        trajectory: TrajectoryRecorder | None = None,
     ) -> AnchoredKeyframe | None:
-        landmarks, tracks = self._landmarks(view, tracking)
+        landmarks, tracks = self._landmarks(view, estimate)
         if len(landmarks) < LEAST_LANDMARKS:
             return None
-        pose = self.map_from_anchor @ view.anchor_from_view
+        pose = map_from_anchor @ view.anchor_from_view
         d = self._description
         ranges = d.ranges(view.proximity)
         segment = TrajectorySegment() if trajectory is None else trajectory.segment(view.stamp_ns, ranges)
@@ -255,17 +284,17 @@ class KeyframeBuilder:
             self._images.append((node.id, view.image))
         return AnchoredKeyframe(node, tracks)
 
-    def _landmarks(self, view: View, tracking: Tracking) -> tuple[Landmarks, NDArray[np.int64]]:
+    def _landmarks(self, view: View, estimate: EpisodeEstimate) -> tuple[Landmarks, NDArray[np.int64]]:
         """The view's features with depth in the view: by the filter, else triangulated; and their tracks."""
         camera = self._camera
         depths, sigmas = np.full(len(view.tracks), np.nan), np.full(len(view.tracks), np.nan)
-        poses, pixels = tracking.history.observations(view.tracks)
+        poses, pixels = estimate.history.observations(view.tracks)
         if len(poses) >= 2 and len(view.tracks):
             solved = triangulate(poses, pixels, camera, reference=view.anchor_from_view.mean.vector)
             fits = solved.chi2 < MOST_CHI2
             depths[fits], sigmas[fits] = solved.depths[fits], solved.depth_sigmas[fits]
-        view_from_robot = view.anchor_from_view.mean.inverse() @ tracking.pose.mean
-        estimates = tracking.landmarks()
+        view_from_robot = view.anchor_from_view.mean.inverse() @ estimate.pose.mean
+        estimates = estimate.landmarks
         shared, row, seat = np.intersect1d(estimates.ids, view.tracks, return_indices=True)
         if len(shared):
             ahead = view_from_robot.apply(estimates.points_in_robot[row])[:, 0] - camera.mount_forward
@@ -285,7 +314,7 @@ class KeyframeBuilder:
         )  # fmt: skip
         visible_share = np.isfinite(pixels[:, good, 0]).mean(axis=0) if len(poses) else np.ones(len(good))
         likely = worth(visible_share, good / max(len(view.tracks), 1))
-        kept = choose(landmarks, likely, camera, self._selection)[:MOST_LANDMARKS]
+        kept = choose(landmarks, likely, camera, self._selection, MOST_LANDMARKS)
         # Rounded now, the robot works with the same numbers as all receivers of the node.
         landmarks, order = settle(landmarks.take(kept), camera)
         return landmarks, view.tracks[good[kept[order]]]

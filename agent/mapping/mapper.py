@@ -201,7 +201,7 @@ class Mapper:
 
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
-        self._keyframes.close_loops()
+        self._keyframes.continue_pending()
         self._use_extracted()
         self._tracking.step(observation)
         if self._tracking.acceptance.carried_off or self._tracking.disputed:
@@ -289,7 +289,9 @@ class Mapper:
         self._extracting = self._extract(observation.image, observation.left_out), take
 
     def finish(self, observation: Observation) -> bool:
-        """End the episode: its views become nodes, and the current image becomes the next anchor.
+        """End the episode: its anchor becomes a node, and the current image the next anchor.
+
+        Its further views become nodes in the ticks that follow.
 
         Returns:
             Whether the anchor view became a node. False without an image.
@@ -299,7 +301,7 @@ class Mapper:
             return False
         features = self._extract(observation.image, observation.left_out)
         self._tracking.remember(force=True)
-        node = self._keyframes.place(self._anchor, self._leaves, self._tracking, self._trajectory)
+        node = self._keyframes.place(self._anchor, self._leaves, self._tracking.estimate, self._trajectory)
         if node is not None:
             self.typical_depth = float(np.median(node.landmarks.depths))
         anchor = self._tracking.take(observation, features.result(), HERE)

@@ -46,6 +46,12 @@ class TrackHistory:
             for column in (self._poses, self._ids, self._pixels):
                 del column[1::2]
 
+    def snapshot(self) -> TrackHistory:
+        """The history as it is now, which later observations do not change."""
+        copy = TrackHistory(self._step, self._turn_step, self._most)
+        copy._poses, copy._ids, copy._pixels = self._poses.copy(), self._ids.copy(), self._pixels.copy()
+        return copy
+
     def observations(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
         """All observations of some tracks.
 

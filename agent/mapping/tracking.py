@@ -68,6 +68,20 @@ class HeldTracks(NamedTuple):
     pixels: Array
 
 
+class EpisodeEstimate(NamedTuple):
+    """What an episode has estimated so far; what is tracked later does not change it.
+
+    Attributes:
+        history: from where each track was seen.
+        pose: `anchor_from_robot`.
+        landmarks: of the filter, in robot.
+    """
+
+    history: TrackHistory
+    pose: PoseGaussian
+    landmarks: LandmarkEstimates
+
+
 class Correction(NamedTuple):
     """How the filter was corrected by the tracks that it holds.
 
@@ -178,6 +192,11 @@ class Tracking:
     def landmarks(self) -> LandmarkEstimates:
         """The filter's landmarks, in robot."""
         return self._filter.landmarks()
+
+    @property
+    def estimate(self) -> EpisodeEstimate:
+        """All that nodes are made of."""
+        return EpisodeEstimate(self.history.snapshot(), self.pose, self.landmarks())
 
     def step(self, observation: Observation) -> None:
         """Predict by the wheels, follow the tracks, correct by what they show.

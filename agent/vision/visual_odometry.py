@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 
 WINDOW_PX = (15, 15)
-POINTS = 200
+POINTS = 100
 LEAST_POINTS = 12
 ROUNDS = 4
 """Of least squares, each with the points that the one before fits worst weighed down."""
@@ -40,7 +40,7 @@ class VisualMotion(NamedTuple):
 
 
 def visual_motion(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Camera) -> VisualMotion | None:
-    """Compare two grey images (H, W) of a camera, both possibly reduced; None if there is too little to follow."""
+    """Compare two grey images (H, W) of a camera, both possibly reduced; None if they show too little."""
     start = cv2.goodFeaturesToTrack(before, POINTS, 0.01, 7)
     if start is None or len(start) < LEAST_POINTS:
         return None

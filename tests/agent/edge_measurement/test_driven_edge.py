@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -113,6 +115,8 @@ def two_nodes(walls) -> HybridMap:
             mapper.leaf(observation)
         before = Pose2(x)
     mapper.finish(observation)
+    assert len(mapper.map.nodes) == 1
+    mapper.step(replace(observation, odometry=Odometry(0.0, 0.0)))  # further views become nodes then
     assert len(mapper.map.nodes) == 2
     return mapper.map
 
