@@ -372,7 +372,7 @@ class Questions:
 
 
 def _asker(request: Request) -> str:
-    """By whom questions are counted."""
+    """The person whose questions are counted."""
     return request.scope[PERSON].name or address_of(request)
 
 
