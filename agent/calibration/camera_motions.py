@@ -128,9 +128,7 @@ def robot_from_camera(heading: float, pitch: float, roll: float) -> Array:
     return np.asarray(z @ y @ x @ ROBOT_FROM_LEVEL)
 
 
-def predict(
-    vector: Array, wheels: WheelTrack, first: Array, last: Array, slip: Array | None = None
-) -> CameraMotions:
+def predict(vector: Array, wheels: WheelTrack, first: Array, last: Array) -> CameraMotions:
     """Camera motions between images by the wheels, for one set of parameters.
 
     Args:
@@ -138,20 +136,23 @@ def predict(
         wheels: what they counted.
         first: (N,) s, stamps of the first images.
         last: (N,) s, stamps of the second images.
-        slip: (3,) forward m, left m, turn rad that each robot moves besides at its end.
     """
+    return motions_over(vector, *counted(vector, wheels, first, last))
+
+
+def counted(vector: Array, wheels: WheelTrack, first: Array, last: Array) -> tuple[Array, Array]:
+    """Ways and turns of the wheels between images, as `WheelTrack.between`, their delay considered."""
     delay = vector[Parameter.DELAY]
-    return motions_over(vector, *wheels.between(first + delay, last + delay), slip)
+    return wheels.between(first + delay, last + delay)
 
 
-def motions_over(vector: Array, ways: Array, turns: Array, slip: Array | None = None) -> CameraMotions:
+def motions_over(vector: Array, ways: Array, turns: Array) -> CameraMotions:
     """Camera motions over ways and turns that were reported.
 
     Args:
         vector: (10,) in the order of `Parameter`; its delay has been considered.
         ways: (N, SUBSTEPS) m.
         turns: (N, SUBSTEPS) rad.
-        slip: as in `predict`.
     """
     p = Parameter
     ways = math.exp(vector[p.WHEEL_SCALE]) * ways
@@ -159,15 +160,32 @@ def motions_over(vector: Array, ways: Array, turns: Array, slip: Array | None = 
     heading = np.cumsum(turns, axis=1)
     middle = heading - 0.5 * turns
     x, y, turned = (ways * np.cos(middle)).sum(1), (ways * np.sin(middle)).sum(1), heading[:, -1]
-    if slip is not None:
-        c, s = np.cos(turned), np.sin(turned)
-        x, y = x + c * slip[0] - s * slip[1], y + s * slip[0] + c * slip[1]
-        turned = turned + slip[2]
-    mount = robot_from_camera(vector[p.HEADING], vector[p.PITCH], vector[p.ROLL])
-    centre = np.array([vector[p.FORWARD], vector[p.LEFT], 0.0])
+    mount, centre = _robot_from_camera(vector)
     back = rotations(np.stack([0.0 * turned, 0.0 * turned, -turned], axis=1))
     moved = np.stack([x, y, 0.0 * x], axis=1)
     rotation = mount.T @ back @ mount
     translation = ((back @ (centre - moved)[..., None])[..., 0] - centre) @ mount
     floor = mount.T @ np.array([0.0, 0.0, -1.0]) * math.exp(-vector[p.HEIGHT])
     return CameraMotions(rotation, translation, np.broadcast_to(floor, (len(ways), 3)).copy())
+
+
+def slip_steps(vector: Array) -> Array:
+    """(6, 3) how slip at the end of a motion changes the camera's, to first order.
+
+    The robot moves besides by m ahead, m to the left and rad of turning: a column each, as the small steps of
+    `CameraMotions.since`. A point p of the camera is M p + c of the robot; slip (d, theta) takes it to
+    M p + c - d - theta z x (M p + c), which is p + omega x p + tau with omega = -theta M' z and
+    tau = -M' (d + theta z x c). The motion itself does not matter.
+    """
+    mount, centre = _robot_from_camera(vector)
+    moved = np.eye(3)
+    moved[:, 2] = -centre[1], centre[0], 0.0
+    turned = np.diag([0.0, 0.0, 1.0])
+    return np.asarray(np.concatenate([-mount.T @ moved, -mount.T @ turned]))
+
+
+def _robot_from_camera(vector: Array) -> tuple[Array, Array]:
+    """Rotation (3, 3) and place (3,) m of the camera on the robot; its height is that of the floor."""
+    p = Parameter
+    mount = robot_from_camera(vector[p.HEADING], vector[p.PITCH], vector[p.ROLL])
+    return mount, np.array([vector[p.FORWARD], vector[p.LEFT], 0.0])

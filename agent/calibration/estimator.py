@@ -15,7 +15,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapweave.agent.calibration.camera_motions import CameraMotions, WheelTrack, motions_over, predict
+from mapweave.agent.calibration.camera_motions import (
+    CameraMotions,
+    WheelTrack,
+    counted,
+    motions_over,
+    predict,
+    slip_steps,
+)
 from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.floor_scale import floor_scale
 from mapweave.agent.calibration.pair_information import (
@@ -35,7 +42,6 @@ STALE = 0.25
 """A pair is reduced again when a parameter has moved by this share of a useful sigma since."""
 STEP = np.array([1e-5, 1e-5, 1e-6, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
 """Of the numeric derivative."""
-SLIP_STEP = 1e-5
 NOISE_STEPS = 4
 """Of expectation maximisation in each Gauss-Newton step."""
 STALE_PITCH = 0.02
@@ -132,8 +138,9 @@ class Estimator:
 
     def _reduced(self, pair: ImagePair, wheels: WheelTrack) -> PairInformation:
         first, last = np.array([pair.first_s]), np.array([pair.last_s])
-        predicted = predict(self.vector, wheels, first, last)
-        noise = self._noises(self.vector, wheels, first, last, predicted)[0]
+        ways, turns = counted(self.vector, wheels, first, last)
+        predicted = motions_over(self.vector, ways, turns)
+        noise = self._noises(ways, turns)[0]
         return reduce_pair(pair, predicted[0], noise, self._sigma, self._depth, self._most_sigma)
 
     def solve(self, wheels: WheelTrack, iterations: int = INNER) -> Estimate:
@@ -156,11 +163,11 @@ class Estimator:
         tight, ranged = (self.ranged.sigma**-2, self.ranged.log) if self.ranged and shows else (0.0, 0.0)
         fixed[P.WHEEL_SCALE, P.WHEEL_SCALE] += tight
         for _ in range(iterations):
-            predicted = predict(self.vector, wheels, first, last)
-            off = predicted.since(at)
-            jacobian = self._jacobian(wheels, first, last, at, off)
+            ways, turns = counted(self.vector, wheels, first, last)
+            off = motions_over(self.vector, ways, turns).since(at)
+            jacobian = self._jacobian(wheels, first, last, ways, turns, at, off)
             rest = b - _product(a, off)
-            basis, growth = self._noise_basis(self.vector, wheels, first, last, predicted)
+            basis, growth = self._noise_basis(ways, turns)
             whitened = np.asarray(np.linalg.inv(basis), np.float64)
             transposed = np.swapaxes(whitened, 1, 2)
             for _ in range(NOISE_STEPS):
@@ -244,12 +251,17 @@ class Estimator:
         return Lengths.BOTH if agree else Lengths.CONTRADICT
 
     def _jacobian(
-        self, wheels: WheelTrack, first: Array, last: Array, at: CameraMotions, off: Array
+        self,
+        wheels: WheelTrack,
+        first: Array,
+        last: Array,
+        ways: Array,
+        turns: Array,
+        at: CameraMotions,
+        off: Array,
     ) -> Array:
         """(N, 6, 10) of the predicted motions with respect to the parameters, numeric."""
         columns = []
-        delay = self.vector[P.DELAY]
-        counted = wheels.between(first + delay, last + delay)
         for k in range(COUNT):
             moved = self.vector.copy()
             moved[k] += STEP[k]
@@ -260,7 +272,7 @@ class Estimator:
             if k == P.DELAY:
                 columns.append(self._delay_column(moved, wheels, first, last, at))
                 continue
-            columns.append((motions_over(moved, *counted).since(at) - off) / STEP[k])
+            columns.append((motions_over(moved, ways, turns).since(at) - off) / STEP[k])
         return np.stack(columns, axis=-1)
 
     def _delay_column(
@@ -275,8 +287,7 @@ class Estimator:
         smooth = wheels.smooth(DELAY_SMOOTH_S)
         here = predict(self.vector, smooth, first, last)
         column = (predict(moved, smooth, first, last).since(at) - here.since(at)) / STEP[P.DELAY]
-        slip = np.array([0.0, 0.0, SLIP_STEP])
-        turning = predict(self.vector, smooth, first, last, slip).since(here) / SLIP_STEP
+        turning = slip_steps(self.vector)[:, 2]
         span = last - first
         still = CameraMotions(np.broadcast_to(np.eye(3), at.rotation.shape), 0.0 * at.floor, 0.0 * at.floor)
         up = -here.floor / np.linalg.norm(here.floor, axis=1, keepdims=True)
@@ -288,34 +299,29 @@ class Estimator:
         begins, finishes = ends
         return np.asarray(column + turning * (finishes - begins)[:, None])
 
-    def _noise_basis(
-        self, vector: Array, wheels: WheelTrack, first: Array, last: Array, predicted: CameraMotions
-    ) -> tuple[Array, Array]:
+    def _noise_basis(self, ways: Array, turns: Array) -> tuple[Array, Array]:
         """Directions (N, 6, 6) in which a pair errs by itself, and how their variances grow (N, 6).
 
         Slip ahead, aside and in turning grow with the way; a vehicle pitches and rolls on its springs
         however far it goes.
+
+        Args:
+            ways: (N, SUBSTEPS) m, of the wheels.
+            turns: (N, SUBSTEPS) rad.
         """
-        n = len(first)
+        n = len(ways)
         basis = np.zeros((n, 6, 6))
-        counted = wheels.between(first + vector[P.DELAY], last + vector[P.DELAY])
-        for k in range(3):
-            slip = np.zeros(3)
-            slip[k] = SLIP_STEP
-            moved = motions_over(vector, *counted, slip)
-            basis[:, :, k] = moved.since(predicted) / SLIP_STEP
+        basis[:, :, :3] = slip_steps(self.vector)
         basis[:, 3, 3] = basis[:, 5, 4] = basis[:, 1, 5] = 1.0
-        ways, turns = wheels.between(first, last)
         moving = np.abs(ways).sum(1) + 0.3 * np.abs(turns).sum(1) + 0.01
         growth = np.ones((n, 6))
         growth[:, :3] = moving[:, None]
         growth[:, 5] = moving**2 + 1e-4
         return basis, growth
 
-    def _noises(
-        self, vector: Array, wheels: WheelTrack, first: Array, last: Array, predicted: CameraMotions
-    ) -> Array:
-        basis, growth = self._noise_basis(vector, wheels, first, last, predicted)
+    def _noises(self, ways: Array, turns: Array) -> Array:
+        """(N, 6, 6) covariances of what a pair errs by itself."""
+        basis, growth = self._noise_basis(ways, turns)
         return (basis * (growth * self._noise)[:, None]) @ np.swapaxes(basis, 1, 2)
 
     def _learn_noise(

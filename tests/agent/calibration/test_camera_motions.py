@@ -15,6 +15,7 @@ from mapweave.agent.calibration.camera_motions import (
     predict,
     robot_from_camera,
     rotations,
+    slip_steps,
 )
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 
@@ -48,6 +49,33 @@ def test_the_mount_has_its_signs():
     assert (robot_from_camera(0.0, 0.1, 0.0) @ ahead)[2] < -0.09
     assert (robot_from_camera(0.0, 0.0, 0.1) @ right)[2] < -0.09
     assert np.allclose(robot_from_camera(0.0, 0.0, 0.0) @ right, [0.0, -1.0, 0.0])
+
+
+def planar(x: float, y: float, turn: float) -> np.ndarray:
+    """(4, 4) pose of a robot."""
+    pose = np.eye(4)
+    pose[:2] = [[math.cos(turn), -math.sin(turn), 0.0, x], [math.sin(turn), math.cos(turn), 0.0, y]]
+    return pose
+
+
+@given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-3.0, 3.0))
+@settings(max_examples=30, deadline=None)
+def test_slip_moves_the_camera_by_the_same_step_whatever_the_motion(x: float, y: float, turn: float):
+    """Against finite differences of matrices."""
+    robot_from_seen = np.eye(4)
+    robot_from_seen[:3, :3] = robot_from_camera(TRUE.heading, TRUE.pitch, TRUE.roll)
+    robot_from_seen[:2, 3] = TRUE.forward, TRUE.left
+
+    def moved(*slip: float) -> CameraMotions:
+        robot = planar(x, y, turn) @ planar(*slip)
+        second_from_first = np.linalg.inv(robot_from_seen) @ np.linalg.inv(robot) @ robot_from_seen
+        return CameraMotions(
+            second_from_first[None, :3, :3], second_from_first[None, :3, 3], np.zeros((1, 3))
+        )
+
+    step = 1e-6
+    for column, slip in zip(slip_steps(TRUE.vector).T, step * np.eye(3), strict=True):
+        assert np.allclose(moved(*slip).since(moved(0.0, 0.0, 0.0))[0] / step, column, atol=1e-4)
 
 
 def test_points_are_seen_where_the_motion_says():
