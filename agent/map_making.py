@@ -65,6 +65,7 @@ class MapMaking:
         self._explorer: Explorer | None = None
         self._carried = CarriedMapping(self.mapper)
         self._resumption: Resumption | None = None
+        self._episodes = 0
 
     @property
     def description(self) -> RobotDescription:
@@ -157,8 +158,18 @@ class MapMaking:
         if self.mapper.doubtful or self.mapper.astray or blind:
             self.calibration.pause()
             return Command(), []
-        if observation.image is not None and self.mapper.started:
+        self._use_calibrated()
+        tracked, before = self.mapper.started, self._episodes
+        command, questions = self._behave(observation, answers, alone, held)
+        if observation.image is not None and tracked and self._episodes == before:
+            # The tick that ends an episode takes long enough.
             self._calibrate(observation.image)
+        return command, questions
+
+    def _behave(
+        self, observation: Observation, answers: tuple[Answer, ...], alone: bool, held: bool
+    ) -> tuple[Command, list[Question]]:
+        """What the robot does while it knows where it is."""
         pose = self.mapper.map_from_robot.mean
         if isinstance(self.floor, CameraOccupancyGrid):
             self.floor.drive(pose)
@@ -211,6 +222,7 @@ class MapMaking:
         """
         while isinstance(move := behaviour.next_move(), EpisodeRequest):
             self.mapper.meet(move, observation)
+            self._episodes += move is EpisodeRequest.FINISH
             self._see_changes()
         return move
 
@@ -223,12 +235,16 @@ class MapMaking:
                 if isinstance(change, NodePut):
                     self.floor.see_node(change.node)
 
-    def _calibrate(self, image: NDArray[np.uint8]) -> None:
-        """Hold the tracks against the wheels; what they show is used from the next node on."""
+    def _use_calibrated(self) -> None:
+        """Go on with the geometry to which the mapper has changed."""
         calibration = self.calibration
         if calibration.pending is not None and self.mapper.description is calibration.pending[0]:
             calibration.switched()
             self._use(calibration.description, calibration.lens)
+
+    def _calibrate(self, image: NDArray[np.uint8]) -> None:
+        """Hold the tracks against the wheels; what they show is used from the next node on."""
+        calibration = self.calibration
         calibration.watch(image, *self.mapper.tracks)
         if calibration.pending is not None:
             self.mapper.recalibrate(*calibration.pending)
