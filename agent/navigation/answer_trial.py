@@ -23,15 +23,15 @@ from mapweave.hybridmap.query import RouteLeg
 TRIALS = 6
 """Answers refuted in a row before a goal is given up. Each costs at most the blind way, 2 m, and a search."""
 MORE_WAY = 50.0
-"""A mission may take this much way, m: what a lost robot turns and drives within its patience,"""
+"""The way to a stop may take this much, m: what a lost robot turns and drives within its patience,"""
 ROUTES = 5.0
 """and so many times its longest route: detours around what is blocked, and ways back."""
 LONGEST_ROUTE = 100.0
-"""Of which no more counts than this, m: a false one may have any length. No mission takes more than 550 m."""
+"""Of which no more counts than this, m: a false one may have any length. No stop takes more than 550 m."""
 
 
 class AnswerTrial:
-    """Of one mission.
+    """Of the way to one stop of a mission, or to its goal.
 
     Attributes:
         node: by which the robot is localized by the fleet's word alone; None if its own view bears it out.
@@ -44,7 +44,7 @@ class AnswerTrial:
         self.borne_out = False
         self._motion = motion
         self._refuted = refuted
-        self._longest = 0.0
+        self._longest, self._begun_at = 0.0, _effort(motion)
         self._failed = 0
         self._route: Sequence[RouteLeg] = ()
         self._last = ""
@@ -110,8 +110,13 @@ class AnswerTrial:
         """Why no further answer is tried; empty if one may be."""
         if self._failed >= TRIALS:
             return f"{self._failed} answers in a row were wrong: {self._last}"
-        way = self._motion.way + TURN_SHARE * self._motion.turned
+        way = _effort(self._motion) - self._begun_at
         if way > MORE_WAY + ROUTES * self._longest:
             effort = f"{way:.0f} m of driving and turning for a route of {self._longest:.0f} m"
             return f"{effort}: {self._last}" if self._last else effort
         return ""
+
+
+def _effort(motion: MotionPrimitives) -> float:
+    """Way driven and turned so far, m."""
+    return motion.way + TURN_SHARE * motion.turned

@@ -32,6 +32,15 @@ class GoalPatience:
         self._driven: set[tuple[NodeId, NodeId]] = set()
         self._held_by, self._held_where, self._held_since = "", "", 0.0
 
+    def reach(self, now: float) -> None:
+        """The robot is at a stop on its way: the edges on the way on from there count anew.
+
+        Args:
+            now: s.
+        """
+        self._driven.clear()
+        self._progressed_at = now
+
     def pause(self, seconds: float) -> None:
         """The robot must not move; that time, s, does not count."""
         self._progressed_at += seconds

@@ -285,7 +285,7 @@ class Navigator:
                 del self._via[0]
                 self.passed += 1
                 self._following = False
-                self._trial = AnswerTrial(self._motion, self._positioning.refuted)
+                self._reach_stop()
                 return
             if self._touched:
                 follower.progress = RouteProgress.BLOCKED
@@ -318,9 +318,14 @@ class Navigator:
         """The robot is where the route ends: at the goal, or at a portal on the way there."""
         self.tally = self.tally.passed([0.0])
         if self._portal is not None:
-            self._trial = AnswerTrial(self._motion, self._positioning.refuted)
+            self._reach_stop()
             self.stage = Stage.PORTAL
             self.crossing.begin(self._portal)
+
+    def _reach_stop(self) -> None:
+        """What was driven until here says nothing of the way on."""
+        self._trial = AnswerTrial(self._motion, self._positioning.refuted)
+        self._patience.reach(self._motion.now)
 
     def _let_pass(self, right_of_way: RightOfWay, follower: RouteFollower) -> Generator[Command, None, bool]:
         """Stand while another robot holds the way ahead; returns whether to go on then.

@@ -259,6 +259,24 @@ def test_a_robot_passes_what_it_must_in_order_and_then_seeks_its_goal(home):
     assert eyes.pose.x - 1.0 == pytest.approx(poses[C], abs=0.35), "it has been at the last before it turns"
 
 
+def test_a_robot_that_goes_to_and_fro_gives_up_neither_for_time_nor_for_way(home):
+    """Before, it gave up once its stops took more way than 50 m, or its patience: it drove no new edge."""
+    eyes, poses = Eyes(home, Pose2(1.0, 2.0)), {A: 0.0, B: 1.0}
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2(eyes.pose.x - 1.0)))
+        step = poses[question.goal] - poses[question.start]
+        return Answer(
+            question.number, RouteAnswer(straight(bare(question.start), bare(question.goal), step=step), "")
+        )
+
+    patience = NavigatorSettings(blind_distance=1e9, patience=30.0)
+    trial = Trial(navigator(eyes, NOWHERE, C, patience, via=(B, A) * 50), eyes, fleet)
+    trial.run(600.0, lambda: trial.navigator.given_up or trial.navigator.passed > 50)
+    assert trial.navigator.passed > 50, trial.navigator.detail
+
+
 def test_a_robot_that_stands_in_the_only_way_is_named_and_the_goal_given_up(home):
     """Before, it tried again for 300 s."""
     trial = trial_to(home)
