@@ -332,11 +332,18 @@ class Pipeline:
     def _lose_pose(self) -> None:
         """The encoders have failed, or are back: what was measured since is void, nodes made before stay."""
         if isinstance(self._mission, GoTo):
-            self.set_mission(self._mission)
+            self._seek_goal_again()
             return
         self._map_making.end_search()
         self._forget_fix()
         self._map_making.lose_pose()
+
+    def _seek_goal_again(self) -> None:
+        """On its way to a goal it knows no more where it is. A goal that was given up stays so."""
+        if self._navigator is not None and self._navigator.given_up:
+            self._forget_fix()
+        else:
+            self.set_mission(self.mission)
 
     def _forget_fix(self) -> None:
         """Where a drive to a goal has ended says no longer where the robot is."""
@@ -351,7 +358,7 @@ class Pipeline:
                 self._forget_fix()
         elif self._lifted and not observation.kidnapped:
             if isinstance(self._mission, GoTo):
-                self.set_mission(self.mission)
+                self._seek_goal_again()
             else:
                 self._put_elsewhere = bool(self.map.nodes) and not isinstance(self._mission, Idle)
                 self._map_making.restart()

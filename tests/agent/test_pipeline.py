@@ -13,7 +13,7 @@ from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mission import Carried, Explore, GoTo, Idle, WhereAmI, WhoIsNear
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, Step
-from mapweave.agent.settings import AgentSettings
+from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -307,6 +307,18 @@ def test_a_robot_that_was_lifted_on_its_way_asks_where_it_is(walls):
     assert first
     assert again
     assert not pipeline.lost
+
+
+def test_a_goal_that_was_given_up_stays_so_when_the_robot_is_lifted(walls):
+    """Before, it drove on to a goal of which its record says that it was not reached."""
+    settings = AgentSettings(navigation=NavigatorSettings(patience=0.5))
+    pipeline = on(GoTo(NodeId("r1", 1, 1)), settings)
+    steps = [pipeline.step(still(walls, tick=tick)) for tick in range(10)]
+    assert steps[-1].status.given_up
+    lift(walls, pipeline, 20)
+    steps = [pipeline.step(still(walls, tick=tick)) for tick in range(30, 40)]
+    assert all(step.status.given_up and step.command == Command() for step in steps)
+    assert all(step.status.fix_node is None for step in steps)
 
 
 # Questions

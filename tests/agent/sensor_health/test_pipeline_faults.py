@@ -18,6 +18,7 @@ from mapweave.agent.sensor_health.sensor_monitor import FIRST_TRIAL, TRIAL_SIDE,
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
@@ -79,6 +80,19 @@ def test_it_stands_says_which_and_goes_on(walls, mission, broken, sensor):
     wait = round((FIRST_TRIAL + 3.0 * TRIAL_SIDE) / BODY.tick) + 15
     pose, after = run(walls, pipeline, pose, 42, wait, lambda seen: seen)
     assert after[-1].fault is None and any(step.command != Command() for step in after)
+
+
+def test_a_robot_whose_encoders_fail_keeps_what_it_has_done_of_its_mission(walls):
+    """Before, it waited again at the portal through which it had been taken."""
+    entry, beyond, goal = (NodeId("r1", 1, number) for number in (1, 3, 5))
+    portal = PortalStop("east lift", PortalMeans.LIFT, entry, beyond, "2", "")
+    pipeline = on(GoTo(goal, portal=PortalWait(portal)))
+    pose, steps = run(walls, pipeline, Pose2(), 0, 3, lambda seen: seen)
+    assert steps[-1].status.portal == PortalWait(portal)
+    pipeline.taken_through()
+    pose, steps = run(walls, pipeline, pose, 3, 1, lambda seen: replace(seen, odometry=Odometry(5.0, 0.0)))
+    assert steps[-1].fault is not None and steps[-1].fault.sensor == "encoders"
+    assert steps[-1].status.portal == PortalWait(portal, done=True)
 
 
 def drive(how: str, seed: int) -> tuple[Pipeline, dict[int, Pose2], list[Step], Simulation]:
