@@ -34,7 +34,7 @@ class Blocks:
         """Start without blocks."""
         self._settings = settings or NavigatorSettings()
         self._blocks: list[_Block] = []
-        self._times: dict[Pair, int] = {}
+        self._lasted: dict[Pair, float] = {}
 
     def add(self, a: NodeId, b: NodeId, now: float, obstacle: Obstacle | None = None) -> None:
         """Add a pair between which the robot could not drive, in either direction.
@@ -47,8 +47,9 @@ class Blocks:
                 robot counts for the longest time: the server knows when it has left.
         """
         s, pair = self._settings, (a, b) if a <= b else (b, a)
-        times = self._times[pair] = self._times.get(pair, 0) + 1
-        until = now + min(s.blocked_first * 2.0 ** (times - 1), s.blocked_longest)
+        lasts = 2.0 * self._lasted[pair] if pair in self._lasted else s.blocked_first
+        lasts = self._lasted[pair] = min(lasts, s.blocked_longest)
+        until = now + lasts
         stays = now + s.blocked_longest if obstacle is not None and obstacle.robot else until
         self._blocks = [block for block in self._blocks if now < block.stays_until and block.pair != pair]
         self._blocks.append(_Block(until, pair, obstacle, stays))

@@ -192,7 +192,7 @@ class Navigator:
             route, self._portal = answer.legs, answer.portal
             self.crossing.check(self._portal)
             if (undriven := self._routes.undriven(route)) is not None:
-                self._blocks.add(*undriven, self._motion.now)
+                yield from self._avoid(*undriven)
             elif route:
                 self._patience.refused_since = None
                 yield from self._follow(route, self.fix)
@@ -250,6 +250,15 @@ class Navigator:
             self._patience.trouble = self.detail
         self.legs = self.legs or len(answer.legs)
         return answer
+
+    def _avoid(self, a: NodeId, b: NodeId) -> Behaviour:
+        """Leave out a leg that is not driven without rangers. A fleet that insists on it is asked seldom."""
+        named = (min(a, b), max(a, b)) in self._blocks.pairs(self._motion.now)
+        self._blocks.add(a, b, self._motion.now)
+        self._patience.trouble = f"no robot has driven between {a} and {b}, and this one has no rangers"
+        if named:
+            self.stage, self.detail = Stage.WAITING, self._patience.trouble
+            yield from self._motion.stand(PAUSE)
 
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""

@@ -137,6 +137,13 @@ def test_blocks_are_kept_for_a_time_that_doubles():
     assert blocks.pairs(74.9) == ((A, B),) and blocks.pairs(75.0) == ()
 
 
+def test_a_pair_may_be_blocked_any_number_of_times():
+    blocks = Blocks(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
+    for _ in range(1100):
+        blocks.add(A, B, 0.0)
+    assert blocks.pairs(24.9) == ((A, B),) and blocks.pairs(25.0) == ()
+
+
 def test_the_place_of_another_robot_is_avoided_for_longer_than_the_pair_of_nodes():
     blocks = Blocks(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
     thing, robot = Obstacle(A, 0.0, 0.0, 0.2), Obstacle(B, 0.0, 0.0, 0.4, "r7")
@@ -291,3 +298,21 @@ def test_only_driven_edges_are_driven_without_rangers(home, body):
     drives = any(command.forward > 0.0 for command in trial.commands)
     assert drives == (body is BODY)
     assert blocked[-1] == (() if body is BODY else ((A, B),))
+
+
+def test_a_fleet_that_insists_on_an_undriven_edge_is_asked_seldom_and_the_goal_given_up(home):
+    """Before, it was asked at each tick, and the reason was that the robot did not know where it is."""
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    ways: list[Question] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        ways.append(question)
+        start, last = straight(bare(A), bare(B))
+        return Answer(question.number, RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way"))
+
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(patience=30.0), BARE)
+    Trial(nav, eyes, fleet, NO_READINGS).run(40.0)
+    assert nav.given_up and f"no robot has driven between {A} and {B}" in nav.detail
+    assert len(ways) < 20
