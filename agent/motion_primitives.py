@@ -22,15 +22,17 @@ class MotionPrimitives:
         now: simulated or real time since then, s.
         way: driven since then, m, forward or backward.
         turned: turned since then, rad, either way.
+        next_number: of the next question.
     """
 
-    def __init__(self, description: RobotDescription, patience: int = 0) -> None:
+    def __init__(self, description: RobotDescription, patience: int = 0, first: int = 1) -> None:
         """Take the robot's description.
 
         Args:
             description: of the robot.
             patience: ticks that an answer may take before the question counts as lost; unused by a robot
                 that asks no questions.
+            first: number of the first question.
         """
         self.odom_from_robot = Pose2()
         self.now = self.way = self.turned = 0.0
@@ -39,7 +41,7 @@ class MotionPrimitives:
         self._observation: Observation | None = None
         self._answers: dict[int, Answer] = {}
         self._questions: list[Question] = []
-        self._next_number = 1
+        self.next_number = first
 
     @property
     def observation(self) -> Observation:
@@ -63,8 +65,8 @@ class MotionPrimitives:
 
     def number(self) -> int:
         """For the next question."""
-        self._next_number += 1
-        return self._next_number - 1
+        self.next_number += 1
+        return self.next_number - 1
 
     def post(self, question: Question) -> None:
         """Ask without waiting; `answer` has the answer later."""

@@ -207,11 +207,13 @@ class Pipeline:
                 near = None if fix is None else fix.node
                 near = min(self.map.nodes, default=near) if self._map_making.located else near
                 self._map_making.lose_pose()
+                # An answer that an earlier drive did not wait for must answer no question of this one.
+                first = 1 if self._navigator is None else self._navigator.next_number
                 crossing = PortalCrossing(self._map_id, self._settings.portals.patience, portal)
                 self._navigator = Navigator(
                     self._map_making.description, self.lens, self._map_making.sift, self.map, goal,
                     self._settings, self._settings.seed, via[passed:], crossing, near,
-                    lambda: self._others.beside,
+                    lambda: self._others.beside, first,
                 )  # fmt: skip
 
     def taken_through(self) -> None:

@@ -79,11 +79,12 @@ class Navigator:
         crossing: PortalCrossing | None = None,
         near: NodeId | None = None,
         beside: Callable[[], RobotBeside | None] = lambda: None,
+        first: int = 1,
     ) -> None:
         """Start lost, or at a portal, with a goal and nodes to pass before, in order.
 
         The robot is on the floor of the node `near`, if that is known. `beside` is the robot next to it,
-        if there is one.
+        if there is one. Its questions are numbered from `first`.
         """
         self.stage: str = Stage.LOST
         self.detail = ""
@@ -102,7 +103,7 @@ class Navigator:
         rng = np.random.default_rng(seed)
         self._planner = planner = LocalPlanner(description, s.navigation)
         self._follower = partial(RouteFollower, description, lens, sift, detour=planner, settings=s, rng=rng)
-        self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
+        self._motion = MotionPrimitives(description, ANSWER_PATIENCE, first)
         self._routes = RouteSource(self._motion, own_map, description)
         self._positioning = Positioning(description, lens, sift, own_map, self._motion, s, rng, near)
         self._trial = AnswerTrial(self._motion, self._positioning.refuted)
@@ -123,6 +124,11 @@ class Navigator:
     def refuted(self) -> int:
         """Answers of the fleet that the robot's view did not bear out, on this mission."""
         return self._positioning.refuted.count
+
+    @property
+    def next_number(self) -> int:
+        """That none of its questions has."""
+        return self._motion.next_number
 
     @property
     def arrived(self) -> bool:

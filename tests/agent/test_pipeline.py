@@ -334,6 +334,16 @@ def test_a_lost_robot_asks_the_fleet(walls):
     assert len(questions[0].view) > 20
 
 
+def test_a_late_answer_to_an_earlier_mission_is_none_to_this_one(walls):
+    """Before, a route to the earlier goal was driven, and its end taken for the goal."""
+    pipeline, numbers = on(GoTo(NodeId("r1", 1, 1))), list[int]()
+    for tick in range(20):
+        if tick == 10:
+            pipeline.set_mission(GoTo(NodeId("r1", 1, 3)))
+        numbers += [q.number for q in pipeline.step(still(walls, tick=tick)).questions if q.number > 0]
+    assert len(numbers) >= 2 and len(set(numbers)) == len(numbers)
+
+
 def test_seeds_choose_the_side():
     turns = set()
     for seed in range(6):
