@@ -282,7 +282,7 @@ class Navigator:
         follower = self._follower(route=route, fix=fix)
         self._trial.took(route, fix)
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
-        self._following, self._touched = True, ""
+        self._touched = ""
         while True:
             if not (yield from self._let_pass(right_of_way, follower)):
                 return
@@ -347,12 +347,17 @@ class Navigator:
 
         Where the way ahead is closed by a person, another one is asked for at once.
         """
+        passage = right_of_way.passage(follower.leg, follower.fix)
+        if self._following and passage is not Passage.FREE:
+            # It stops only now: the wheels have turned until here.
+            follower.fix.follow(self._motion.observation, self._description)
         self._following = False
-        while (passage := right_of_way.passage(follower.leg, follower.fix)) is Passage.HELD:
+        while passage is Passage.HELD:
             if right_of_way.holder:
                 self.stage, self.detail = Stage.YIELDING, right_of_way.reason
                 self._patience.trouble = f"{right_of_way.holder} is in the way"
             yield Command()
+            passage = right_of_way.passage(follower.leg, follower.fix)
         self._following = passage is Passage.FREE
         self._aside = right_of_way.aside if passage is Passage.ASIDE else None
         if passage is Passage.CLOSED:
@@ -374,11 +379,11 @@ class Navigator:
             return
         follower = self._follower(route=route, fix=fix)
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
-        while follower.to_goal > THERE and follower.progress in UNDERWAY:
-            if not (yield from self._let_pass(right_of_way, follower)):
-                return
+        while follower.to_goal > THERE and (yield from self._let_pass(right_of_way, follower)):
             command = follower.step(self._motion.observation)
             self.fix, self.stage, self.detail = follower.fix, Stage.ASIDE, follower.detail
+            if follower.to_goal <= THERE or follower.progress not in UNDERWAY:
+                break
             yield command
         self._following = False
 

@@ -10,6 +10,7 @@ import pytest
 from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI, WhichWay
 from mapweave.agent.navigation.goal_patience import YIELDED
 from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.observation import Command
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.nearby import NearbyRequest
@@ -70,6 +71,20 @@ def test_a_robot_whose_way_is_held_stands_and_says_so_and_then_drives_on(home):
     free[0] = True
     trial.run(5.0)
     assert any(command.forward for command in trial.commands[-30:])
+
+
+def test_a_robot_that_is_held_on_its_way_knows_where_it_stopped(home):
+    """Before, it forgot what it had driven in the last tick before it stopped: 26 mm each time."""
+    trial = trial_to(home)
+    for granted in (2, 0, 2, 0):
+        trial.traffic = lambda question, n=granted: Answer(
+            question.number, ReserveAnswer(n, "" if n else "r7", None, "r7 drives there")
+        )
+        trial.run(2.5)
+    fix = trial.navigator.fix
+    assert fix is not None and fix.node == A
+    assert trial.commands[-1] == Command() and 0.3 < trial.eyes.pose.x - 1.0 < 1.4
+    assert fix.node_from_robot.mean.x == pytest.approx(trial.eyes.pose.x - 1.0, abs=1e-6)
 
 
 def test_a_robot_that_waits_too_long_looks_for_another_way(home):
