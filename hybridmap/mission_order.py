@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import time
+from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated
@@ -177,5 +178,11 @@ class Missions:
 
     @staticmethod
     def newest(reports: list[MissionReport]) -> Missions:
-        """The newest of all."""
-        return Missions(tuple(sorted(reports, key=lambda report: report.order.rank)[-MAX_KEPT:]))
+        """As many as are kept: the newest of each robot first, so that none displaces those of others."""
+        turns, ranked = Counter[str](), []
+        for report in sorted(reports, key=lambda report: report.order.rank, reverse=True):
+            robot = report.order.robot
+            ranked.append((turns[robot], report))
+            turns[robot] += 1
+        kept = (report for _, report in sorted(ranked, key=lambda one: one[0])[:MAX_KEPT])
+        return Missions(tuple(sorted(kept, key=lambda report: report.order.rank)))

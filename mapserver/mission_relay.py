@@ -47,6 +47,13 @@ EXPIRY = 600.0
 EVERY = 1.0
 """Time between two attempts, s."""
 
+_Key = tuple[str, str]
+"""A robot and the id of a mission: what one robot reports is none of another's, whatever id it has."""
+
+
+def _key(mission: MissionOrder | MissionRequest) -> _Key:
+    return mission.robot, mission.id
+
 
 class MissionRelay:
     """Takes missions from any thread. `hear` and `retry` are called by the server."""
@@ -71,7 +78,7 @@ class MissionRelay:
         self._bus, self._keys, self._store, self._places, self._time_ns = bus, keys, store, places, time_ns
         self.roster: Roster | None = None
         self._turn = threading.RLock()
-        self._reports: dict[str, MissionReport] = {}
+        self._reports: dict[_Key, MissionReport] = {}
         self.reload()
 
     def reload(self) -> None:
@@ -84,9 +91,9 @@ class MissionRelay:
             return
         with self._turn:
             for report in missions.reports:
-                before = self._reports.get(report.order.id)
+                before = self._reports.get(_key(report.order))
                 if before is None or report.supersedes(before):
-                    self._reports[report.order.id] = report
+                    self._reports[_key(report.order)] = report
 
     def missions(self) -> Missions:
         """All that are known, oldest first."""
@@ -100,7 +107,7 @@ class MissionRelay:
             InvalidValue: there is no such robot.
         """
         with self._turn:
-            known = self._reports.get(request.id)
+            known = self._reports.get(_key(request))
         if known is not None and known.state is not MissionState.SENT:
             return known
         if known is None:
@@ -146,7 +153,8 @@ class MissionRelay:
     def hear(self, status: AgentStatus) -> None:
         """Take note of what a robot reports of its mission."""
         report = status.mission
-        if report is None:
+        # That one is on its way only the server can say: it would try to hand it on.
+        if report is None or report.state is MissionState.SENT:
             return
         self._note(report)
         self._replace_older(report.order)
@@ -221,15 +229,18 @@ class MissionRelay:
         # Before it is kept: with it the whole record could be neither written nor sent, and no robot stopped.
         encode(report)
         with self._turn:
-            before = self._reports.get(report.order.id)
+            before = self._reports.get(_key(report.order))
             if before is not None and not report.supersedes(before):
                 return before
-            self._reports[report.order.id] = report
+            if before is not None:
+                # A robot says what has become of an order, and not what was ordered, or by whose name.
+                report = replace(report, order=before.order)
+            self._reports[_key(report.order)] = report
             if before is not None and before.state is report.state:
                 return report
             kept = Missions.newest(list(self._reports.values()))
             if len(self._reports) > MAX_KEPT:
-                self._reports = {report.order.id: report for report in kept.reports}
+                self._reports = {_key(report.order): report for report in kept.reports}
             try:
                 self._store.put_result(KEPT, encode(kept))
             except InvalidFile as error:

@@ -39,6 +39,7 @@ from mapweave.identities.key_file import read_key_file
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials
+from mapweave.wire.each_robot import each_robot
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
@@ -242,19 +243,11 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         """Stop a robot, or all of them; the orders go to the robots directly, and at once.
 
         Raises:
-            NotConnected: one does not answer; the others are stopped.
+            NotConnected: one does not answer, or not as it should; the others are stopped.
         """
         self._check_role()
-        names = [robot] if robot else [entry.robot for entry in self.status().robots if entry.alive]
-        reports, silent = [], []
-        for name in names:
-            try:
-                reports.append(self._direct(check_name(name), MissionKind.STOP, None, ""))
-            except NotConnected as error:
-                silent.append(str(error))
-        if silent:
-            raise NotConnected("; ".join(silent))
-        return tuple(reports)
+        names = [check_name(robot)] if robot else [e.robot for e in self.status().robots if e.alive]
+        return tuple(each_robot(names, lambda name: self._direct(name, MissionKind.STOP, None, "")))
 
     def portal_done(self, robot: str) -> str:
         """Tell a robot that it was taken through the portal at which it waits; it looks where it is then.

@@ -56,7 +56,7 @@ from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConn
 from mapweave.hybridmap.explanation import PairExplanation, route_over
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
-from mapweave.hybridmap.mission_order import MissionKind, Missions
+from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
 from mapweave.identities.logins import Logins
 from mapweave.mapserver.http.annotations import annotate, annotations_json
 from mapweave.mapserver.http.answering import Answering
@@ -73,6 +73,7 @@ from mapweave.mapserver.http.rates import LIMITED, Rates
 from mapweave.mapserver.http.reply import PATIENCE, Reply, busy, refusal
 from mapweave.mapserver.http.same_site import SameSite, is_loopback
 from mapweave.mapserver.http.serving import HttpThread, Limits
+from mapweave.wire.each_robot import each_robot
 
 log = logging.getLogger(__name__)
 
@@ -318,9 +319,11 @@ class Questions:
 
         def stop() -> Mapping[str, Any]:
             names = [entry.robot for entry in self._server.robots().robots if entry.alive]
-            return json_values(
-                Missions(tuple(self._server.give(name, MissionKind.STOP, "", by, "", ()) for name in names))
-            )
+
+            def one(name: str) -> MissionReport:
+                return self._server.give(name, MissionKind.STOP, "", by, "", ())
+
+            return json_values(Missions(tuple(each_robot(names, one))))
 
         return await run_in_threadpool(stop)
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import http.client
 import json
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import pytest
 
+from mapweave import fleet
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
-from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.limits import MAX_STAMP_NS
+from mapweave.hybridmap.mission_order import MAX_KEPT, MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
@@ -143,6 +146,88 @@ def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
     held = [one for one in house.person.missions("r0") if one.order.id == report.order.id]
     assert held == [control.report] == [report]
     assert house.entry("r1").status == status
+    link.close()
+
+
+def test_one_robot_displaces_no_missions_of_others(house: House) -> None:
+    """By very many missions with stamps of the far future, which it says that it has, or is to get."""
+    link, _ = house.robot()
+    report = house.person.explore("r0")
+    liar = house.bus()
+    liar.announce(KEYS.agent_alive(MapId("r1", 1)))
+    status = AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, "r1", 1)
+
+    def say(mission_id: str, state: MissionState) -> None:
+        order = MissionOrder(mission_id, "r1", MissionKind.EXPLORE, MAX_STAMP_NS, "anna")
+        new = replace(status, mission=MissionReport(order, state))
+        liar.publish(KEYS.agent_status("r1"), encode(new))
+        eventually(lambda: house.entry("r1").status == new)
+
+    for k in range(MAX_KEPT + 5):
+        say(f"m{k}", MissionState.RUNNING)
+    say(report.order.id, MissionState.DONE)
+    say("never", MissionState.SENT)
+    missions = house.person.missions()
+    assert [one for one in missions if one.order.robot == "r0"] == [report] and len(missions) == MAX_KEPT
+    assert all(one.state is not MissionState.SENT for one in missions), "only the server sends missions"
+    house.stop_server()
+    house.start_server()
+    assert report in house.person.missions()
+    assert house.person.go("r0", str(THERE)) in house.person.missions()
+    link.close()
+
+
+def test_a_robot_does_not_say_what_was_ordered(house: House) -> None:
+    link, _ = house.robot()
+    report = house.person.explore("r0")
+    other = replace(report.order, kind=MissionKind.STOP, by="bert", stamp_ns=1)
+    status = replace(house.entry("r0").status, mission=MissionReport(other, MissionState.DONE, 1.0))
+    house.bus().publish(KEYS.agent_status("r0"), encode(status))
+    eventually(lambda: house.person.missions()[0].state is MissionState.DONE)
+    assert house.person.missions()[0].order == report.order
+    link.close()
+
+
+@pytest.mark.parametrize("by_http", [False, True])
+def test_no_robot_keeps_others_from_being_stopped(
+    house: House, monkeypatch: pytest.MonkeyPatch, by_http: bool
+) -> None:
+    """Robots that hang, that answer nonsense, and after whose mission none can come."""
+    link, control = house.robot()
+    monkeypatch.setattr(mission_relay, "ANSWER", 20.0)
+    monkeypatch.setattr(fleet, "ANSWERED", 20.0)
+    over, bus = threading.Event(), house.bus()
+    last = MissionOrder("last", "a1", MissionKind.EXPLORE, MAX_STAMP_NS, "anna")
+    answers = {
+        "a0": lambda request: request.reply(b"?"),
+        "a1": lambda request: request.reply(encode(MissionReport(last, MissionState.REPLACED))),
+        "a2": lambda request: (over.wait(20.0), request.reply(b"?")),
+    }
+    for name, answer in answers.items():
+        bus.announce(KEYS.agent_alive(MapId(name, 1)))
+        (house.bus() if name == "a2" else bus).serve(KEYS.mission(name), answer)
+        new = AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, name, 1)
+        if name == "a1":
+            new = replace(new, mission=MissionReport(last, MissionState.RUNNING))
+        bus.publish(KEYS.agent_status(name), encode(new))
+        eventually(lambda new=new, name=name: house.entry(name).status == new)
+    errors = []
+
+    def stop() -> None:
+        if by_http:
+            with Web(("127.0.0.1", 0), house.server) as web:
+                errors.append(ask(web, "POST", "/stop")[1]["error"])
+            return
+        with pytest.raises(NotConnected) as error:
+            house.person.stop()
+        errors.append(str(error.value))
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
+    eventually(lambda: control.report is not None and control.report.order.kind is MissionKind.STOP)
+    over.set()
+    stopping.join()
+    assert ("a1" if by_http else "a0") in errors[0]
     link.close()
 
 
