@@ -17,6 +17,7 @@ from mapweave.hybridmap.agent_status import (
     one_line,
 )
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.known_logs import Lag
@@ -193,7 +194,11 @@ def whereabouts(status: AgentStatus, merged: MergedMap) -> tuple[Pose2 | None, i
     component = merged.component_of(node)
     if component is None or node not in merged.poses:
         return None, NO_COMPONENT
-    return merged.pose(node) @ node_from_robot, component
+    pose = merged.pose(node) @ node_from_robot
+    if max(abs(pose.x), abs(pose.y)) > MAX_POSITION:
+        # No message holds it, and the message is about all robots.
+        return None, NO_COMPONENT
+    return pose, component
 
 
 def _nearest(map_id: MapId, map_from_robot: Pose2, merged: MergedMap) -> tuple[NodeId, Pose2] | None:

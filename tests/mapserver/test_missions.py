@@ -177,6 +177,24 @@ def test_one_robot_displaces_no_missions_of_others(house: House) -> None:
     link.close()
 
 
+def test_a_robot_that_says_it_is_very_far_away_hides_no_other(house: House) -> None:
+    """Where it is by its own words lies beyond the range of messages."""
+    link, _ = house.robot()
+    liar, there = house.bus(), Pose2(1e6, 1e6, 0.0)
+    liar.announce(KEYS.agent_alive(MapId("r1", 1)))
+    for number, fix in enumerate(sorted(house.mapped.truth)):
+        lie = Status("x", "", 0, 0, Pose2(), False, "goto", fix_node=fix, node_from_robot=there)
+        liar.publish(KEYS.agent_status("r1"), encode(AgentStatus(lie, number, "r1", 1)))
+        eventually(
+            lambda lie=lie: (
+                [one.status.status for one in house.server.robots().robots if one.status][1:] == [lie]
+            )
+        )
+        entry = house.entry("r0")
+        assert entry.merged_from_robot is not None and entry.component == 0
+    link.close()
+
+
 def test_a_robot_does_not_say_what_was_ordered(house: House) -> None:
     link, _ = house.robot()
     report = house.person.explore("r0")
