@@ -18,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
 from mapweave.mapserver.nearby import StandingRobot
 from mapweave.mapserver.routes import Router
+from mapweave.mapserver.wire_limits import LONGEST_LEG
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 LEASE = 5.0
@@ -35,6 +37,8 @@ RADIUS = 0.2
 """Of a robot whose footprint is not known, m."""
 STEP = 0.05
 """Between two points of a way that are compared, m."""
+LONGEST = 1e4
+"""Of a way, m: its points take 3 MB. A robot may say that it is a thousand kilometres from its node."""
 ASIDE, APART = 12, 0.3
 """Places that are tried to step aside to, and m between two: a place has a node for each heading."""
 
@@ -122,6 +126,9 @@ class Reservations:
             request: its way. One without nodes releases what it holds.
             router: of the newest merged map.
             now: of a clock that only grows, s.
+
+        Raises:
+            InvalidValue: no robot drives such a way.
         """
         with self._turn:
             self._leases = {robot: lease for robot, lease in self._leases.items() if now < lease.until}
@@ -136,6 +143,8 @@ class Reservations:
             robot = poses[request.start] @ request.start_from_robot
             here = np.array([robot.x, robot.y])
             stops = np.array([here, *([poses[node].x, poses[node].y] for node in request.route)])
+            if _too_long(stops):
+                raise InvalidValue("the way is longer than any that a robot drives")
             radius = max(router.roads.union.nodes[node].radius for node in request.route) or RADIUS
             others = {name: one for name, one in self._leases.items() if one.component == component}
             granted, held, holder = _free(stops, radius, others)
@@ -242,6 +251,12 @@ def _points(a: Points, b: Points) -> Points:
     return np.linspace(a, b, count)
 
 
+def _too_long(stops: Points) -> bool:
+    """Whether no robot drives a way: its points would be too many to compare."""
+    legs = np.linalg.norm(np.diff(stops, axis=0), axis=1)
+    return bool(legs.max() > LONGEST_LEG or legs.sum() > LONGEST)
+
+
 def _free(stops: Points, radius: float, others: Mapping[str, _Lease]) -> tuple[int, Points, str]:
     """How many stops of a way may be driven to, the points up to there, and who holds the next part."""
     held, length = stops[:1], 0.0
@@ -305,7 +320,9 @@ def _place_aside(lease: _Lease, others: Sequence[_Lease], router: Router) -> _As
 
 
 def _way(here: Points, answer: RouteAnswer, poses: Mapping[NodeId, Pose2]) -> Points | None:
-    """(N, 2) points from a place along a route; None without one."""
+    """(N, 2) points from a place along a route; None without one, and of one that no robot drives."""
     nodes = [leg.node.id for leg in answer.legs if leg.node.id in poses]
     stops = np.array([here, *([poses[node].x, poses[node].y] for node in nodes)])
-    return np.vstack([here[None], *(_points(a, b) for a, b in pairwise(stops))]) if nodes else None
+    if not nodes or _too_long(stops):
+        return None
+    return np.vstack([here[None], *(_points(a, b) for a, b in pairwise(stops))])

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -73,6 +74,27 @@ def test_the_way_of_a_lone_robot_is_free_as_far_as_it_may_hold_it(router: Router
     assert AHEAD == 10.0
     long = traffic.ask("r0", 0, *range(1, 9), 18, 17, 16, 15, 14)
     assert 8 <= long.granted < 13 and long.holder == "", "it holds no more than the next 10 m"
+
+
+def test_a_way_that_no_robot_drives_takes_no_time_and_holds_nothing(router: Router) -> None:
+    """A robot may say that it is a thousand kilometres away, or that it drives to and fro without end."""
+    traffic = Traffic(router)
+    for ask in (
+        lambda: traffic.ask("r0", 0, 1, 2, off=1e6),
+        lambda: traffic.ask("r0", 0, 1, 2, off=2e3),
+        lambda: traffic.ask("r0", 0, *(k for _ in range(1000) for k in (1, 8))),
+    ):
+        with pytest.raises(InvalidValue, match="longer than any that a robot drives"):
+            ask()
+    assert traffic.ask("r1", 0, 1, 2, 3).granted == 3
+    # Nor when it stands in another's way.
+    traffic = Traffic(router)
+    for traffic.now in (0.0, 1.0, 5.0):
+        here = NearbyRequest("r0", ((node(2), Pose2()),), 0.05, 0.02, 0.2, 0.4, 0.5)
+        traffic.nearby.ask(here, router.merged, traffic.now)
+    traffic.now = 5.1
+    traffic.ask("r1", 0, 1, 2, 3)
+    assert traffic.reservations.room_for("r0", node(2), Pose2(1e6, 0.0, 0.0), router, traffic.now) is None
 
 
 def test_who_comes_second_waits_until_the_first_has_passed(router: Router) -> None:
