@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
-import math
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.limits import MAX_FLOAT
 from mapweave.hybridmap.pose import Pose2
 from mapweave.storage.atomic_file import read_whole
 
@@ -70,7 +71,9 @@ def parse_nav2_map(data: bytes, path: Path) -> Nav2Map:
         raise InvalidFile(f"{path}: resolution {resolution:g}: give metres in a pixel, for example 0.05")
     origin = fields.get("origin")
     if not isinstance(origin, list) or len(origin) != 3 or not all(map(_is_number, origin)):
-        raise InvalidFile(f"{path}: origin {origin!r}: give [x, y, yaw], for example [-10.0, -5.2, 0.0]")
+        raise InvalidFile(
+            f"{path}: origin {_words(origin)}: give [x, y, yaw], for example [-10.0, -5.2, 0.0]"
+        )
     occupied = _number(path, fields, "occupied_thresh", 0.65)
     free = _number(path, fields, "free_thresh", 0.25)
     if not 0.0 <= free < occupied <= 1.0:
@@ -79,8 +82,11 @@ def parse_nav2_map(data: bytes, path: Path) -> Nav2Map:
         )
     negate = fields.get("negate", 0)
     if negate not in (0, 1):
-        raise InvalidFile(f"{path}: negate {negate!r}: give 0 or 1")
-    place = path.parent / Path(image).expanduser()
+        raise InvalidFile(f"{path}: negate {_words(negate)}: give 0 or 1")
+    try:
+        place = path.parent / Path(image).expanduser()
+    except RuntimeError as error:
+        raise InvalidFile(f"{path}: image {image!r:.80}: {error}") from None
     return Nav2Map(place, resolution, Pose2(*map(float, origin)), bool(negate), occupied, free)
 
 
@@ -93,7 +99,8 @@ def _fields(path: Path, data: bytes) -> dict[str, Any]:
         raise InvalidFile(f"{path}: is no map.yaml: it has {len(data)} bytes")
     try:
         fields = YAML(typ="safe", pure=True).load(io.BytesIO(data))
-    except (YAMLError, ValueError, RecursionError) as error:
+    except (YAMLError, ValueError, LookupError, TypeError, RecursionError) as error:
+        # A value that is not of its tag, such as `!!bool maybe`, is a LookupError.
         raise InvalidFile(f"{path}: is no YAML ({str(error).split(chr(10))[0]})") from None
     if not isinstance(fields, dict):
         raise InvalidFile(f"{path}: is no map.yaml: it has no fields")
@@ -105,9 +112,19 @@ def _number(path: Path, fields: dict[str, Any], name: str, default: float | None
     if value is None:
         raise InvalidFile(f"{path}: has no `{name}:`")
     if not _is_number(value):
-        raise InvalidFile(f"{path}: {name} {value!r}: give a number")
+        raise InvalidFile(f"{path}: {name} {_words(value)}: give a number")
     return float(value)
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    # A float of more than 300 digits is infinite; an integer of so many is no float.
+    return abs(value) <= MAX_FLOAT
+
+
+def _words(value: object) -> str:
+    """The beginning of a value: by aliases one of a few hundred bytes may stand for gigabytes of text."""
+    text = reprlib.Repr()
+    text.maxlevel = 2
+    return text.repr(value)[:80]

@@ -103,6 +103,11 @@ def test_a_map_of_nav2_is_read(tmp_path: Path) -> None:
         (f"{MAP}free_thresh: 0.9\n", "free < occupied"),
         (f"{MAP}a: !!python/object/apply:os.system [ls]\n", "is no YAML"),
         ("[" * 1500, "is no YAML"),
+        (f"{MAP}a: !!bool maybe\n", "is no YAML"),
+        (f"{MAP}a: !!int ''\n", "is no YAML"),
+        (MAP.replace("0.05", "1" + 400 * "0"), "resolution 1000.*: give a number"),
+        (MAP.replace("0.25", "1" + 400 * "0"), r"give \[x, y, yaw\]"),
+        (MAP.replace("plan.pgm", "~nobody-here/plan.pgm"), "image '~nobody-here/plan.pgm'"),
         ("a" * 10_000, "10000 bytes"),
     ],
 )
@@ -114,3 +119,17 @@ def test_what_is_no_map_yaml_is_refused_in_one_line(tmp_path: Path, text: str, w
     assert "\n" not in str(refused.value) and str(path) in str(refused.value)
     with pytest.raises(InvalidFile, match="cannot be read"):
         read_nav2_map(tmp_path)
+
+
+@pytest.mark.parametrize("field", ["origin", "resolution", "negate", "free_thresh"])
+def test_aliases_of_aliases_fill_no_memory(tmp_path: Path, field: str) -> None:
+    """600 bytes of lists of lists, of which the text would take terabytes."""
+    names = ["x", *(f"*a{k}" for k in range(13))]
+    levels = [f"a{k}: &a{k} [{', '.join(9 * [name])}]\n" for k, name in enumerate(names)]
+    path = tmp_path / "map.yaml"
+    path.write_text(f"{''.join(levels)}image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*(line for line in lines if not line.startswith(field)), f"{field}: *a13\n"]))
+    with pytest.raises(InvalidFile, match=field) as refused:
+        read_nav2_map(path)
+    assert len(str(refused.value)) < 500
