@@ -73,7 +73,7 @@ def body_of_words(
     elif isinstance(area := plain.get("area"), Mapping):
         plain["area"] = {name: _node(value, name, near, resolve) for name, value in area.items()}
     elif radius is not None:
-        node = NodeId(*_node(plain.pop("node", None), "node", near, resolve))
+        node = value_of(_node(plain.pop("node", None), "node", near, resolve), NodeId)
         plain["area"] = packed(Area.around(node, value_of(radius, float)))
     if isinstance(edge := plain.get("edge"), list | tuple):
         plain["edge"] = [_node(word, "node", near, resolve) for word in edge]

@@ -77,7 +77,7 @@ def annotate(server: Annotating, data: bytes, by: str, who: str = "") -> Mapping
     """
     try:
         posted = msgspec.json.decode(data, type=_Posted)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidValue(f"{error}; {FORM}") from None
     annotation = annotation_of_words(
         posted.name[: MAX_NAME + 1], posted.body, posted.removed, server.annotations, server.resolve,

@@ -85,7 +85,7 @@ def read_request(
     """
     try:
         asked = msgspec.json.decode(body, type=_Body)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InvalidValue(f"the body is no constraint: {error}; write {ONE}, as JSON") from None
     numbered = not isinstance(asked.undo, bool)
     given = [

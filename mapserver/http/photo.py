@@ -117,7 +117,7 @@ def scaled(camera: Camera, scale: float) -> Camera:
 def _number(name: str, value: Any) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if isinstance(value, bool) or not math.isfinite(number) or abs(number) > 1e6:
         raise InvalidValue(f"{name} must be a number, not {str(value)[:40]!r}")

@@ -55,7 +55,7 @@ class Asking:
 
     def http(self, method: str, body: object = None) -> tuple[int, dict[str, Any]]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        data = None if body is None else json.dumps(body).encode()
+        data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
         connection.request(method, "/constraints", data, {"Content-Type": "application/json"})
         reply = connection.getresponse()
         return reply.status, json.loads(reply.read())
@@ -175,6 +175,7 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         ({"window": {"map": "a.1", "begin": "noon"}}, "'noon' is no time"),
         ({"undo": 1}, "there is no constraint 1"),
         ({"retired": ["a.1"]}, "unknown field"),
+        (b'{"link": ["\xff", "a.1.1"]}', "the body is no constraint"),
     ],
 )
 def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: str) -> None:

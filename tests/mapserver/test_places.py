@@ -137,6 +137,9 @@ def test_places_over_http(house: House) -> None:
             (b'{"name": "x", "body": {"kind": "place", "node": 5}}', "Expected `array"),
             (b'{"name": "x", "body": {"kind": "place", "node": "50,50"}}', "nothing is mapped within 2 m"),
             (b'{"name": "r0.1.1", "body": {"kind": "place", "node": "r0.1.3"}}', "looks like a node"),
+            (b'{"name": "x", "body": {"kind": "place", "radius": 1}}', "Expected `array"),
+            (b'{"name": "x", "body": {"kind": "place", "radius": 1, "node": ["r0"]}}', "Expected `array`"),
+            (b'{"name": "x", "body": {"a": ' + 9999 * b"[", "recursion"),
         ]:
             status, answer = ask(web, "POST", "/annotations", wrong)
             assert status == 400 and reason in answer["error"], answer

@@ -170,8 +170,13 @@ def test_images_that_are_none(served: Web, body: bytes, words: str) -> None:
             form()[1]["Content-Type"],
             "neither TOML nor JSON",
         ),
+        (
+            form(("image", picture()), ("camera", b'{"fx": 1%s}' % (400 * b"0")))[0],
+            form()[1]["Content-Type"],
+            "fx must be a number",
+        ),
     ],
-    ids=["no-boundary", "no-parts", "no-image", "cut", "many", "no-name", "no-toml", "deep-json"],
+    ids=["no-boundary", "no-parts", "no-image", "cut", "many", "no-name", "no-toml", "deep-json", "digits"],
 )
 def test_forms_that_are_none(served: Web, body: bytes, content_type: str, words: str) -> None:
     status, answer = post(served, body=body or b"x", **{"Content-Type": content_type})
