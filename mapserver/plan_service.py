@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from mapweave.hybridmap.annotation import Annotation, Annotations
-from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage, PlanPiece, PlanReceived
 from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.log.store import Store
@@ -19,6 +20,8 @@ from mapweave.storage.plan_image import plan_file
 from mapweave.wire.bus import Bus, Closing
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
+
+log = logging.getLogger(__name__)
 
 MOST_AT_ONCE = 4
 """Images on their way; one more takes the place of the oldest."""
@@ -121,9 +124,14 @@ class PlanService:
             raise InvalidValue("the image of this plan is not on the server: send it first")
 
     def files(self) -> dict[str, bytes]:
-        """The images of the plans in force, for a map file; those that are lost are left out."""
-        used = [plan.image for _, plan in self._annotations().in_force(FloorPlan)]
-        return {image.sha256: self.images.get(image.sha256) for image in used if image.sha256 in self.images}
+        """The images of the plans in force, for a map file; those that are lost or damaged are left out."""
+        files: dict[str, bytes] = {}
+        for _, plan in self._annotations().in_force(FloorPlan):
+            try:
+                files[plan.image.sha256] = self.images.get(plan.image.sha256)
+            except InvalidFile as error:
+                log.warning("a map file is made without an image: %s", error)
+        return files
 
 
 def _sha256(payload: bytes) -> str:

@@ -82,6 +82,11 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
         house.start_server()
     content = map_of(fleet)
     assert content.images == {PNG.image.sha256: PNG.png}
+    # One whose image the disk has damaged takes no map along.
+    (kept,) = house.mapped.path.with_name(f"{house.mapped.path.name}.plans").iterdir()
+    for damaged in (b"", PNG.png[:-1]):
+        kept.write_bytes(damaged)
+        assert len(map_of(fleet).poses) == 7 and map_of(fleet).images == {}
     fleet.withdraw("plan", "flat")
     assert fleet.plans().plans == () and map_of(fleet).images == {}
 
