@@ -70,7 +70,6 @@ def refined(mapped: Landmarks, depths: Array, sigmas: Array) -> Landmarks | None
         mapped: N landmarks as the map has them.
         depths: (N,) m, NaN where nothing was learned.
         sigmas: (N,) m, of independent errors.
-        s: when a depth is refined.
     """
     sigmas_with_floor = np.hypot(sigmas, FLOOR[0] + FLOOR[1] * depths)
     with np.errstate(invalid="ignore"):

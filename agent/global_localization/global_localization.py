@@ -45,7 +45,7 @@ LEAST_VIEWS = 0.25
 LENIENT = 2.0
 """A robot that has only just lost all landmarks accepts recognitions that are so much less exact."""
 VAGUE = 3.0
-"""A recognition so many times less exact than `SURE` may still confirm an exact one."""
+"""A recognition so many times less exact than `sure` may still confirm an exact one."""
 
 FAMILIAR = 3
 """So many headings of nodes nearby are tried before a turn all around,"""

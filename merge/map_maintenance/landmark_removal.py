@@ -66,11 +66,7 @@ class LandmarkRemover:
     """Keeps the landmark observations from merged map to merged map: each view is compared once."""
 
     def __init__(self) -> None:
-        """Begin with nothing seen again.
-
-        Args:
-            settings: when a landmark has faded.
-        """
+        """Begin with nothing seen again."""
         self._observations: dict[NodeId, list[LandmarkObservations]] = {}
         self._faded: dict[NodeId, NDArray[np.bool_]] = {}
         self._graphs: tuple[PoseGraph, ...] = ()

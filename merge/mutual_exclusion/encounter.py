@@ -39,7 +39,7 @@ class Encounter:
     seen: VisibilityInterval
     least_apart: float
 
-    def _windows(self, s: ExclusionSettings) -> NDArray[np.int64]:
+    def _windows(self) -> NDArray[np.int64]:
         """(T,) number of the window of time in which a moment is; -1 where it is not known of both."""
         windows = np.floor(self.times / WINDOW).astype(np.int64)
         _, seats = np.unique(windows[self.known], return_inverse=True)
@@ -47,30 +47,28 @@ class Encounter:
         out[self.known] = seats
         return out
 
-    def by_footprints(self, clear: Array, s: ExclusionSettings) -> Array:
+    def by_footprints(self, clear: Array) -> Array:
         """(W,) logarithms of the odds against the merge that each window of time gives.
 
         Args:
             clear: (K,) chances that they were clear of each other after all in the moments that are close.
-            s: how long a window is.
         """
         # A footprint takes this share of the neighbourhood; without it many moments would prove anything.
         free = 1.0 - NEIGHBOURHOOD**-2
         odds = np.where(self.distances < NEIGHBOURHOOD * self.least_apart, free, 1.0)
         odds[self.close] = free / clear
-        seats = self._windows(s)[self.known]
+        seats = self._windows()[self.known]
         # Moments of one window hang together: the mean of their odds is fair all the same, a product is not.
         out: Array = np.log(np.bincount(seats, odds[self.known]) / np.bincount(seats))
         return out
 
-    def by_visibility(self, odds: Array, s: ExclusionSettings) -> Array:
+    def by_visibility(self, odds: Array) -> Array:
         """(S, W) the same of what they should have seen.
 
         Args:
             odds: (S, M) against the merge, of each observation.
-            s: how long a window is.
         """
-        seats = self._windows(s)
+        seats = self._windows()
         windows, count = seats[self.seen.moments], int(seats.max()) + 1
         counts = np.bincount(windows, minlength=count)
         sums = np.array([np.bincount(windows, row, minlength=count) for row in odds])
@@ -81,39 +79,37 @@ class Encounter:
         """Whether that is enough to refuse a merge.
 
         Args:
-            clear: as in `by_bodies`.
-            odds: as in `by_sight`.
+            clear: as in `by_footprints`.
+            odds: as in `by_visibility`.
             weights: (S,) how probable each way is in which poses may be wrong.
             s: what is enough.
         """
-        by_window, total = self.added(clear, odds, weights, s)
+        by_window, total = self.added(clear, odds, weights)
         # What was enough at any time is enough: later meetings do not make it possible.
         windows = np.cumsum(by_window > math.log(2.0))
         return bool(((windows >= s.least_moments) & (total >= -math.log(s.doubt))).any())
 
-    def added(self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings) -> tuple[Array, Array]:
+    def added(self, clear: Array, odds: Array, weights: Array) -> tuple[Array, Array]:
         """(W,) logarithms of the odds against the merge that each window adds to those before, and (W,) sums.
 
         Over all ways in which poses may be wrong, each as probable as it is: the later windows meet those
         that the earlier ones have left.
         """
-        by_way = np.cumsum(self.by_footprints(clear, s) + self.by_visibility(odds, s), axis=1)
+        by_way = np.cumsum(self.by_footprints(clear) + self.by_visibility(odds), axis=1)
         total: Array = -scipy.special.logsumexp(-by_way, axis=0, b=weights[:, None])
         added: Array = np.diff(total, prepend=0.0)
         return added, total
 
-    def evidence(
-        self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings
-    ) -> tuple[float, float]:
+    def evidence(self, clear: Array, odds: Array, weights: Array) -> tuple[float, float]:
         """By footprints and by mutual visibility, at the maximum."""
-        by_footprints = np.cumsum(self.by_footprints(clear, s))
-        _, total = self.added(clear, odds, weights, s)
+        by_footprints = np.cumsum(self.by_footprints(clear))
+        _, total = self.added(clear, odds, weights)
         most = int(np.argmax(total))
         return float(by_footprints[most]), float(total[most] - by_footprints[most])
 
     def ample(self, clear: Array, odds: Array, s: ExclusionSettings) -> int:
         """Number of moments after which there is twice as much evidence as is asked for; all, if never."""
-        evidence = np.cumsum(self.by_footprints(clear, s) + self.by_visibility(odds, s)[0])
+        evidence = np.cumsum(self.by_footprints(clear) + self.by_visibility(odds)[0])
         enough = np.flatnonzero(evidence >= -2.0 * math.log(s.doubt))
-        seats = self._windows(s)
+        seats = self._windows()
         return int(np.flatnonzero(seats == enough[0])[-1]) + 1 if len(enough) else len(seats)

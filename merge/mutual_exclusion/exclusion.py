@@ -63,7 +63,7 @@ def clash_of(
         return None
     # Nor for all observations, where the first of them are enough.
     ample = meeting.ample(clear, odds, s)
-    by_footprints, by_visibility = meeting.evidence(clear, odds, still, s)
+    by_footprints, by_visibility = meeting.evidence(clear, odds, still)
     close, least_apart = meeting.close, meeting.least_apart
     shift = SIGMAS * _pose_sigmas(graph, first, second, met.one.nearest[close], met.two.nearest[close])
     clear = chances_clear(met.apart, shift, met.spreads, least_apart)
@@ -72,7 +72,7 @@ def clash_of(
         errors = errors_in_common(graph, part.seen) if len(part.seen) else none_wrong(part.seen)
         moved = odds_against(part.seen, errors, least_apart)
         if part.refuses(clear, moved, errors.weights, s):
-            evidence = sum(part.evidence(clear, moved, errors.weights, s))
+            evidence = sum(part.evidence(clear, moved, errors.weights))
             return _clash(
                 graph, (first, second), meeting, odds[0] if by_visibility > by_footprints else None, evidence
             )

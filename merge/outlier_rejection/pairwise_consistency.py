@@ -167,7 +167,7 @@ def sort_links(
     best = best_clique(agree, hundredths, EXACT)
     kept = [links[k] for k in best]
     reason = _too_little(kept, s)
-    rival = _rival(agree, hundredths, best, s)
+    rival = _rival(agree, hundredths, best)
     support, against_it = int(landmarks[best].sum()), int(landmarks[rival].sum())
     weight, against = float(weights[best].sum()), float(weights[rival].sum())
     sets = tuple(kept), tuple(links[k] for k in rival)
@@ -227,9 +227,7 @@ def _against_odometry(
     return [link for link, good in zip(links, fits, strict=True) if good], refusals
 
 
-def _rival(
-    agree: NDArray[np.bool_], weights: NDArray[np.int64], best: list[int], s: ConsistencySettings
-) -> list[int]:
+def _rival(agree: NDArray[np.bool_], weights: NDArray[np.int64], best: list[int]) -> list[int]:
     """The best set among the links that agree with less than half of the kept ones."""
     rest = np.setdiff1d(np.arange(len(weights)), best)
     rest = rest[agree[rest][:, best].mean(axis=1) < 0.5] if best else rest
