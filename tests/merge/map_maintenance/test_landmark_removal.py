@@ -93,6 +93,15 @@ def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None
     assert presence(together, unseen)[0] == removal.AT_FIRST, "no view could show it"
 
 
+def test_landmarks_of_a_place_that_a_visit_sees_a_hundred_times_have_a_presence() -> None:
+    """Before, all likelihoods of a long visit became 0, and what was found half of the time never faded."""
+    rng = np.random.default_rng(0)
+    together = np.ones((60, 60), np.bool_)
+    found = [(rng.random(40) < 0.5).tolist() for _ in range(100)]
+    there = presence(together, [look([True] * 40, some) for some in found])
+    assert (there > 0.9).all(), "what is missed beside what is found is not gone"
+
+
 def test_near_landmarks_may_be_of_one_thing() -> None:
     together = things(NODE, 0.5)
     points = NODE.points_in_robot
