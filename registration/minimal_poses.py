@@ -5,7 +5,7 @@ With the camera at (tx, ty, heading) of the points' frame, c and s the heading's
 - Three bearings: Y = a X for a pixel with slope a is linear in (c, s, A, B). Two differences of three such
   rows lose B, and their cross product is (c, s, A) up to scale.
 - Two points with depth: height over the camera and the pixel's row give a depth (or the image measures it),
-  - Two points with depth: height over the camera and the pixel's row give a depth (or the image measures it),
+  and a turn and a shift in the plane carry the two of the robot's frame upon the two of the points' frame.
 """
 
 from __future__ import annotations
