@@ -106,6 +106,7 @@ class WrongGeometrySearch:
         self._s = consistency
         self._memory = DecisionCache()
         self._ties: dict[MapPair, _Tie] = {}
+        self._waiting: set[MapPair] = set()
         self._checked: dict[tuple[MapId, tuple[MapId, ...]], bool] = {}
 
     def wrong(
@@ -127,9 +128,12 @@ class WrongGeometrySearch:
             The maps that are wrong, by id.
         """
         self._memory.forget_others(maps)
+        stale = {*stale, *self._waiting}
+        # Their links are sorted once both maps are used again.
+        self._waiting = {pair for pair in stale if not set(pair).isdisjoint(left_out)}
         for pair in stale:
             self._ties.pop(pair, None)
-            if not set(pair).isdisjoint(left_out):
+            if pair in self._waiting:
                 continue
             with suppress(*UNSOLVABLE):
                 self._tie(pair, maps, links(pair))

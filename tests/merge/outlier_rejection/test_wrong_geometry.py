@@ -97,6 +97,17 @@ def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expect
         assert finder.wrong(maps, links.__getitem__, ()).keys() == wrong.keys()
 
 
+def test_a_map_that_was_left_out_when_its_links_came_is_searched_once_it_is_used() -> None:
+    """Such as one that was taken for a copy. Before, it was searched when its links changed again."""
+    maps = {MapId(agent, 1): corridor(agent) for agent in "ab"}
+    maps[MapId("c", 1)] = corridor("c", 1.0, 2.0, 12)
+    ids = sorted(maps)
+    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    finder = WrongGeometrySearch(ConsistencySettings())
+    assert not finder.wrong(maps, links.__getitem__, links.keys(), [ids[1]])
+    assert finder.wrong(maps, links.__getitem__, ()).keys() == {ids[2]}
+
+
 def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     maps = {MapId(agent, 1): corridor(agent) for agent in "abd"}
     maps[MapId("c", 1)] = corridor("c", 1.0, 2.0, 12)
