@@ -29,6 +29,8 @@ MOST_TURN = 1.0
 """The turn to the next view ends at this angle, rad."""
 TRAVEL_STEP = 0.8
 """Longest way between two nodes on the way to the next place, m."""
+USUAL_TICK = 0.1
+"""s; durations are bounded by numbers of these."""
 PATIENCE = 4.0
 """Time without getting on before a way is given up, s."""
 
@@ -83,7 +85,7 @@ class ExplorationBehaviours:
         self.phase = Phase.DRIVING
         self._drive.start(reach)
         far_end = False
-        for _ in self._ticks(4 * abs(reach) / 0.1 * self.patience + 40):
+        for _ in self._ticks(4 * abs(reach) / USUAL_TICK * self.patience + 40):
             since = self._mapper.anchor_from_robot
             command, done, reason = self._drive.command(
                 since.x, since.heading, self._mapper.bearings, self._now.proximity
@@ -109,7 +111,7 @@ class ExplorationBehaviours:
         s = self._settings
         self.phase, self.detail = phase, ""
         start = self._mapper.map_from_robot.mean.heading
-        for _ in self._ticks(MOST_TURN / s.turn_rate / self._description.tick + 40):
+        for _ in self._ticks(MOST_TURN / s.turn_rate / USUAL_TICK + 40):
             turned = abs(wrap_angle(self._mapper.map_from_robot.mean.heading - start))
             left = self._mapper.anchored
             if turned >= MOST_TURN or (turned >= LEAST_TURN and left <= LEFT):
@@ -203,5 +205,5 @@ class ExplorationBehaviours:
         return clearance(self._description, self._now.proximity, direction, DRIVE)
 
     def _ticks(self, most: float) -> range:
-        """A bound on the duration of a behaviour."""
-        return range(int(most))
+        """A bound on the duration of a behaviour, in usual ticks."""
+        return range(int(most * (USUAL_TICK / self._description.tick)))
