@@ -40,6 +40,14 @@ def _folder_of(store: Path) -> Path:
     return store.with_name(f"{store.name}.plans")
 
 
+def _holds(path: Path, png: bytes) -> bool:
+    """Whether an image is there, and whole: the disk may have damaged it."""
+    try:
+        return read_whole(path) == png
+    except OSError:
+        return False
+
+
 class PlanImages:
     """Kept until no plan names them. Thread-safe."""
 
@@ -76,8 +84,9 @@ class PlanImages:
         image = check_plan_png(png)
         with self._lock:
             path = self._path(image.sha256)
-            if not path.exists():
-                total = sum(other.stat().st_size for other in self._folder.glob(f"*{SUFFIX}"))
+            if not _holds(path, png):
+                others = (other for other in self._folder.glob(f"*{SUFFIX}") if other != path)
+                total = sum(other.stat().st_size for other in others)
                 if total + len(png) > MOST_BYTES:
                     raise InvalidValue(f"the images of plans take {total >> 20} MiB: no more are kept")
                 self._folder.mkdir(parents=True, exist_ok=True)

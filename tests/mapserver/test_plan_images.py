@@ -31,6 +31,8 @@ def test_images_are_kept_by_content_and_outlast_a_restart(tmp_path: Path) -> Non
     (tmp_path / "s0.sqlite.plans" / f"{first.sha256}.png").write_bytes(png(3))
     with pytest.raises(InvalidFile, match="damaged"):
         images.get(first.sha256)
+    # To add it again, as the error says, mends it.
+    assert images.put(png(1)) == first and images.get(first.sha256) == png(1)
 
 
 def test_what_is_no_image_and_too_many_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
