@@ -137,7 +137,7 @@ class KeyFolder:
             raise SettingsError(f"{path}: no keys are here; make some with `mapweave keys init`") from None
         except NotADirectoryError:
             raise SettingsError(f"{path}: is a file; give the folder of `mapweave keys init`") from None
-        except (OSError, msgspec.DecodeError) as error:
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
             raise SettingsError(f"{path / CATALOGUE}: {error}") from None
 
     @classmethod

@@ -81,7 +81,7 @@ def read_tokens(folder: Path) -> tuple[Token, ...]:
         return msgspec.json.decode(read_whole(folder / TOKENS), type=tuple[Token, ...])
     except FileNotFoundError:
         return ()
-    except (OSError, msgspec.DecodeError) as error:
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{folder / TOKENS}: {error}") from None
 
 

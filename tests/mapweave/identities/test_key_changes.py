@@ -171,6 +171,20 @@ def test_the_only_server_is_revoked_by_force_alone(
     folder.revoke("s1")
 
 
+def test_what_is_no_text_is_one_line_and_lets_no_client_in(
+    folder: KeyFolder, capfd: pytest.CaptureFixture[str]
+) -> None:
+    token = folder.token("r1", 1.0)
+    logins = Logins(folder.path)
+    for name in (TOKENS, "fleet.json"):
+        good = (folder.path / name).read_bytes()
+        (folder.path / name).write_bytes(good.replace(b"r1", b"r\xff"))
+        assert name in complaint(capfd, "keys", "list", "--keys", folder.path)
+        assert logins.login(token) is None
+        (folder.path / name).write_bytes(good)
+        assert logins.login(token) is not None
+
+
 @pytest.mark.parametrize("expires", ["2027-01-01T00:00:00x", "2027-01-01T00:00:00", "soon"])
 def test_a_damaged_date_is_one_line_and_lets_no_client_in(
     expires: str, folder: KeyFolder, capfd: pytest.CaptureFixture[str]
