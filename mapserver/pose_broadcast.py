@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 
+from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.mapserver.services import guarded
@@ -131,6 +132,9 @@ class PoseBroadcast:
         nothing = _Published()
         for graph in graphs:
             for node, (x, y, heading) in zip(graph.nodes, graph.means.tolist(), strict=True):
+                if not (abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION):
+                    # No message holds it. The merge sets such a map apart, but is first done without.
+                    continue
                 before = self._published.get(node.agent, nothing).places.get(node)
                 if before is not None and before.frame == graph.anchor:
                     pose = before.merged_from_node

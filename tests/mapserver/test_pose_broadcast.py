@@ -102,6 +102,13 @@ def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) 
     assert turned.placed[A[2]].merged_from_node.vector == pytest.approx([2.12, 0, math.radians(1.1)])
 
 
+def test_a_map_beyond_the_range_of_messages_costs_no_other_its_poses(memory: MemoryFleet) -> None:
+    """Though its robot comes before the other in the alphabet."""
+    result, far = Received(memory), NodeId("a0", 1, 1)
+    (news,) = result.tell(graph([far], 2e6), graph(A))
+    assert set(news.placed) == set(A)
+
+
 def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> None:
     result = Received(memory)
     result.tell(graph(A), graph(B))
