@@ -14,6 +14,7 @@ from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.portal import MAX_FLOOR_WORDS
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
     REACH,
@@ -114,8 +115,8 @@ class Places:
         return best[1]
 
     def floor_of(self, component: int) -> str:
-        """The floor of a component; empty if none is known. Of several, joined by hand, all."""
-        return " and ".join(labels_of(self.merged, self.annotations.floors, component))
+        """The floor of a component; empty if none is known. Of several, joined by hand, all that fit."""
+        return " and ".join(labels_of(self.merged, self.annotations.floors, component))[:MAX_FLOOR_WORDS]
 
     def named(self, answer: RelocalizeAnswer) -> RelocalizeAnswer:
         """An answer to a lost robot, with the names of the places."""

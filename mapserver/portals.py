@@ -10,7 +10,7 @@ import networkx as nx
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import EdgeId, NodeId
-from mapweave.hybridmap.portal import Portal, PortalMeans, PortalStop
+from mapweave.hybridmap.portal import MAX_FLOOR_WORDS, Portal, PortalMeans, PortalStop
 from mapweave.merge.floors import floor_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
@@ -54,7 +54,7 @@ class Portals:
 
     def floor(self, node: NodeId) -> str:
         """The label of the floor on which a node is; empty if it has none."""
-        return floor_of(self.merged, self._floors, node)
+        return floor_of(self.merged, self._floors, node)[:MAX_FLOOR_WORDS]
 
     def apart(self, start: NodeId, goal: NodeId) -> str:
         """That no way leads between two nodes whose components no portals join, in words."""

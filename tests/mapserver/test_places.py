@@ -8,6 +8,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import quote
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.fleet import Fleet
+from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.constraint_subject import RetiredMap
@@ -34,7 +36,7 @@ from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.map_file import MapFile, read_map_file, unpack_map_file, write_map_file
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import decode, encode_view
+from mapweave.wire.messages import decode, encode, encode_view
 from synthetic.maps import looking_around, map_tours, write_store
 from synthetic.world import room, take_view
 from tests.mapserver.conftest import MappedRoom
@@ -156,6 +158,19 @@ def fetched(mapped_room: Callable[[], MappedRoom]) -> MapFile:
 @pytest.fixture(scope="module")
 def merged(fetched: MapFile) -> MergedMap:
     return merged_of(fetched)
+
+
+def test_very_many_floors_of_a_part_are_as_many_as_a_message_holds(merged: MergedMap) -> None:
+    maps = [MapId("r0", number) for number in range(5)]
+    labels = Annotations(tuple(
+        Annotation(str(which), Floor(NodeId(*which, 1), f"{which.epoch}" * 64), False, "anna", 1)
+        for which in maps
+    ))  # fmt: skip
+    graphs = (SimpleNamespace(maps=maps),)
+    places = Places(Router(merged), labels)
+    places.router = SimpleNamespace(merged=SimpleNamespace(graphs=graphs))  # type: ignore[assignment]
+    entry = RobotEntry("r0", True, floor=places.floor_of(0))
+    assert decode(encode(FleetStatus((entry,))), FleetStatus).robots == (entry,)
 
 
 def record(name: str, place: Place) -> Annotations:
