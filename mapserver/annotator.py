@@ -25,7 +25,7 @@ from mapweave.merge.floors import floor_of, held_together
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import encode_record
+from mapweave.wire.log_messages import encode_said
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import serve_senders
 
@@ -152,7 +152,7 @@ class Annotator:
     def _annotate(self, request: Request, who: str) -> None:
         def annotate(payload: bytes) -> bytes:
             annotation = decode(payload, Annotation)
-            return encode_record({"said": self.annotate(replace(annotation, who=who or annotation.who))})
+            return encode_said(self.annotate(replace(annotation, who=who or annotation.who)))
 
         guarded(annotate)(request)
 

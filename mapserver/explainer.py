@@ -38,7 +38,7 @@ from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import encode_record
+from mapweave.wire.log_messages import encode_said
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import serve_senders
 
@@ -168,7 +168,7 @@ class Explainer:
             asked = decode(request.payload, ConstraintRequest)
             if who:
                 asked = replace(asked, constraint=replace(asked.constraint, who=who))
-            return encode_record({"said": self.constrain(asked)})
+            return encode_said(self.constrain(asked))
 
         self._later(request, constrain)
 

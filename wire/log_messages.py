@@ -26,6 +26,8 @@ MAX_SERVERS = 64
 MAX_REFUSALS = 16
 MAX_REASON = 300
 MAX_SMALL_BYTES = 65536
+MAX_SAID = 1024
+"""Characters of a text in a flat record."""
 
 Scalar = bool | int | float | str
 Id = Annotated[int, Meta(ge=0)]
@@ -192,7 +194,7 @@ class _Record(LogMessage, frozen=True):
             bool
             | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
             | Annotated[float, Meta(ge=-MAX_FLOAT, le=MAX_FLOAT)]
-            | Annotated[str, Meta(max_length=1024)],
+            | Annotated[str, Meta(max_length=MAX_SAID)],
         ],
         Meta(max_length=64),
     ] = field(name="s")
@@ -210,6 +212,11 @@ def encode_record(values: Mapping[str, Scalar]) -> bytes:
     except InvalidMessage as error:
         raise InvalidValue(str(error)) from None
     return data
+
+
+def encode_said(words: str) -> bytes:
+    """What was done, in words that may be cut: it is done, however many they are."""
+    return encode_record({"said": words[:MAX_SAID]})
 
 
 def decode_record(data: bytes) -> dict[str, Scalar]:

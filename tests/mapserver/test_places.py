@@ -112,6 +112,16 @@ def ask(web: Web, method: str, path: str, body: object = None) -> tuple[int, dic
     return reply.status, json.loads(content)
 
 
+def test_a_long_reason_is_no_error_of_what_is_kept(house: House) -> None:
+    """What an entry says and what the one before has said is more than the answer holds."""
+    for note in ("a", "b"):
+        said = house.person.annotate(
+            "portal", 64 * "x", 300 * "y", a="r0.1.1", b="r0.1.3", means="door", note=120 * note
+        )
+        assert said.startswith("portal xxx")
+    assert len(house.person.annotations().made) == 2
+
+
 def test_places_over_http(house: House) -> None:
     with Web(("127.0.0.1", 0), house.server) as web:
         body = {"name": "Küche", "body": {"kind": "place", "node": "r0.1.3"}, "because": "tea"}
