@@ -10,7 +10,16 @@ import numpy as np
 
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.floor_plan import FittedPair, FloorPlan, PlacedPlan, PlacedPlans, PlanPair, PlanPart
+from mapweave.hybridmap.floor_plan import (
+    MAX_PARTS,
+    FittedPair,
+    FloorPlan,
+    PlacedPlan,
+    PlacedPlans,
+    PlanPair,
+    PlanPart,
+)
+from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.similarity import (
@@ -24,6 +33,7 @@ from mapweave.registration.similarity import (
     scale_contradiction,
     wrong_pair,
 )
+from mapweave.wire.messages import encode
 
 CLICK = 0.1
 """How precisely a person clicks a place that is known in the map, m: an arm's breadth. Where the residuals
@@ -46,13 +56,16 @@ def placed_plan(name: str, plan: FloorPlan, merged: MergedMap) -> PlacedPlan:
             reasons.append(f"component {number} has {_pairs(len(members))}, and {LEAST} are needed")
             continue
         try:
-            parts.append(_part(plan, merged, number, members))
+            part = _part(plan, merged, number, members)
+            # One that no message holds would cost people the answer about all plans.
+            encode(PlacedPlans((PlacedPlan(name, plan, (part,)),)))
+            parts.append(part)
         except InvalidValue as error:
             reasons.append(f"component {number}: {error}")
     nodes = Counter(str(plan.pairs[k].node) for k in missing)
     if missing:
         reasons.append(f"{_pairs(len(missing))} of nodes that are not in the merged map: {', '.join(nodes)}")
-    return PlacedPlan(name, plan, tuple(parts), "; ".join(reasons))
+    return PlacedPlan(name, plan, tuple(parts[:MAX_PARTS]), "; ".join(reasons)[:MAX_WORDS])
 
 
 def placed_plans(annotations: Annotations, merged: MergedMap) -> PlacedPlans:

@@ -91,6 +91,19 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
     assert fleet.plans().plans == () and map_of(fleet).images == {}
 
 
+def test_a_plan_that_no_message_holds_is_refused(house: House) -> None:
+    """It would cost people the answer about all plans."""
+    fleet = house.person
+    assert house.server.settle(20.0)
+    fleet.put_plan_image(PNG.png)
+    fleet.annotate("plan", "flat", **fields())
+    places = ((1e6, 1e6, 1.0, 1.0), (1e6, -1e6, 11.0, 1.0), (-1e6, 1e6, 1.0, 11.0))
+    pairs = [{"node": "r0.1.1", "x": x, "y": y, "u": u, "v": v} for x, y, u, v in places]
+    with pytest.raises(InvalidValue, match="plans: Expected"):
+        fleet.annotate("plan", "moon", **{**fields(), "pairs": pairs, "metres_per_pixel": None})
+    assert [plan.name for plan in fleet.plans().plans] == ["flat"]
+
+
 def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> None:
     fleet, node, pose = house.person, NodeId("r0", 1, 3), Pose2(50.0, -20.0, 1.5)
     fleet.put_plan_image(PNG.png)
