@@ -124,7 +124,7 @@ def _is_number(value: object) -> bool:
 
 
 def _words(value: object) -> str:
-    """The beginning of a value: by aliases one of a few hundred bytes may stand for gigabytes of text."""
+    """The beginning of a value: with aliases, a few hundred bytes of a file are gigabytes of text."""
     text = reprlib.Repr()
     text.maxlevel = 2
     return text.repr(value)[:80]

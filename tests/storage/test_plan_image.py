@@ -107,7 +107,7 @@ def test_a_map_of_nav2_is_read(tmp_path: Path) -> None:
         (f"{MAP}a: !!int ''\n", "is no YAML"),
         (MAP.replace("0.05", "1" + 400 * "0"), "resolution 1000.*: give a number"),
         (MAP.replace("0.25", "1" + 400 * "0"), r"give \[x, y, yaw\]"),
-        (MAP.replace("plan.pgm", "~nobody-here/plan.pgm"), "image '~nobody-here/plan.pgm'"),
+        (MAP.replace("plan.pgm", "~not-a-user/plan.pgm"), "image '~not-a-user/plan.pgm'"),
         ("a" * 10_000, "10000 bytes"),
     ],
 )
