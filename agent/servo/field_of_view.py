@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.pose import Array
 
 OUT = -math.pi
 """Room of a landmark that no heading brings into view, rad."""
@@ -103,10 +103,6 @@ class FieldOfView:
             gamma -= 2.0 * math.pi * np.round(gamma / (2.0 * math.pi))
             return self._least(width - np.abs(gamma))
         return np.stack([self.slack(np.stack([x, y, np.full_like(x, h)], axis=-1)) for h in headings])
-
-    def visible(self, goal_from_robot: Pose2) -> int:
-        """How many landmarks are in view at a pose."""
-        return int(np.count_nonzero(self.rooms(goal_from_robot.vector) >= 0.0))
 
     def spread(self, most: int) -> FieldOfView:
         """At most `most` of the landmarks, evenly over the bearings at the goal: a stricter, faster field."""

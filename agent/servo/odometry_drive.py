@@ -104,7 +104,7 @@ class OdometryDrive:
 
 
 def _step(command: Command, state: State, reason: str) -> ServoStep:
-    return ServoStep(command, state, None, reason, 0)
+    return ServoStep(command, state, None, reason)
 
 
 def _turning(heading: float, toward: float) -> float:

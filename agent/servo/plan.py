@@ -66,10 +66,6 @@ class Plan:
         """Driven, m."""
         return sum(leg.length for leg in self.legs)
 
-    def poses(self) -> Array:
-        """(M, 3) x m, y m, heading rad, in goal: the way, densely, with the last turn to heading 0."""
-        return sample(self.start, self.legs)
-
 
 def sample(start: Pose2, legs: Sequence[Leg]) -> Array:
     """(M, 3) dense poses from a start along legs to the goal's heading (the turn of it nearest)."""

@@ -1,15 +1,11 @@
-"""Polar coordinates of the robot about the goal, equation (2) of the paper, and bearings, equation (3)."""
+"""Polar coordinates of the robot about the goal, equation (2) of the paper."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
+from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 TURN = 2.0 * math.pi
 
@@ -53,22 +49,3 @@ def continued(goal_from_robot: Pose2, before: Polar) -> Polar:
         before.phi + wrap_angle(polar.phi - before.phi),
         before.beta + wrap_angle(polar.beta - before.beta),
     )
-
-
-def bearings(rho: Any, phi: Any, beta: Any, points_in_goal: NDArray[Any]) -> Array:
-    """Bearings gamma of landmarks from the robot's origin, equation (3).
-
-    Args:
-        rho: (...) m.
-        phi: (...) rad.
-        beta: (...) rad.
-        points_in_goal: (N, 2) or (N, 3) m, in the goal's robot frame.
-
-    Returns:
-        (..., N) rad in [-pi, pi), positive to the left of the optical axis.
-    """
-    rho, phi, beta = (np.asarray(a, dtype=np.float64)[..., None] for a in (rho, phi, beta))
-    points = np.asarray(points_in_goal, dtype=np.float64)
-    direction = np.arctan2(points[:, 1] - rho * np.sin(phi), points[:, 0] - rho * np.cos(phi))
-    gamma: Array = np.mod(direction - phi + beta, TURN) - math.pi
-    return gamma

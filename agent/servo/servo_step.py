@@ -20,12 +20,9 @@ class ServoStep:
         state: what the robot does.
         law: 0 to 4 while one of the paper's five laws drives (charts 1 to 5), None otherwise.
         reason: why, in words.
-        predicted_visible: fewest landmarks in view over the look-ahead under this command; 0 if the drive
-            does not use landmarks.
     """
 
     command: Command
     state: State
     law: int | None
     reason: str
-    predicted_visible: int

@@ -133,7 +133,7 @@ class Servo:
         if self._visibility.field.slack(pose.vector) < LEAST_MARGIN:
             self._law = None
             self._drop_plan()
-            return self._step(*self._recovery.command(pose, self._visibility.field, surroundings), pose)
+            return self._step(*self._recovery.command(pose, self._visibility.field, surroundings))
         self._recovery.over()
         for _ in range(3):
             self._keep_or_drop(pose, surroundings)
@@ -142,15 +142,13 @@ class Servo:
             if self._law is not None:
                 return self._drive_law(pose, surroundings)
             if self._thinking:
-                return self._step(Command(), "driving", "standing still to think the way over", pose)
+                return self._step(Command(), "driving", "standing still to think the way over")
             if self._plan is None:
                 break
             step = self._drive_leg(pose, surroundings)
             if step is not None:
                 return step
-        return self._step(
-            Command(), "stuck", "no way keeps the landmarks in view and the obstacles away", pose
-        )
+        return self._step(Command(), "stuck", "no way keeps the landmarks in view and the obstacles away")
 
     # ---- constraints
 
@@ -254,11 +252,11 @@ class Servo:
         if abs(pose.heading) > HEADING_TOLERANCE:
             self._settled = 0
             turn = Command(0.0, clip(-TURN_GAIN * pose.heading, self._limits.turn))
-            return self._step(turn, "turning", "at the goal: turning to its heading", pose)
+            return self._step(turn, "turning", "at the goal: turning to its heading")
         self._settled += 1
         if self._settled < SETTLE_TICKS:
-            return self._step(Command(), "turning", "at the goal: settling", pose)
-        return self._step(Command(), "arrived", "at the goal", pose)
+            return self._step(Command(), "turning", "at the goal: settling")
+        return self._step(Command(), "arrived", "at the goal")
 
     def _drive_law(self, pose: Pose2, around: Surroundings) -> ServoStep:
         """Equation (5) with v = rho u, slowed to the limits without a change of curvature."""
@@ -303,16 +301,13 @@ class Servo:
     ) -> ServoStep:
         """The last check: a command that would break a constraint within the look-ahead is stopped."""
         if around.admits(arc(pose, command.forward, command.turn, HORIZON), 0.0):
-            return self._step(command, state, reason, pose)
+            return self._step(command, state, reason)
         self._law = None
         self._drop_plan()
-        return self._step(Command(), state, f"stopped: {reason} would leave what is allowed", pose)
+        return self._step(Command(), state, f"stopped: {reason} would leave what is allowed")
 
-    def _step(self, command: Command, state: State, reason: str, pose: Pose2) -> ServoStep:
-        rooms = self._visibility.field.rooms(arc(pose, command.forward, command.turn, HORIZON))
-        seen = int((rooms >= 0.0).sum(axis=-1).min())
-        law = self._law if state == "driving" else None
-        return ServoStep(command, state, law, reason, seen)
+    def _step(self, command: Command, state: State, reason: str) -> ServoStep:
+        return ServoStep(command, state, self._law if state == "driving" else None, reason)
 
 
 def _branch(angle: float, reference: float) -> float:

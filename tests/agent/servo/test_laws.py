@@ -17,8 +17,7 @@ from mapweave.agent.servo.laws import (
     lyapunov,
     saturate,
 )
-from mapweave.agent.servo.polar import Polar, bearings, continued, polar_of
-from mapweave.hybridmap.camera import Camera
+from mapweave.agent.servo.polar import Polar, continued, polar_of
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 rho_ = st.floats(0.05, 4.0)
@@ -33,18 +32,6 @@ def test_polar_coordinates_round_trip(rho: float, phi: float, beta: float) -> No
     assert polar.rho == pytest.approx(rho)
     assert polar.phi == pytest.approx(phi)
     assert wrap_angle(polar.beta - beta) == pytest.approx(0.0, abs=1e-9)
-
-
-@given(rho_, phi_, beta_, st.floats(0.3, 6.0), st.floats(-1.0, 1.0))
-def test_the_bearing_agrees_with_the_camera(
-    rho: float, phi: float, beta: float, depth: float, gamma: float
-) -> None:
-    camera = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, 0.2)
-    goal_from_robot = Polar(rho, phi, beta).pose()
-    point = goal_from_robot.apply(np.array([[depth, depth * math.tan(gamma), 0.2]]))
-    measured = camera.bearings(camera.project(goal_from_robot.inverse().apply(point)))
-    assert bearings(rho, phi, beta, point) == pytest.approx(measured, abs=1e-6)
-    assert bearings(rho, phi, beta, point) == pytest.approx(gamma, abs=1e-6)
 
 
 def unicycle_step(polar: Polar, forward: float, turn: float, dt: float) -> Polar:

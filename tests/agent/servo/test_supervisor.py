@@ -11,6 +11,7 @@ import pytest
 
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.servo.supervisor import Servo
+from mapweave.agent.servo.visibility import Visibility
 from mapweave.hybridmap.pose import Array, Pose2
 
 Draw = tuple[Callable[..., Array], Callable[..., Pose2]]
@@ -98,11 +99,13 @@ def test_starts_parked(robot: RobotDescription, simulate: Callable[..., Any]) ->
 
 
 def test_landmarks_that_are_not_tracked_are_not_counted_on(robot: RobotDescription) -> None:
-    servo, pose = Servo(robot), Pose2(-1.0, 0.0, 0.0)
-    servo.start(pose, WALL_OF_POINTS)
+    visibility, pose = Visibility(robot.camera), Pose2(-1.0, 0.0, 0.0)
     tracked = np.zeros(len(WALL_OF_POINTS), dtype=bool)
     tracked[:5] = True
-    counts = [servo.command(pose, WALL_OF_POINTS, tracked, NOTHING).predicted_visible for _ in range(15)]
+    counts = []
+    for _ in range(15):
+        visibility.update(pose, WALL_OF_POINTS, tracked)
+        counts.append(int((visibility.field.rooms(pose.vector) >= 0.0).sum()))
     assert counts[0] >= 12
     assert counts[-1] == 5
 
