@@ -60,7 +60,7 @@ def aliased_places(
     """The node that a view shows best, and another one, elsewhere, that it shows about as well; or None.
 
     Args:
-        recalled: most inliers first, as `recall_all` returns them.
+        recalled: most inliers first, as `recognise_places` returns them.
         rival: another node is a rival with this share of the best node's inliers;
         apart: it is elsewhere if it puts the robot further away than this, m.
     """

@@ -33,7 +33,7 @@ class GoalPatience:
         self._held_by, self._held_where, self._held_since = "", "", 0.0
 
     def reach(self, now: float) -> None:
-        """The robot is at a stop on its way: the edges on the way on from there count anew.
+        """The robot is at a stop on its way: edges that it has driven count again from here.
 
         Args:
             now: s.

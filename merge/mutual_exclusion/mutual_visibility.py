@@ -6,8 +6,8 @@ d cos δ - √(r² - d² sin² δ). If the ray went on, the other robot was not 
 been. If it ended before, something was in between, and if it passed beside, nothing is known.
 
 **Why a true merge is safe.** Let a robot be there with nothing in between. A sensor misses it with a
-probability of at most ε (`missed`), else it sees it. The alternative is a world with other things, one of
-which ends the ray just there with probability q (`scenery`). The measurement is then (1 - q) / ε times as
+probability of at most ε (`MISSED`), else it sees it. The alternative is a world with other things, one of
+which ends the ray just there with probability q (`SCENERY`). The measurement is then (1 - q) / ε times as
 likely if the ray went on, and q / (1 - ε) times as likely if it ended there. Under a true merge these odds
 against it have an expectation of ε' (1 - q) / ε + (1 - ε') q / (1 - ε), where ε' ≤ ε is the sensors' true
 miss rate. That is at most 1: it grows with ε', and is 1 at ε. It holds for any q; q only decides how soon a

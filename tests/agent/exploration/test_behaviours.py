@@ -1,4 +1,4 @@
-"""The moves of exploration, of a robot that moves as it is told."""
+"""The moves of exploration, of a robot that moves just as commanded."""
 
 from __future__ import annotations
 
