@@ -6,11 +6,16 @@ from contextlib import ExitStack
 
 import pytest
 
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.agent_status import MAX_ROBOTS, AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.mission_order import MAX_VIA, MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
+from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.quotas import Quotas
 from mapweave.mapserver.roster import Roster
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import decode, encode
 from tests.quick import first_quick
 from tests.waiting import eventually
 
@@ -31,3 +36,14 @@ def test_the_period_of_statuses_grows_with_the_number_of_robots(robots: int, per
         for token in tokens[50:]:
             token.close()
         eventually(lambda: roster.status_period() == 0.0)
+
+
+def test_one_answer_holds_all_robots_whatever_they_do() -> None:
+    node = NodeId("r0", 1, 3)
+    wait = PortalWait(PortalStop("lift", PortalMeans.LIFT, node, node._replace(number=4)))
+    order = MissionOrder("m", "r0", MissionKind.GO, 1, "anna", node, "kitchen", MAX_VIA * (node,))
+    report = MissionReport(order, MissionState.RUNNING, portal=wait)
+    status = Status("waiting", "", 7, 0, Pose2(), False, "goto", fix_node=node, portal=wait)
+    said = AgentStatus(status, 1, "r0", 1, mission=report, battery=0.5)
+    entries = tuple(RobotEntry(f"r{k}", True, 0.0, said, Pose2(), 0, newest=node) for k in range(MAX_ROBOTS))
+    assert decode(encode(FleetStatus(entries)), FleetStatus).robots == entries
