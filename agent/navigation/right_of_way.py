@@ -52,6 +52,7 @@ class RightOfWay:
         self._last = -EVERY
         self._granted: int | None = None
         self._held_since: float | None = None
+        self._called = motion.now
 
     def passage(self, leg: int, fix: Fix) -> Passage:
         """Whether the robot may drive to a node of the route; called each tick.
@@ -61,6 +62,10 @@ class RightOfWay:
             fix: where the robot is.
         """
         now = self._motion.now
+        paused, self._called = now - self._called, now
+        if paused > EVERY and self._held_since is not None:
+            # It was stopped by something else meanwhile: it has not waited for the other robot.
+            self._held_since += paused
         if self._asked is not None:
             number, first, at = self._asked
             answer = self._motion.answer(number)

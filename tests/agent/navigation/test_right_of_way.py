@@ -5,22 +5,27 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI, WhichWay
+from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.goal_patience import YIELDED
+from mapweave.agent.navigation.right_of_way import Passage, RightOfWay
 from mapweave.agent.navigation.stage import Stage
-from mapweave.agent.observation import Command
+from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import NodeId
-from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
 from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.reservations import Reservations
 from tests.agent.scripted_fleet import (
     BODY,
+    FREE,
     NOWHERE,
     A,
     B,
@@ -95,6 +100,33 @@ def test_a_robot_that_waits_too_long_looks_for_another_way(home):
         (),
         ((A, B),),
     ]
+
+
+def test_a_robot_that_a_person_drives_meanwhile_has_not_waited():
+    """Before, it gave a goal up for which it had waited 5 s, once the person let it go on."""
+    motion = MotionPrimitives(BODY)
+    right_of_way = RightOfWay(motion, [A, B])
+    fix = Fix(A, PoseGaussian(Pose2(), np.zeros((3, 3))))
+    asked: list[Question] = []
+
+    def tick() -> None:
+        held = ReserveAnswer(0, "r7", None, "r7 stands there", occupied=True)
+        observation = Observation(0, Odometry(0.0, 0.0), None, FREE)
+        motion.take_in(observation, tuple(Answer(question.number, held) for question in asked))
+
+    def waits(seconds: float) -> set[Passage]:
+        out = set()
+        for _ in range(round(seconds / BODY.tick)):
+            tick()
+            out.add(right_of_way.passage(1, fix))
+            asked[:] = motion.questions()
+        return out
+
+    assert waits(5.0) == {Passage.HELD}
+    for _ in range(round(2.0 * YIELDED / BODY.tick)):
+        tick()
+    assert waits(YIELDED - 6.0) == {Passage.HELD}
+    assert waits(2.0) == {Passage.HELD, Passage.STUCK}
 
 
 def test_a_robot_whose_goal_is_taken_waits_and_then_gives_up(home):
