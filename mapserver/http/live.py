@@ -90,6 +90,7 @@ class Live:
         self._probabilities: Mapping[Pair, float] = {}
         self._floors: Mapping[MapId, str] = {}
         self._events: dict[MapEvent, int] = {}
+        self._counted = 0
         self._state = ""
         self._viewers = 0
         self._looked = asyncio.Event()
@@ -132,7 +133,7 @@ class Live:
             if self._map.version > version:
                 text, version = await run_in_threadpool(self._map_since, version)
                 await viewer.send_text(text)
-            if len(self._events) > events:
+            if self._counted > events:
                 text, events = self._events_since(events)
                 await viewer.send_text(text)
             if self._state != state:
@@ -147,7 +148,7 @@ class Live:
     def _events_since(self, first: int) -> tuple[str, int]:
         fresh = tuple(event for event, number in self._events.items() if number >= first)
         content = {"kind": "events", **json_values(History(fresh))}
-        return json_bytes(content).decode(), len(self._events)
+        return json_bytes(content).decode(), self._counted
 
     async def _look_on(self) -> None:
         while self._viewers:
@@ -171,8 +172,7 @@ class Live:
             if merged is not self._shown or floors != self._floors:
                 self._shown, self._floors = merged, floors
                 self._map.show(merged, self._probabilities, floors)
-        for event in self._server.history():
-            self._events.setdefault(event, len(self._events))
+        self._count(dict.fromkeys(self._server.history()))
         status = self._server.status()
         content = {
             "kind": "state",
@@ -181,6 +181,14 @@ class Live:
         }
         self._state = json_bytes(content).decode()
         return merged is not self._rated and time.monotonic() >= self._rest_until
+
+    def _count(self, history: Mapping[MapEvent, None]) -> None:
+        """Number what is new. What the server keeps no longer is not kept here either."""
+        known = self._events
+        self._events = {event: known[event] for event in history if event in known}
+        for event in history:
+            if event not in known:
+                self._events[event], self._counted = self._counted, self._counted + 1
 
     def _rate(self) -> None:
         """Work out the links' probabilities, which takes long in a large map."""

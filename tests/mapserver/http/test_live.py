@@ -162,6 +162,16 @@ def test_a_viewer_gets_the_map_and_what_changes(served: Web, services: StubServi
         assert not first.links()
         services.events += (MapEvent(10**18 + 1, MapEventKind.PARTED, "they came apart"),)
         assert [event["words"] for event in first.until("events")["history"]] == ["they came apart"]
+        # What the server has forgotten is kept for no new viewer, and the next event is new for all.
+        services.events = services.events[1:]
+
+        def shown_late() -> list[str]:
+            with viewer(served) as late:
+                return [event["words"] for event in late.until("events")["history"]]
+
+        eventually(lambda: shown_late() == ["they came apart"])
+        services.events = (MapEvent(10**18 + 2, MapEventKind.JOINED, "they are one again"),)
+        assert [event["words"] for event in first.until("events")["history"]] == ["they are one again"]
         # What comes in differences is what comes at once.
         with viewer(served) as second:
             second.until("map")
