@@ -25,6 +25,8 @@ CHANGE_BYTES = 16_384
 """Of a change, on average. Those of the demo have 1 kB on average and 3.2 kB at most; 128 kB is allowed."""
 LANDMARKS = 500
 """Of a node, on average over a robot's maps. Those of the demo have 100, those of photographs at most 400."""
+EDGES, DRIVEN = 16, 16_000
+"""Edges of a node, on average over a robot's maps, and of drives on maps of others. The demo has 3 a node."""
 MOST_ROBOTS = 4096
 """Robots of which this is remembered: without keys, names cost nothing."""
 REMEMBERED = 10.0

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
-from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.quotas import CHANGE_BYTES, MOST_ROBOTS, Quotas, TokenBucket
+from mapweave.mapserver.quotas import CHANGE_BYTES, DRIVEN, EDGES, MOST_ROBOTS, Quotas, TokenBucket
 from mapweave.wire.log_messages import MAX_ROWS
 
 WORTHWHILE = 16
 """Changes for which it is worth asking a robot; fewer wait until so many may come."""
-ADVICE = "retire maps with `mapweave map retire`, or raise in [quotas]"
+RETIRE = "retire maps with `mapweave map retire`"
+ADVICE = f"{RETIRE}, or raise in [quotas]"
 MOST_UNMERGED = 1024
 """Changes of a robot that wait to be merged; further ones stay on its disk."""
 
@@ -33,6 +34,7 @@ class Intake:
         self._beacons = TokenBucket(rate, now)
         self._current: AgentLog | None = None
         self._nodes = self._landmarks = 0
+        self._edges_left = DRIVEN
         self._stale = True
 
     def beacon(self) -> bool:
@@ -82,7 +84,7 @@ class Intake:
         self._stale = True
 
     def fitting(self, entries: Sequence[Entry]) -> tuple[int, str]:
-        """How many of these changes, in order, the robot's quota of nodes has room for, and why not more.
+        """How many of these changes, in order, the robot's quotas have room for, and why not more.
 
         Those that fit count as kept from now on.
 
@@ -101,7 +103,14 @@ class Intake:
     def _fitting(self, entries: Sequence[Entry]) -> tuple[int, str]:
         settings = self._quotas.settings
         added: dict[NodeId, int] = {}
+        edges_here: set[NodeId] = set()
         for count, entry in enumerate(entries):
+            if isinstance(entry.change, Change) and isinstance(entry.change.body, EdgePut):
+                edges_here.add(entry.change.body.edge.id)
+                self._edges_left -= 1
+                if self._edges_left < 0 and (edges := self._count_edges(len(edges_here))):
+                    self._edges_left = 0
+                    return count, f"{self._agent} has {edges} edges here, which is its quota: {RETIRE}"
             if not (isinstance(entry.change, Change) and isinstance(entry.change.body, NodePut)):
                 continue
             node = entry.change.body.node
@@ -114,6 +123,17 @@ class Intake:
             self._nodes, self._landmarks = nodes, landmarks
             added[node.id] = len(node.landmarks)
         return len(entries), ""
+
+    def _count_edges(self, coming: int) -> int:
+        """How many edges there are if there is no room for those that come, else 0.
+
+        Counted rarely: many change an edge that is there, and counting reads all logs of the robot.
+        """
+        retired = self._retired()
+        kept = self._store.edges(self._agent).items()
+        edges = sum(count for map_id, count in kept if map_id not in retired)
+        self._edges_left = EDGES * self._nodes + DRIVEN - edges - coming
+        return edges if self._edges_left < 0 else 0
 
     def _count(self) -> None:
         self._stale = False

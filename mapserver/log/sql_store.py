@@ -255,6 +255,18 @@ class SqlStore(Store):
         )
         return {MapId(agent, epoch): (nodes, total) for epoch, nodes, total in self._read(query, (agent,))}
 
+    def edges(self, agent: str) -> dict[MapId, int]:
+        """Edges of each map of a robot; see `Store`."""
+        query = (
+            "SELECT epoch, number, kind FROM change WHERE agent = ? AND kind IN (?, ?) "
+            "ORDER BY epoch, sequence"
+        )
+        edges: dict[MapId, set[int]] = {}
+        for epoch, number, kind in self._read(query, (agent, EdgePut.__name__, EdgeRetired.__name__)):
+            there = edges.setdefault(MapId(agent, epoch), set())
+            (there.add if kind == EdgePut.__name__ else there.discard)(number)
+        return {map_id: len(there) for map_id, there in edges.items()}
+
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
         """The newest changes of a map that were refused, in order."""
         query = (

@@ -200,6 +200,9 @@ class Store(Protocol):
     def kept(self, agent: str) -> dict[MapId, tuple[int, int]]:
         """Nodes and landmarks of each map of a robot."""
 
+    def edges(self, agent: str) -> dict[MapId, int]:
+        """Edges of each map of a robot; this reads through all of its logs."""
+
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
         """The newest changes of a map that were refused, in order."""
 

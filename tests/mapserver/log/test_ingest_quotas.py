@@ -14,7 +14,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log import ingest, known_logs, pull_schedule, pulled
+from mapweave.mapserver.log import ingest, intake, known_logs, pull_schedule, pulled
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.intake import ADVICE
 from mapweave.mapserver.log.sqlite_store import SqliteStore
@@ -22,7 +22,7 @@ from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
 from mapweave.wire.bus import Request
 from mapweave.wire.log_messages import Refusal
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from tests.mapserver.log.acknowledged_fleet import AGENT, node
+from tests.mapserver.log.acknowledged_fleet import AGENT, edge, node
 from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server
 from tests.waiting import eventually
 
@@ -169,6 +169,35 @@ def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     assert replicator.wait_acknowledged(60)
     eventually(lambda: not replicator.status().failure)
     assert [c.sequence for c in server.seen if c.map == map_id][-5:] == [16, 17, 18, 19, 20]
+
+
+def test_edges_beyond_the_quota_stay_on_the_robot_until_there_is_room(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two nodes may have as many edges as one likes, and each costs every merge: that of all robots."""
+    monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
+    monkeypatch.setattr(intake, "DRIVEN", 10)
+    monkeypatch.setattr(intake, "EDGES", 2)
+    server = Server(hub, tmp_path / "s0.sqlite")
+    bus = MemoryBus(hub)
+    cleanup.callback(bus.close)
+    journal = Journal(tmp_path / "r0.sqlite", "r0")
+    cleanup.callback(journal.close)
+    map_id = journal.open_map(1)
+    replicator = Replicator(bus, KEYS, journal, map_id, ["s0"], AGENT)
+    cleanup.callback(replicator.close)
+    rng = np.random.default_rng(1)
+    nodes = [node(map_id, number, rng) for number in (1, 2)]
+    again = [edge(map_id, 3 + number % 5, 1, 2) for number in range(40)]
+    replicator.submit([*nodes, *again], 1)
+    assert replicator.wait_acknowledged(60), "forty changes of five edges"
+    replicator.submit([edge(map_id, number, 1, 2) for number in range(8, 30)], 1)
+    eventually(lambda: "edges here, which is its quota" in replicator.status().failure)
+    kept = server.store.edges("r0")[map_id]
+    assert 14 <= kept <= 15 and replicator.unacknowledged() == 27 - kept
+    monkeypatch.setattr(intake, "DRIVEN", 100)
+    assert replicator.wait_acknowledged(60)
+    server.end()
 
 
 def test_logs_that_never_answer_do_not_hold_up_one_that_does(
