@@ -7,7 +7,21 @@ import traceback
 from mapweave.hybridmap.errors import DeviceError
 
 
-def driver_error(error: Exception) -> DeviceError:
+class DriverMistake(DeviceError):
+    """A driver does not give what its protocol says: to connect again does not help."""
+
+
+def mistake(what: str, words: str) -> DriverMistake:
+    """A mistake for the driver's author, as one line: what it is in, and what is wrong with it."""
+    return DriverMistake(f"driver: {what} {words}")
+
+
+def kind_of(value: object) -> str:
+    """The type of a value, in words."""
+    return "None" if value is None else type(value).__name__
+
+
+def driver_error(error: BaseException) -> DeviceError:
     """An error of the code of a driver, for its author.
 
     Args:
@@ -17,7 +31,7 @@ def driver_error(error: Exception) -> DeviceError:
         One line that names the file, the line and the error.
 
     Raises:
-        Exception: `error` itself, if no code outside of this package was running: then the mistake is here.
+        BaseException: `error` itself, if no code outside of this package was running: the mistake is here.
     """
     frames = [
         (frame.f_code.co_filename, line)

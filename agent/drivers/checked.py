@@ -11,7 +11,7 @@ from numbers import Real
 
 import numpy as np
 
-from mapweave.agent.drivers.author_errors import driver_error
+from mapweave.agent.drivers.author_errors import driver_error, kind_of, mistake
 from mapweave.agent.drivers.messages import encode_description
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
@@ -70,7 +70,7 @@ class CheckedRobot:
         if seen is None:
             return None
         if not isinstance(seen, Observation):
-            raise _mistake("sense()", f"must return an Observation or None, not {_kind(seen)}")
+            raise mistake("sense()", f"must return an Observation or None, not {kind_of(seen)}")
         self._check_stamp(seen.stamp_ns, description.tick)
         _check_image(seen, description)
         _check_numbers(seen, description)
@@ -85,9 +85,9 @@ class CheckedRobot:
         with _driver_code():
             applied = self._robot.act(command)
         if not isinstance(applied, Command):
-            raise _mistake("act()", f"must return the Command that is applied, not {_kind(applied)}")
+            raise mistake("act()", f"must return the Command that is applied, not {kind_of(applied)}")
         if not (math.isfinite(applied.forward) and math.isfinite(applied.turn)):
-            raise _mistake("act()", f"{applied} is not finite")
+            raise mistake("act()", f"{applied} is not finite")
         return applied
 
     def close(self) -> None:
@@ -103,13 +103,13 @@ class CheckedRobot:
         now = self._clock()
         for unit, in_a_second in UNITS.items():
             if abs(stamp_ns / in_a_second - now) < SKEW:
-                raise _mistake("stamp_ns", f"{stamp_ns} are {unit} since 1970; it must be nanoseconds")
+                raise mistake("stamp_ns", f"{stamp_ns} are {unit} since 1970; it must be nanoseconds")
 
     def _check_stamp(self, stamp_ns: int, tick: float) -> None:
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, int | np.integer):
-            raise _mistake(
-                "stamp_ns", f"{stamp_ns!r} is {_kind(stamp_ns)}; it must be whole nanoseconds, an int"
+            raise mistake(
+                "stamp_ns", f"{stamp_ns!r} is {kind_of(stamp_ns)}; it must be whole nanoseconds, an int"
             )
         if before is None:
             self._check_unit(stamp_ns)
@@ -117,11 +117,11 @@ class CheckedRobot:
             return
         self._good += 1
         if stamp_ns == before:
-            raise _mistake("stamp_ns", f"stands still at {stamp_ns}; it is the time of each image")
+            raise mistake("stamp_ns", f"stands still at {stamp_ns}; it is the time of each image")
         if stamp_ns < before:
-            raise _mistake("stamp_ns", f"goes backwards, from {before} to {stamp_ns}")
+            raise mistake("stamp_ns", f"goes backwards, from {before} to {stamp_ns}")
         if stamp_ns - before < SMALLEST_SHARE * tick * 1e9:
-            raise _mistake(
+            raise mistake(
                 "stamp_ns", f"rises by {stamp_ns - before} in a tick of {tick:g} s; it must be nanoseconds"
             )
 
@@ -139,19 +139,19 @@ def _driver_code() -> Iterator[None]:
 
 def _check_description(description: object) -> None:
     if not isinstance(description, RobotDescription):
-        raise _mistake("describe()", f"must return a RobotDescription, not {_kind(description)}")
+        raise mistake("describe()", f"must return a RobotDescription, not {kind_of(description)}")
     bearings = description.ranger_bearings
     if not isinstance(bearings, tuple | list):
-        raise _mistake("describe()", f"ranger_bearings must be a tuple of radians, not {_kind(bearings)}")
+        raise mistake("describe()", f"ranger_bearings must be a tuple of radians, not {kind_of(bearings)}")
     far = [b for b in bearings if isinstance(b, Real) and not abs(b) <= math.tau]
     if far:
-        raise _mistake("describe()", f"ranger_bearings are radians, not degrees: {far[0]:g}")
+        raise mistake("describe()", f"ranger_bearings are radians, not degrees: {far[0]:g}")
     try:
         encode_description(description)
     except InvalidValue as error:
-        raise _mistake("describe()", f"gives no {error}") from None
+        raise mistake("describe()", f"gives no {error}") from None
     if bearings and not description.ranger_reach > 0.0:
-        raise _mistake("describe()", "there are ranger_bearings and no ranger_reach, m")
+        raise mistake("describe()", "there are ranger_bearings and no ranger_reach, m")
 
 
 def _check_image(seen: Observation, description: RobotDescription) -> None:
@@ -159,42 +159,34 @@ def _check_image(seen: Observation, description: RobotDescription) -> None:
     if image is None:
         return
     if not isinstance(image, np.ndarray):
-        raise _mistake("image", f"must be an array, not {_kind(image)}")
+        raise mistake("image", f"must be an array, not {kind_of(image)}")
     if image.ndim == 3:
-        raise _mistake("image", f"has {image.shape[2]} channels; it must be grey, (H, W)")
+        raise mistake("image", f"has {image.shape[2]} channels; it must be grey, (H, W)")
     if image.ndim != 2 or image.dtype != np.uint8:
-        raise _mistake("image", f"must be (H, W) uint8, not {image.shape} {image.dtype}")
+        raise mistake("image", f"must be (H, W) uint8, not {image.shape} {image.dtype}")
     if image.shape != (camera.height, camera.width):
         height, width = image.shape
-        raise _mistake(
+        raise mistake(
             "image", f"is {width}x{height} px, but the camera is described as {camera.width}x{camera.height}"
         )
 
 
 def _check_numbers(seen: Observation, description: RobotDescription) -> None:
     if not isinstance(seen.odometry, Odometry):
-        raise _mistake("odometry", f"must be an Odometry, not {_kind(seen.odometry)}")
+        raise mistake("odometry", f"must be an Odometry, not {kind_of(seen.odometry)}")
     forward, turn = seen.odometry.forward, seen.odometry.turn
     if not (isinstance(forward, Real) and isinstance(turn, Real)):
-        raise _mistake("odometry", f"must be two numbers, m and rad, not {forward!r} and {turn!r}")
+        raise mistake("odometry", f"must be two numbers, m and rad, not {forward!r} and {turn!r}")
     if not (math.isfinite(forward) and math.isfinite(turn)):
-        raise _mistake("odometry", f"is not finite: {forward:g} m, {turn:g} rad")
+        raise mistake("odometry", f"is not finite: {forward:g} m, {turn:g} rad")
     if not isinstance(seen.proximity, np.ndarray):
-        raise _mistake("proximity", f"must be an array, not {_kind(seen.proximity)}")
+        raise mistake("proximity", f"must be an array, not {kind_of(seen.proximity)}")
     # An empty array means that the sensors have failed, which the agent handles.
     if seen.proximity.ndim != 1 or seen.proximity.dtype.kind not in "fiu":
-        raise _mistake("proximity", "must be an array of one distance for each bearing, m")
+        raise mistake("proximity", "must be an array of one distance for each bearing, m")
     count, bearings = len(seen.proximity), len(description.ranger_bearings)
     if count and count != bearings:
-        raise _mistake("proximity", f"has {count} readings, but describe() gives {bearings} ranger_bearings")
+        raise mistake("proximity", f"has {count} readings, but describe() gives {bearings} ranger_bearings")
     battery = seen.battery
     if battery is not None and not (isinstance(battery, Real) and 0.0 <= battery <= 1.0):
-        raise _mistake("battery", f"is {battery!r}; it must be a share from 0 to 1, or None")
-
-
-def _kind(value: object) -> str:
-    return "None" if value is None else type(value).__name__
-
-
-def _mistake(what: str, words: str) -> DeviceError:
-    return DeviceError(f"driver: {what} {words}")
+        raise mistake("battery", f"is {battery!r}; it must be a share from 0 to 1, or None")

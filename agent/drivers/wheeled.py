@@ -12,11 +12,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.drivers.author_errors import driver_error
+from mapweave.agent.drivers.author_errors import DriverMistake, driver_error, kind_of, mistake
 from mapweave.agent.drivers.base import Base, BaseReading, Wheels
-from mapweave.agent.drivers.camera import Capture, FrameSource
+from mapweave.agent.drivers.camera import Capture, Frame, FrameSource
+from mapweave.agent.drivers.checked_base import check_base, check_reading, check_wheels
 from mapweave.agent.drivers.clock import now_ns
-from mapweave.agent.drivers.settings import RobotSettings
+from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 
@@ -53,8 +54,9 @@ class WheeledRobot:
 
         Raises:
             SettingsError: there is no camera.
-            DeviceError: the camera cannot be opened.
+            DeviceError: the camera cannot be opened, or the base is none.
         """
+        check_base(base)
         self._base = base
         self._settings = settings
         self._description: RobotDescription | None = None
@@ -64,7 +66,7 @@ class WheeledRobot:
         self._bumped = self._kidnapped = False
         self._command: Wheels | None = None
         self._failure = ""
-        self._mistake: Exception | None = None
+        self._mistake: BaseException | None = None
         self._opened = self._closing = False
         self._stamp_ns = 0
         self._age_ns = OLDEST_IMAGE_NS
@@ -83,14 +85,19 @@ class WheeledRobot:
         """Combine settings and driver; waits for the first answer of the base.
 
         Raises:
-            DeviceError: the base does not answer.
+            DeviceError: the base does not answer, or its driver has raised an error.
             SettingsError: a dimension of the robot is missing.
         """
         if self._description is None:
             with self._changed:
-                self._changed.wait_for(lambda: bool(self._readings) or self._closing, PATIENCE)
+                self._changed.wait_for(
+                    lambda: bool(self._readings or self._mistake) or self._closing, PATIENCE
+                )
+                self._raise_mistake()
                 if not self._readings:
-                    raise DeviceError(self._failure or "the robot was closed before it has answered")
+                    silent = f"the robot's base has not answered for {PATIENCE:g} s"
+                    closed = "the robot was closed before it has answered"
+                    raise DeviceError(self._failure or (closed if self._closing else silent))
                 read_ns, reading = self._readings[-1]
                 self._stamp_ns = read_ns - self._age_ns
                 self._odometry_at = reading.way
@@ -116,8 +123,9 @@ class WheeledRobot:
         with self._changed:
             if self._closing:
                 return None
-            if self._mistake is not None:
-                raise driver_error(self._mistake) from self._mistake
+            self._raise_mistake()
+            if frame is not None and not isinstance(frame, Frame):
+                raise mistake("camera: newer()", f"must return a Frame or None, not {kind_of(frame)}")
             if frame is not None:
                 stamp_ns = frame.stamp_ns
                 self._age_ns = now_ns() - stamp_ns
@@ -155,6 +163,7 @@ class WheeledRobot:
             InvalidValue: the command is not finite.
         """
         wheels = self._base.nearest(self._wheels(command))
+        check_wheels("nearest()", wheels)
         with self._changed:
             self._command = wheels
             self._changed.notify_all()
@@ -172,7 +181,17 @@ class WheeledRobot:
 
     def _put_together(self) -> RobotDescription:
         """Description of the robot, once the base has answered."""
-        return self._settings.describe(self._base.geometry)
+        geometry = self._base.geometry
+        if not isinstance(geometry, Geometry):
+            raise mistake("geometry", f"of the base must be a Geometry, not {kind_of(geometry)}")
+        return self._settings.describe(geometry)
+
+    def _raise_mistake(self) -> None:
+        """Raise what the base's thread has ended by."""
+        if isinstance(self._mistake, DeviceError):
+            raise self._mistake
+        if self._mistake is not None:
+            raise driver_error(self._mistake) from self._mistake
 
     def _wheels(self, command: Command) -> Wheels:
         """Wheel speeds of a command within the limits."""
@@ -202,18 +221,28 @@ class WheeledRobot:
     def _serve(self) -> None:
         while not self._closing:
             try:
-                self._base.open()
-                while not self._closing:
-                    self._exchange()
-            except DeviceError as error:
-                self._fail(str(error))
-            except Exception as error:  # noqa: BLE001 - raised again by `sense`
-                self._mistake = error
+                self._connected()
+            # An exit would end this thread alone, and the robot would seem to stand.
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - raised again by `sense`
+                with self._changed:
+                    self._mistake = error
+                    self._changed.notify_all()
                 return
-            finally:
-                self._base.close()
             with self._changed:
                 self._changed.wait_for(lambda: self._closing, RETRY)
+
+    def _connected(self) -> None:
+        """Open the base and exchange with it until the line fails, or the robot is closed."""
+        try:
+            self._base.open()
+            while not self._closing:
+                self._exchange()
+        except DriverMistake:
+            raise
+        except DeviceError as error:
+            self._fail(str(error))
+        finally:
+            self._base.close()
 
     def _exchange(self) -> None:
         with self._changed:
@@ -225,6 +254,7 @@ class WheeledRobot:
             self._base.drive(command)
         asked = now_ns()
         reading = self._base.read()
+        check_reading(reading)
         stamp_ns = (asked + now_ns()) // 2 if reading.stamp_ns is None else reading.stamp_ns
         with self._changed:
             if self._readings and stamp_ns <= self._readings[-1][0]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -163,6 +166,91 @@ def test_a_driver_that_fails_is_not_driven_on(robot: CheckedRobot, base: EvenBas
         for _ in range(5):
             robot.act(Command(0.1, 0.0))
             robot.sense()
+
+
+class Reads(EvenBase):
+    """A base whose `read` does what a test says."""
+
+    def __init__(self, read: Callable[[], Any]) -> None:
+        super().__init__()
+        self.read = read  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [
+        (lambda: None, r"read\(\) must return a BaseReading, not None"),
+        (lambda: BaseReading((0.0, 0.0)), r"read\(\): way must be Wheels, not tuple"),  # type: ignore[arg-type]
+        (lambda: BaseReading(Wheels("1", "2")), r"read\(\): way must be two finite numbers, not '1' and '2'"),  # type: ignore[arg-type]
+        (lambda: BaseReading(Wheels(), bumped=None), r"read\(\): bumped must be True or False, not None"),  # type: ignore[arg-type]
+        (
+            lambda: BaseReading(Wheels(), stamp_ns=1_700_000_000),
+            r"read\(\): stamp_ns is 1700000000; it must be",
+        ),
+        (lambda: BaseReading(Wheels(), stamp_ns=1.7e18), r"read\(\): stamp_ns is 1.7e\+18; it must be"),  # type: ignore[arg-type]
+        (lambda: 1 / 0, r".*test_wheeled.py, line \d+: ZeroDivisionError"),
+        (lambda: sys.exit("no board"), r".*test_wheeled.py, line \d+: SystemExit: no board"),
+    ],
+)
+def test_a_base_that_reads_wrongly_from_the_start(
+    read: Callable[[], Any], words: str, camera: LateCamera
+) -> None:
+    robot = CheckedRobot(WheeledRobot(Reads(read), SETTINGS, camera))
+    begin = time.monotonic()
+    with pytest.raises(DeviceError, match=f"^driver: {words}"):
+        robot.sense()
+    assert time.monotonic() - begin < 4.0
+    robot.close()
+
+
+def test_a_base_that_cannot_be_closed_is_not_forgotten(
+    base: EvenBase, camera: LateCamera, monkeypatch
+) -> None:
+    monkeypatch.setattr(base, "close", lambda: {}["port"])
+    base.failing = True
+    robot = WheeledRobot(base, SETTINGS, camera)
+    with pytest.raises(DeviceError, match=r"^driver: .*test_wheeled.py, line \d+: KeyError: 'port'"):
+        robot.sense()
+    robot.close()
+
+
+def test_a_base_that_never_answers_is_not_called_closed(
+    camera: LateCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 0.2)
+    ended = threading.Event()
+    robot = WheeledRobot(Reads(ended.wait), SETTINGS, camera)
+    with pytest.raises(DeviceError, match=r"^the robot's base has not answered for 0.2 s"):
+        robot.sense()
+    ended.set()
+    robot.close()
+
+
+def test_a_base_without_a_method_or_a_class_is_refused(camera: LateCamera, monkeypatch) -> None:
+    with pytest.raises(DeviceError, match=r"^driver: base is the class EvenBase; it must be an object"):
+        WheeledRobot(EvenBase, SETTINGS, camera)  # type: ignore[arg-type]
+    monkeypatch.delattr(EvenBase, "read")
+    with pytest.raises(DeviceError, match=r"^driver: base EvenBase needs open, .*; it lacks read$"):
+        WheeledRobot(EvenBase(), SETTINGS, camera)
+
+
+def test_speeds_geometry_and_frames_of_another_type(
+    base: EvenBase, robot: CheckedRobot, camera: LateCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(base, "nearest", lambda speeds: tuple(speeds))
+    with pytest.raises(DeviceError, match=r"^driver: nearest\(\) must be Wheels, not tuple"):
+        robot.act(Command(0.1, 0.0))
+    monkeypatch.setattr(camera, "newer", lambda stamp_ns, patience: IMAGE)
+    with pytest.raises(
+        DeviceError, match=r"^driver: camera: newer\(\) must return a Frame or None, not ndarray"
+    ):
+        robot.sense()
+    nameless = EvenBase()
+    nameless.geometry = None  # type: ignore[assignment]
+    other = CheckedRobot(WheeledRobot(nameless, SETTINGS, camera))
+    with pytest.raises(DeviceError, match=r"^driver: geometry of the base must be a Geometry, not None"):
+        other.describe()
+    other.close()
 
 
 def test_a_base_that_is_not_there_is_one_line(base: EvenBase, camera: LateCamera, monkeypatch) -> None:
