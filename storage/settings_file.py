@@ -29,7 +29,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         SettingsError: the file is missing or is not TOML.
     """
     try:
-        return tomllib.loads(read_whole(path).decode("utf-8"))
+        # Editors of Windows begin a file with an invisible mark.
+        return tomllib.loads(read_whole(path).decode("utf-8-sig"))
     except FileNotFoundError:
         raise SettingsError(f"{path}: no such file") from None
     except OSError as error:

@@ -37,7 +37,7 @@ def write_camera(path: Path, values: Mapping[str, Value]) -> None:
     Raises:
         SettingsError: the file cannot be read, or its camera is written in a way that cannot be changed.
     """
-    old = read_whole(path).decode("utf-8") if path.exists() else ""
+    old = read_whole(path).decode("utf-8-sig") if path.exists() else ""
     camera_table(path)
     lines = old.splitlines()
     at = next((k for k, line in enumerate(lines) if HEADER.match(line)), None)

@@ -173,7 +173,7 @@ def _camera(image: Path, intrinsics: Intrinsics) -> Camera:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return read_whole(path).decode("utf-8").splitlines()
+        return read_whole(path).decode("utf-8-sig").splitlines()
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:

@@ -70,7 +70,7 @@ def write_geometry(path: Path, geometry: DriveGeometry, notes: Mapping[str, str]
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        lines = read_whole(path).decode("utf-8").splitlines() if path.exists() else []
+        lines = read_whole(path).decode("utf-8-sig").splitlines() if path.exists() else []
         tables = [k for k, line in enumerate(lines) if line.lstrip().startswith("[")]
         end = tables[0] if tables else len(lines)
         for field, key in KEYS.items():

@@ -52,7 +52,7 @@ def read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     if not path.exists():
         return np.linspace(0.0, 0.1 * (count - 1), count)
     try:
-        times = np.array([float(line) for line in read_whole(path).decode().split()])
+        times = np.array([float(line) for line in read_whole(path).decode("utf-8-sig").split()])
     except (OSError, ValueError) as error:
         raise DeviceError(f"{path}: {error}") from None
     if len(times) != count:
@@ -83,7 +83,7 @@ def read_increments(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np
     rows: list[tuple[float, float]] = []
     damage = ""
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             try:
                 for row in reader:

@@ -28,7 +28,7 @@ def read_poses(path: Path) -> StampedPoses:
         DeviceError: the file is missing or wrong.
     """
     try:
-        text = read_whole(path).decode("utf-8")
+        text = read_whole(path).decode("utf-8-sig")
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:

@@ -12,9 +12,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mapweave.agent.drivers.settings_writer import write_camera
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.settings import Settings, load_settings
-from mapweave.storage.settings_file import build
+from mapweave.storage.settings_file import build, read_toml
 
 
 def load(tmp_path: Path, text: str | bytes) -> Settings:
@@ -205,3 +206,10 @@ def test_any_value_anywhere_is_taken_or_refused(data):
     assert default is None or type(made) is type(default)
     if isinstance(default, tuple):
         assert field.type == "tuple[str, ...]" and all(type(one) is str for one in made)
+
+
+def test_a_camera_is_written_into_a_file_of_an_editor_of_windows(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_bytes(b'\xef\xbb\xbf[robot.camera]\r\nsource = "1"\r\n')
+    write_camera(path, {"fx": 300.0})
+    assert read_toml(path)["robot"]["camera"] == {"source": "1", "fx": 300.0}

@@ -278,3 +278,26 @@ def test_what_is_no_recording_is_refused_in_one_line(name: str, tmp_path: Path) 
     with pytest.raises(DeviceError) as error:
         open_recording(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_files_of_an_editor_of_windows(drive: Drive, tmp_path: Path) -> None:
+    """Such editors begin a file with an invisible mark, and end lines with CR LF."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    folder_with_poses(drive, folder)
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+    rows = [f"{stamp / 1e9:.3f},{0.1 * k},0,0\n" for k, stamp in enumerate(drive.stamps_ns)]
+    (folder / "odometry.csv").write_text("stamp_s,x_m,y_m,heading_rad\n" + "".join(rows))
+    before = open_recording(folder)
+    files = [path for path in folder.iterdir() if path.is_file()]
+    assert {"camera.toml", "odometry.csv", "times.txt"} <= {path.name for path in files}
+    for path in files:
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    after = open_recording(folder)
+    assert after.camera == before.camera
+    assert np.array_equal(after.stamps_ns, before.stamps_ns)
+    assert np.array_equal(after.increments, before.increments)
+    (folder / "odometry.csv").write_bytes(
+        b"\xef\xbb\xbfforward_m,turn_rad\r\n" + b"0.1,0.0\r\n" * len(drive.images)
+    )
+    assert open_recording(folder).increments[1] == pytest.approx([0.1, 0.0])
