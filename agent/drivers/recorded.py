@@ -41,6 +41,11 @@ class RecordedRobot:
         """Observations that are on the disk."""
         return 0 if self._writer is None else self._writer.written
 
+    @property
+    def failed(self) -> bool:
+        """Whether the recording has ended by itself, as on a full disk; a line has said why."""
+        return self._writer is not None and self._writer.failed
+
     def describe(self) -> RobotDescription:
         """Description of the other robot."""
         description = self._robot.describe()

@@ -100,6 +100,11 @@ class McapWriter:
             if self.dropped == 1:
                 self._say(f"{self._folder}: the disk is too slow, observations are left out of the recording")
 
+    @property
+    def failed(self) -> bool:
+        """Whether the recording has ended before it was closed: nothing more is written."""
+        return bool(self._failed)
+
     def close(self) -> None:
         """Write what waits and finish the file."""
         if not self._thread.is_alive():
@@ -131,6 +136,8 @@ class McapWriter:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
+        if self._failed:
+            return
         self._failed = (
             getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
         )

@@ -50,11 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
             print_error(f"{name}: waits for its robot")
             recorded.describe()
             with Bar(plain_or_terminal(), f"{name}: observations in {arguments.out}", None) as bar:
-                while not stop.is_set() and recorded.sense() is not None:
+                while not (stop.is_set() or recorded.failed) and recorded.sense() is not None:
                     bar.update(recorded.written)
         finally:
             recorded.close()
     finally:
         bus.close()
     print(f"{name}: {recorded.written} observations in {arguments.out}")
-    return 0
+    return 1 if recorded.failed else 0

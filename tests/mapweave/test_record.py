@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import pytest
@@ -66,3 +67,18 @@ def test_a_recording_is_not_overwritten(
     assert main(["record", "r0", "--out", str(tmp_path / "drive"), *nowhere]) == 1
     assert "not empty" in capfd.readouterr().err
     assert [p.name for p in (tmp_path / "drive").iterdir()] == ["notes.txt"]
+
+
+def test_a_full_disk_ends_the_command(
+    driver: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    endless = (tmp_path / "rolling.py").read_text().replace("self.count > 20", "time.sleep(0.01)")
+    (tmp_path / "rolling.py").write_text(f"import time\n{endless}")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("mapweave.agent.recordings.mcap_writer._Part.write", full)
+    out = str(tmp_path / "drive")
+    assert main(["record", "r0", "--out", out, "--robot", driver, "--connect", "tcp/127.0.0.1:1"]) == 1
+    assert capfd.readouterr().err.count("the recording ends here, No space left on device") == 1
