@@ -44,6 +44,7 @@ class CheckedRobot:
         self._description: RobotDescription | None = None
         self._stamp_ns: int | None = None
         self._good = 0
+        self._waiting_since: float | None = None
 
     def describe(self) -> RobotDescription:
         """Description of the robot.
@@ -58,6 +59,12 @@ class CheckedRobot:
             self._description = description
         return self._description
 
+    @property
+    def waiting(self) -> float:
+        """For how long the driver's `sense` has not returned, s; 0 outside of it."""
+        since = self._waiting_since
+        return 0.0 if since is None else time.monotonic() - since
+
     def sense(self) -> Observation | None:
         """The next observation.
 
@@ -65,8 +72,12 @@ class CheckedRobot:
             DeviceError: the observation is wrong, or the driver has failed.
         """
         description = self.describe()
-        with _driver_code():
-            seen = self._robot.sense()
+        self._waiting_since = time.monotonic()
+        try:
+            with _driver_code():
+                seen = self._robot.sense()
+        finally:
+            self._waiting_since = None
         if seen is None:
             return None
         if not isinstance(seen, Observation):

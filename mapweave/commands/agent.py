@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import threading
 from dataclasses import replace
@@ -23,6 +24,7 @@ from mapweave.connection import SOON
 from mapweave.extras import need
 
 if TYPE_CHECKING:
+    from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.robot import Robot
     from mapweave.agent.drivers.settings import RobotSettings
     from mapweave.agent.synchronization import Synchronization
@@ -136,13 +138,13 @@ def run(arguments: argparse.Namespace) -> int:
             body, _ = connect(replace(network, endpoints=(arguments.body,), keys=""))
         if body.wait_connected(SOON):
             claim = Claim(body, keys, name)
-        robot, synchronization = open_robot(
+        robot, synchronization = checked, _ = open_robot(
             arguments, settings.robot, body, network.fleet, name, arguments.lockstep
         )
         if arguments.record is not None:
             robot = RecordedRobot(robot, arguments.record, print_line=print_error)
         # A stop signal ends the wait for the robot.
-        threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
+        threading.Thread(target=close_on, args=(stop, checked), name="stop", daemon=True).start()
         kinds = {"explore": MissionKind.EXPLORE, "carried": MissionKind.CARRIED, "idle": MissionKind.STOP}
         options = AgentOptions(
             name=name,
@@ -218,7 +220,7 @@ def open_robot(
     fleet: str,
     name: str,
     lockstep: bool = False,
-) -> tuple[Robot, Synchronization]:
+) -> tuple[CheckedRobot, Synchronization]:
     """The robot, its output checked, and how the loop is synchronised: a simulation may run in lock-step."""
     from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.registry import find_driver
@@ -252,7 +254,27 @@ def bus_of(arguments: argparse.Namespace, settings: RobotSettings, network: Netw
     return (reach(network) if remote else connect(network))[0]
 
 
-def close_on(stop: threading.Event, robot: Robot) -> None:
-    """Close a robot once the process is stopped, which ends a wait for an observation."""
+PATIENCE = 5.0
+"""s that a driver may take to return once it is closed."""
+
+
+def close_on(stop: threading.Event, robot: CheckedRobot) -> None:
+    """Close a robot once the process is stopped, which ends a wait for an observation.
+
+    A driver that does not return even then is named, and the process ends without it: each change of the map
+    is in the journal already.
+    """
     stop.wait()
+    end = threading.Timer(PATIENCE, end_without, args=(robot,))
+    end.daemon = True
+    end.start()
     robot.close()
+
+
+def end_without(robot: CheckedRobot) -> None:
+    """End the process if the driver hangs."""
+    if robot.waiting >= PATIENCE:
+        print_error(
+            f"the driver's sense() has not returned for {robot.waiting:.0f} s: the process ends without it"
+        )
+        os._exit(1)

@@ -120,3 +120,26 @@ def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: P
     *_, last = agent.said.read_text().splitlines()
     assert re.match(f"mapweave: driver: {words}", last), last
     assert (tmp_path / "agent.log").read_text().endswith("closed\n")
+
+
+@pytest.mark.slow
+def test_a_driver_that_hangs_does_not_keep_the_process(tmp_path: Path, closed: str) -> None:
+    hangs = DRIVER.replace("time.sleep(0.1)", "print('hangs', file=self.log); time.sleep(1000)")
+    driver = tmp_path / "still.py"
+    driver.write_text(hangs.replace("{stamp}", "time.time_ns()"))
+    agent = Started(
+        tmp_path, "agent", "agent", "r0", "--robot", f"{driver}:Still", "--connect", closed,
+        "--settings", settings(tmp_path, "agent"), "--data", tmp_path / "data", "--epoch", "1",
+    )  # fmt: skip
+    try:
+        log = tmp_path / "agent.log"
+        eventually(lambda: log.exists() and "hangs" in log.read_text())
+        assert agent.end() == 1
+        *_, last = agent.said.read_text().splitlines()
+        assert re.search(
+            r"the driver's sense\(\) has not returned for \d+ s: the process ends without it$", last
+        )
+        assert log.read_text().endswith("closed\n")
+    finally:
+        agent.process.kill()
+        agent.process.wait()
