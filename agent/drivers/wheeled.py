@@ -31,6 +31,8 @@ PATIENCE = 5.0
 """s that `describe` waits for the first answer of the base."""
 STALE = 0.5
 """s; older proximity readings are not reported."""
+SILENT = 2.0
+"""s without an answer after which a base is called silent whose driver waits on; most give up before that."""
 OLDEST_IMAGE_NS = 1_000_000_000
 """Assumed age of the first image on arrival; later the age of the last image is used."""
 LONGEST_EXTRAPOLATION_NS = 100_000_000
@@ -68,6 +70,7 @@ class WheeledRobot:
         self._failure = ""
         self._mistake: BaseException | None = None
         self._opened = self._closing = False
+        self._answered = 0.0
         self._stamp_ns = 0
         self._age_ns = OLDEST_IMAGE_NS
         self._odometry_at = Wheels()
@@ -124,6 +127,9 @@ class WheeledRobot:
             if self._closing:
                 return None
             self._raise_mistake()
+            if not self._failure and time.monotonic() - self._answered > SILENT:
+                # Else its thread has said what is wrong.
+                self._fail(f"the robot's base has not answered for {SILENT:g} s")
             if frame is not None and not isinstance(frame, Frame):
                 raise mistake("camera: newer()", f"must return a Frame or None, not {kind_of(frame)}")
             if frame is not None:
@@ -266,7 +272,7 @@ class WheeledRobot:
             self._kidnapped |= reading.kidnapped
             if self._failure and self._opened:
                 log.warning("the robot answers again")
-            self._opened, self._failure = True, ""
+            self._opened, self._failure, self._answered = True, "", time.monotonic()
             self._changed.notify_all()
 
     def _fail(self, failure: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapweave.agent.drivers import wheeled
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
 from mapweave.agent.drivers.camera import Frame
 from mapweave.agent.drivers.checked import CheckedRobot
@@ -34,6 +35,8 @@ class EvenBase:
     def __init__(self) -> None:
         self.failing = self.broken = False
         self.touches = self.reads = 0
+        self.answers = threading.Event()
+        self.answers.set()
 
     def way(self, stamp_ns: int) -> Wheels:
         seconds = (stamp_ns % 10**13) / 1e9
@@ -56,6 +59,7 @@ class EvenBase:
     def read(self) -> BaseReading:
         if self.failing:
             raise DeviceError("gone")
+        self.answers.wait()
         self.reads += 1
         touched, self.touches = self.touches > 0, max(self.touches - 1, 0)
         return BaseReading(self.way(now_ns()), bumped=touched, kidnapped=touched)
@@ -157,6 +161,23 @@ def test_neither_image_nor_wheels(robot: CheckedRobot, base: EvenBase, camera: L
         seen = robot.sense()
     assert seen is not None
     assert seen.image is not None
+
+
+def test_a_base_that_waits_on_for_an_answer_is_called_silent(
+    robot: CheckedRobot, base: EvenBase, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(wheeled, "SILENT", 0.3)
+    base.answers.clear()
+    with caplog.at_level("WARNING"):
+        for _ in range(8):
+            seen = robot.sense()
+        base.answers.set()
+        eventually(lambda: "the robot answers again" in caplog.text)
+    assert seen is not None and seen.odometry.forward == 0.0
+    assert [record.message for record in caplog.records] == [
+        "the robot's base has not answered for 0.3 s; the robot stands until it answers again",
+        "the robot answers again",
+    ]
 
 
 def test_a_driver_that_fails_is_not_driven_on(robot: CheckedRobot, base: EvenBase) -> None:
