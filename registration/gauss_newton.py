@@ -44,8 +44,8 @@ class PlanarFix:
         mean_square: mean squared normalised residual of the inliers; 1 when the uncertainties are right.
         rms_px: of the inliers' residuals, px, after the points moved within their uncertainty.
         log_evidence: sum over the inliers of how much likelier they are than wrong matches, nats.
-        rival: what the mirrored pose explains (see planar_ambiguity.py), as a share of what this one does; 0 if
-            there is no other.
+        rival: what the mirrored pose explains (see planar_ambiguity.py), as a share of what this one does; 0
+            if there is no other.
     """
 
     node_from_robot: PoseGaussian

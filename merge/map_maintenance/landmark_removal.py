@@ -245,7 +245,7 @@ def presence(together: NDArray[np.bool_], observations: Sequence[LandmarkObserva
             hidden *= np.where(informative, found == 0, 1.0)
             absent *= np.where(informative, MISTAKEN**found * (1.0 - MISTAKEN) ** missed, 1.0)
             informed |= informative
-            # Only their ratios count. Scaled by powers of two they lose no digit, and all of them never vanish.
+            # Only their ratios count. Scaled by powers of two they lose no digit, and never all vanish.
             exponents = np.frexp(np.maximum(np.maximum(visible, hidden), absent))[1]
             visible, hidden, absent = (np.ldexp(some, -exponents) for some in (visible, hidden, absent))
         if_present = (1.0 - HIDDEN) * visible + HIDDEN * hidden
