@@ -149,6 +149,7 @@ def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
     link.close()
 
 
+@pytest.mark.slow
 def test_one_robot_displaces_no_missions_of_others(house: House) -> None:
     """By very many missions with stamps of the far future, which it says that it has, or is to get."""
     link, _ = house.robot()

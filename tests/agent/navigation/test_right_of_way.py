@@ -306,6 +306,7 @@ def test_a_robot_passes_what_it_must_in_order_and_then_seeks_its_goal(home):
     assert eyes.pose.x - 1.0 == pytest.approx(poses[C], abs=0.35), "it has been at the last before it turns"
 
 
+@pytest.mark.slow
 def test_a_robot_that_goes_to_and_fro_gives_up_neither_for_time_nor_for_way(home):
     """Before, it gave up once its stops took more way than 50 m, or its patience: it drove no new edge."""
     eyes, poses = Eyes(home, Pose2(1.0, 2.0)), {A: 0.0, B: 1.0}
