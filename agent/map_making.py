@@ -218,7 +218,8 @@ class MapMaking:
     def _act(self, behaviour: Explorer | CarriedMapping, observation: Observation) -> Command:
         """The behaviour's command for this tick; what it asks of the mapper before that is done at once.
 
-        Only here do the views of an episode become nodes. They leave with the step's changes.
+        Only here do anchors become nodes. They leave with the step's changes; nodes of further views and loop
+        closures follow in the next ticks.
         """
         while isinstance(move := behaviour.next_move(), EpisodeRequest):
             self.mapper.meet(move, observation)
