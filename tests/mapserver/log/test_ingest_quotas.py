@@ -143,11 +143,8 @@ def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(
     eventually(lambda: [agent.beacon(2) for agent in agents] and len(server.store.maps()) == 6)
 
 
-def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
-    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(nodes=10)))
+def robot(hub: MemoryHub, tmp_path: Path, cleanup: ExitStack) -> tuple[MapId, Replicator]:
+    """A robot with an empty map, and what sends its changes."""
     bus = MemoryBus(hub)
     cleanup.callback(bus.close)
     journal = Journal(tmp_path / "r0.sqlite", "r0")
@@ -155,6 +152,15 @@ def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     map_id = journal.open_map(1)
     replicator = Replicator(bus, KEYS, journal, map_id, ["s0"], AGENT)
     cleanup.callback(replicator.close)
+    return map_id, replicator
+
+
+def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
+    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(nodes=10)))
+    map_id, replicator = robot(hub, tmp_path, cleanup)
     rng = np.random.default_rng(1)
     puts = [node(map_id, number, rng) for number in range(1, 16)]
     again = [node(map_id, number, rng) for number in range(1, 6)]
@@ -179,13 +185,7 @@ def test_edges_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     monkeypatch.setattr(intake, "DRIVEN", 10)
     monkeypatch.setattr(intake, "EDGES", 2)
     server = Server(hub, tmp_path / "s0.sqlite")
-    bus = MemoryBus(hub)
-    cleanup.callback(bus.close)
-    journal = Journal(tmp_path / "r0.sqlite", "r0")
-    cleanup.callback(journal.close)
-    map_id = journal.open_map(1)
-    replicator = Replicator(bus, KEYS, journal, map_id, ["s0"], AGENT)
-    cleanup.callback(replicator.close)
+    map_id, replicator = robot(hub, tmp_path, cleanup)
     rng = np.random.default_rng(1)
     nodes = [node(map_id, number, rng) for number in (1, 2)]
     again = [edge(map_id, 3 + number % 5, 1, 2) for number in range(40)]
