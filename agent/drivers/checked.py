@@ -27,6 +27,14 @@ stands then, and says so (`sensor_health/clock_monitor.py`)."""
 SKEW = 60.0
 """A first stamp this near to the time in another unit is in that unit, s. Others show it by how they rise."""
 UNITS = {"seconds": 1.0, "milliseconds": 1e3, "microseconds": 1e6}
+LARGEST = 1e4
+"""m or rad; a larger motion in a tick is no measurement, and covariances overflow."""
+TOO_FAST = 10.0
+"""So many times as fast as it is described to be, no robot moves: the unit is wrong, or the motion is not the
+one since the observation before. Only the first motions are judged, as the first stamps are: encoders that
+jump later have failed, which the pipeline says (`sensor_health/encoder_monitor.py`)."""
+SLACK = (0.5, 1.0)
+"""m and rad in a tick that are never too much: of a robot that is pushed, or whose observation comes late."""
 
 
 class CheckedRobot:
@@ -43,7 +51,7 @@ class CheckedRobot:
         self._clock = clock
         self._description: RobotDescription | None = None
         self._stamp_ns: int | None = None
-        self._good = 0
+        self._good = self._moved = 0
         self._waiting_since: float | None = None
 
     def describe(self) -> RobotDescription:
@@ -82,9 +90,12 @@ class CheckedRobot:
             return None
         if not isinstance(seen, Observation):
             raise mistake("sense()", f"must return an Observation or None, not {kind_of(seen)}")
+        before_ns = self._stamp_ns
         self._check_stamp(seen.stamp_ns, description.tick)
         _check_image(seen, description)
         _check_numbers(seen, description)
+        if before_ns is not None:
+            self._check_motion(seen.odometry, max((seen.stamp_ns - before_ns) * 1e-9, description.tick))
         return seen
 
     def act(self, command: Command) -> Command:
@@ -135,6 +146,24 @@ class CheckedRobot:
             raise mistake(
                 "stamp_ns", f"rises by {stamp_ns - before} in a tick of {tick:g} s; it must be nanoseconds"
             )
+
+    def _check_motion(self, odometry: Odometry, seconds: float) -> None:
+        """Of the first observations in which the robot has moved."""
+        if self._moved >= FIRST or not (odometry.forward or odometry.turn):
+            return
+        self._moved += 1
+        limits = self.describe()
+        for value, fastest, slack, unit in (
+            (odometry.forward, limits.max_forward, SLACK[0], "m"),
+            (odometry.turn, limits.max_turn, SLACK[1], "rad"),
+        ):
+            # A robot that is carried takes no commands, and has no limits.
+            if fastest and abs(value) > TOO_FAST * fastest * seconds + slack:
+                raise mistake(
+                    "odometry",
+                    f"is {value:g} {unit} in {seconds:.2g} s, but describe() gives at most {fastest:g} "
+                    f"{unit}/s; it must be m and rad since the observation before",
+                )
 
 
 @contextmanager
@@ -190,6 +219,8 @@ def _check_numbers(seen: Observation, description: RobotDescription) -> None:
         raise mistake("odometry", f"must be two numbers, m and rad, not {forward!r} and {turn!r}")
     if not (math.isfinite(forward) and math.isfinite(turn)):
         raise mistake("odometry", f"is not finite: {forward:g} m, {turn:g} rad")
+    if max(abs(forward), abs(turn)) > LARGEST:
+        raise mistake("odometry", f"is no motion in a tick: {forward:g} m, {turn:g} rad")
     if not isinstance(seen.proximity, np.ndarray):
         raise mistake("proximity", f"must be an array, not {kind_of(seen.proximity)}")
     # An empty array means that the sensors have failed, which the agent handles.
@@ -198,6 +229,10 @@ def _check_numbers(seen: Observation, description: RobotDescription) -> None:
     count, bearings = len(seen.proximity), len(description.ranger_bearings)
     if count and count != bearings:
         raise mistake("proximity", f"has {count} readings, but describe() gives {bearings} ranger_bearings")
+    for name in ("bumped", "kidnapped"):
+        value = getattr(seen, name)
+        if not isinstance(value, bool | np.bool_):
+            raise mistake(name, f"must be True or False, not {value!r}")
     battery = seen.battery
     if battery is not None and not (isinstance(battery, Real) and 0.0 <= battery <= 1.0):
         raise mistake("battery", f"is {battery!r}; it must be a share from 0 to 1, or None")

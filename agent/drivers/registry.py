@@ -161,6 +161,18 @@ def _driver(found: object, name: str) -> Driver:
             raise
         except Exception as error:
             raise driver_error(error) from error
+        _check_opened(robot, name)
         return robot
 
     return opened
+
+
+def _check_opened(robot: Robot, name: str) -> None:
+    """Refuse a subclass of `WheeledRobot` that has not called its constructor: every method would fail."""
+    # Late: this module also lists drivers where OpenCV is missing.
+    from mapweave.agent.drivers.wheeled import WheeledRobot
+
+    if isinstance(robot, WheeledRobot) and not robot.initialized:
+        raise DeviceError(
+            f"driver {name}: __init__ must call super().__init__(base, settings) of WheeledRobot"
+        )

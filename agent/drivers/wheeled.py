@@ -44,7 +44,12 @@ class WheeledRobot:
 
     One thread sends the newest command to the base, reads it, and reconnects when the line fails. Another
     thread captures images. `sense` and `act` only exchange values with these threads.
+
+    Attributes:
+        initialized: whether the constructor has run to its end; a subclass may forget to call it.
     """
+
+    initialized = False
 
     def __init__(self, base: Base, settings: RobotSettings, camera: FrameSource | None = None) -> None:
         """Open the camera and start to connect.
@@ -83,6 +88,7 @@ class WheeledRobot:
         self._camera = camera
         self._thread = threading.Thread(target=self._serve, name="base", daemon=True)
         self._thread.start()
+        self.initialized = True
 
     def describe(self) -> RobotDescription:
         """Combine settings and driver; waits for the first answer of the base.

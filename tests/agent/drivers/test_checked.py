@@ -73,6 +73,9 @@ def good(**changes: Any) -> Observation:
         (good(odometry=None), "odometry must be an Odometry, not None"),
         (good(odometry=(0.1, 0.0)), "odometry must be an Odometry, not tuple"),
         (good(odometry=Odometry("0.1", 0.0)), "odometry must be two numbers, m and rad, not '0.1' and 0.0"),  # type: ignore[arg-type]
+        (good(odometry=Odometry(1e300, 0.0)), "odometry is no motion in a tick: 1e\\+300 m, 0 rad"),
+        (good(bumped=None), "bumped must be True or False, not None"),
+        (good(kidnapped=1), "kidnapped must be True or False, not 1"),
         (good(proximity=[1.0] * 5), "proximity must be an array, not list"),
         (good(proximity=np.full(5, "1")), "proximity must be an array of one distance for each bearing"),
         (good(battery=80), "battery is 80; it must be a share from 0 to 1, or None"),
@@ -200,6 +203,42 @@ def test_seconds_since_the_start_are_no_nanoseconds() -> None:
     robot.sense()
     with pytest.raises(DeviceError, match="must be nanoseconds"):
         robot.sense()
+
+
+def at(tick: int, forward: float, turn: float = 0.0) -> Observation:
+    """A good observation with a motion."""
+    return good(stamp_ns=NOW_NS + tick * 100_000_000, odometry=Odometry(forward, turn))
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [
+        (Odometry(30.0, 0.0), "30 m in 0.1 s, but .* at most 0.3 m/s"),  # millimetres
+        (Odometry(0.0, -4.5), "-4.5 rad in 0.1 s, but .* at most 0.8 rad/s"),  # degrees
+    ],
+)
+def test_odometry_in_another_unit_shows_when_the_robot_first_moves(motion: Odometry, words: str) -> None:
+    robot = checked(at(0, 0.0), *(at(k, 0.0) for k in range(1, 40)), replace(at(40, 0.0), odometry=motion))
+    for _ in range(40):
+        robot.sense()
+    with pytest.raises(DeviceError, match=f"^driver: odometry is {words}; .* since the observation before"):
+        robot.sense()
+
+
+def test_encoders_that_jump_later_are_for_the_pipeline_to_say() -> None:
+    seen = [*(at(k, 0.01) for k in range(FIRST + 1)), at(FIRST + 1, 30.0)]
+    robot = checked(*seen)
+    assert [robot.sense() for _ in seen] == seen
+
+
+def test_a_robot_that_is_pushed_or_late_moves_as_it_may() -> None:
+    """The way of a minute without an observation, and a robot without limits, which is carried."""
+    seen = [at(0, 0.0), at(1, 0.4, 0.8), at(601, 30.0)]
+    robot = checked(*seen)
+    assert [robot.sense() for _ in seen] == seen
+    carried = checked(at(0, 0.0), at(1, 5.0), description=replace(DESCRIPTION, max_forward=0.0))
+    assert carried.sense() is not None
+    assert carried.sense() is not None
 
 
 @pytest.mark.parametrize(

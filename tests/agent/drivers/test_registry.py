@@ -114,6 +114,19 @@ def test_a_constructor_that_fails(text: str, words: str, tmp_path: Path) -> None
         find_driver(f"{path}:Rover")(RobotSettings())
 
 
+def test_a_wheeled_robot_without_the_constructor_of_its_base_class(tmp_path: Path) -> None:
+    """Before, the agent ended with a traceback from its `close`."""
+    path = tmp_path / "rover.py"
+    path.write_text(
+        "from mapweave.agent.drivers.wheeled import WheeledRobot\n"
+        "class Rover(WheeledRobot):\n"
+        "    def __init__(self, settings): self.settings = settings\n"
+    )
+    words = r"^driver .*rover.py:Rover: __init__ must call super\(\).__init__\(base, settings\)"
+    with pytest.raises(DeviceError, match=words):
+        find_driver(f"{path}:Rover")(RobotSettings())
+
+
 def test_the_example_says_which_option_it_lacks() -> None:
     example = Path(__file__).parents[3] / "examples" / "own_robot.py"
     with pytest.raises(
