@@ -10,7 +10,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
+
+FARTHEST = 10.0
+"""m; no robot has its lens higher above the floor, or farther from the axle: it is in millimetres."""
+
+
+def check_mount(height: float, forward: float = 0.0) -> None:
+    """Refuse a mount of a camera that cannot be right.
+
+    Args:
+        height: of the optical centre above the floor, m.
+        forward: of it ahead of the axle, m.
+
+    Raises:
+        InvalidValue: which of them is too far, or is no number.
+    """
+    for name, value, least in (("height_m", height, 0.0), ("forward_m", forward, -FARTHEST)):
+        if not least <= value <= FARTHEST:
+            raise InvalidValue(
+                f"camera: {name} is {value:g}; it is in metres, from {least:g} to {FARTHEST:g}"
+            )
 
 
 class Parameter(IntEnum):

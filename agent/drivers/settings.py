@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
+from mapweave.agent.drive_geometry import check_mount
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import SettingsError
@@ -59,8 +60,10 @@ class CameraSettings:
         """The ideal camera on the robot, and the lens.
 
         Raises:
-            InvalidValue: the coefficients are not those of such a lens, or it folds.
+            InvalidValue: the coefficients are not those of such a lens, it folds, or the mount
+                cannot be right.
         """
+        check_mount(self.height_m, self.forward_m)
         image = Camera(
             self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.height_m, self.forward_m
         )

@@ -289,7 +289,9 @@ def _poses(opened: Bag, topic: str) -> StampedPoses:
     if kept.sum() < 2:
         why = f" ({opened.damage[-1]})" if opened.damage else ""
         raise DeviceError(f"{opened.path}: {topic} has {int(kept.sum())} poses; there must be two{why}")
-    return StampedPoses(stamps[kept], poses[kept])
+    left_out = int((~kept).sum())
+    notes = (f"{left_out} poses of {topic} go back in time or repeat a stamp: left out",) if left_out else ()
+    return StampedPoses(stamps[kept], poses[kept], notes=notes)
 
 
 def _kidnapped(opened: Bag, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mapweave.agent.drive_geometry import check_mount
 from mapweave.agent.recordings.geometry_file import FILE_KEYS
 from mapweave.agent.recordings.toml_file import check_keys, number, read_table, whole
 from mapweave.hybridmap.camera import Camera
@@ -29,6 +30,7 @@ def read_camera(path: Path) -> tuple[Camera, Distortion]:
             mount_height=number(values, "height_m"),
             mount_forward=number(values, "forward_m") if "forward_m" in values else 0.0,
         )  # fmt: skip
+        check_mount(camera.mount_height, camera.mount_forward)
         model = LensModel(values.get("lens", LensModel.RADIAL_TANGENTIAL))
         return lens_of(camera, model, values.get("distortion", ()))
     except KeyError as missing:

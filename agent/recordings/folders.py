@@ -15,6 +15,7 @@ from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven, com
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Images, Recording, Stamps, stamps_of
+from mapweave.agent.recordings.table_file import named_columns
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
@@ -139,7 +140,7 @@ def _is_poses(path: Path) -> bool:
     """Whether an odometry.csv has stamped poses rather than increments."""
     try:
         with path.open(newline="") as file:
-            return "x_m" in next(csv.reader(file), [])
+            return "x_m" in named_columns(file)
     except (OSError, ValueError, csv.Error):
         return False
 

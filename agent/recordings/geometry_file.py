@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from mapweave.agent.drive_geometry import DriveGeometry
+from mapweave.agent.drive_geometry import FARTHEST, DriveGeometry
 from mapweave.agent.recordings.toml_file import check_keys, number, read_table
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.atomic_file import read_whole, write_whole
@@ -25,9 +25,9 @@ CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "lens", "distortion")
 FILE_KEYS = (*CAMERA_KEYS, *KEYS.values())
 """What a camera.toml or a robot's own file may give."""
 LIMITS = {
-    "forward": (-10.0, 10.0), "left": (-10.0, 10.0), "height": (0.001, 100.0), "heading": (-0.6, 0.6),
-    "pitch": (-0.6, 0.6), "roll": (-0.6, 0.6), "wheel_scale": (0.2, 5.0), "turn_scale": (0.2, 5.0),
-    "drift": (-1.0, 1.0), "delay": (-1.0, 1.0),
+    "forward": (-FARTHEST, FARTHEST), "left": (-FARTHEST, FARTHEST), "height": (0.001, FARTHEST),
+    "heading": (-0.6, 0.6), "pitch": (-0.6, 0.6), "roll": (-0.6, 0.6),
+    "wheel_scale": (0.2, 5.0), "turn_scale": (0.2, 5.0), "drift": (-1.0, 1.0), "delay": (-1.0, 1.0),
 }  # fmt: skip
 """What cannot be right is a mistake in the file; m, rad, rad/m, s."""
 

@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from mapweave.agent.recordings.table_file import read_text, rows_of
 from mapweave.agent.recordings.toml_file import number
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.storage.atomic_file import read_whole
 
+INCREMENT_COLUMNS = ("forward_m", "turn_rad")
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 
 
@@ -80,32 +82,24 @@ def read_increments(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np
     Raises:
         DeviceError: it is missing or wrong, or has less than two rows that can be read.
     """
+    text, damage = read_text(path)
     rows: list[tuple[float, float]] = []
-    damage = ""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            try:
-                for row in reader:
-                    values = number(row, "forward_m"), number(row, "turn_rad")
-                    if not all(map(math.isfinite, values)):
-                        raise ValueError("there must be one finite row for each image")
-                    rows.append(values)
-            except (ValueError, TypeError, csv.Error) as error:
-                damage = f"{path}: line {reader.line_num}: {error}"
-        whole = read_whole(path).endswith(b"\n")
-    except FileNotFoundError:
-        raise DeviceError(f"{path}: no such file; without odometry the map has no scale") from None
-    except KeyError as missing:
-        raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
-    except (OSError, ValueError) as error:
-        raise DeviceError(f"{path}: {error}") from None
+    if text:
+        reader = rows_of(path, text.splitlines(), INCREMENT_COLUMNS)
+        try:
+            for row in reader:
+                values = number(row, "forward_m"), number(row, "turn_rad")
+                if not all(map(math.isfinite, values)):
+                    raise ValueError("there must be one finite row for each image")
+                rows.append(values)
+        except (ValueError, TypeError, csv.Error) as error:
+            damage = f"{path}: line {reader.line_num}: {error}"
     if (len(rows) >= count and damage) or len(rows) > count:
         raise DeviceError(damage or f"{path}: {len(rows)} rows for {count} images; there must be one each")
     if len(rows) < count and not damage:
         damage = f"{path}: {len(rows)} rows for {count} images"
         # The number that a file without a last line's end ends in may have had more digits.
-        rows = rows if whole else rows[:-1]
+        rows = rows if text.endswith("\n") else rows[:-1]
     if len(rows) < 2:
         raise DeviceError(damage or f"{path}: {count} images are no drive; there must be two or more")
     return np.array(rows), damage

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mapweave.agent.drive_geometry import check_mount
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class RecordingOptions:
             height_given: whether its mount is, too.
 
         Raises:
-            DeviceError: the person's file is missing or wrong.
+            DeviceError: the person's file is missing or wrong, or the height cannot be right.
         """
         if self.camera is not None:
             return CameraGiven(read_camera(self.camera))
@@ -45,6 +47,10 @@ class RecordingOptions:
             return CameraGiven(None, "does not say what camera it is; give --camera FILE (a camera.toml)")
         camera, distortion = given
         if self.camera_height is not None:
+            try:
+                check_mount(self.camera_height)
+            except InvalidValue as error:
+                raise DeviceError(f"--camera-height: {error}") from None
             return CameraGiven((replace(camera, mount_height=self.camera_height), distortion))
         lacks = "" if height_given else "does not say how high the camera is; give --camera-height METRES"
         return CameraGiven(given, lacks)

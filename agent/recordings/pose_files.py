@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from mapweave.agent.recordings.recording import StampedPoses, stamps_of
+from mapweave.agent.recordings.table_file import read_text, rows_of
 from mapweave.agent.ros_messages.values import heading_of
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
-from mapweave.storage.atomic_file import read_whole
 
 CSV_COLUMNS = ("stamp_s", "x_m", "y_m", "heading_rad")
 
@@ -22,31 +22,34 @@ def read_poses(path: Path) -> StampedPoses:
 
     A `.csv` has the columns stamp_s, x_m, y_m and heading_rad. Any other file has lines of
     `stamp x y z qx qy qz qw`, s and m, z up; lines that begin with # are comments. A last line without its
-    end is left out. A damaged line ends the poses.
+    end is left out. A damaged line ends the poses. Poses are sorted by time.
 
     Raises:
         DeviceError: the file is missing or wrong.
     """
-    try:
-        text = read_whole(path).decode("utf-8-sig")
-    except FileNotFoundError:
-        raise DeviceError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise DeviceError(f"{path}: {error}") from None
+    text, no_text = read_text(path)
     rows, damage = _csv(path, text) if path.suffix == ".csv" else _tum(path, text)
+    damage = damage or no_text
     if len(rows) < 2:
         raise DeviceError(damage or f"{path}: {len(rows)} poses; there must be two or more")
-    rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    rows = rows[np.append(True, np.diff(rows[:, 0]) > 0)]
+    back, rows = np.diff(rows[:, 0]) < 0, rows[np.argsort(rows[:, 0], kind="stable")]
+    new = np.append(True, np.diff(rows[:, 0]) > 0)
+    notes = []
+    if back.any():
+        often = "once" if back.sum() == 1 else f"{int(back.sum())} times"
+        notes.append(
+            f"{path}: stamps go back {often}, first at pose {int(back.argmax()) + 1}: sorted by time"
+        )
+    if not new.all():
+        notes.append(f"{path}: {int((~new).sum())} poses have the stamp of another one: left out")
+    rows = rows[new]
     stamps = stamps_of(path, rows[:, 0])
-    return StampedPoses(stamps, rows[:, 1:], f"{damage}; the poses before it are used" if damage else "")
+    damage = f"{damage}; the poses before it are used" if damage else ""
+    return StampedPoses(stamps, rows[:, 1:], damage, tuple(notes))
 
 
 def _csv(path: Path, text: str) -> tuple[Array, str]:
-    reader = csv.DictReader(_whole_lines(text))
-    missing = [name for name in CSV_COLUMNS if name not in (reader.fieldnames or ())]
-    if missing:
-        raise DeviceError(f"{path}: no column {missing[0]!r}; poses have {', '.join(CSV_COLUMNS)}")
+    reader = rows_of(path, _whole_lines(text), CSV_COLUMNS)
     rows, damage = list[list[float]](), ""
     try:
         for row in reader:

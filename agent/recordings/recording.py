@@ -112,11 +112,13 @@ class StampedPoses:
         stamps_ns: (M,) ascending, by the images' clock.
         poses: (M, 3) x m, y m, heading rad, in a frame that drifts.
         damage: what follows and cannot be read, in one line; empty if nothing does.
+        notes: what was sorted or left out, a line each.
     """
 
     stamps_ns: Stamps
     poses: Array
     damage: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def stamps_of(path: Path, seconds: Iterable[float]) -> Stamps:
@@ -212,6 +214,7 @@ def assembled(
         except DeviceError as error:
             raise DeviceError(f"{path}: {error}") from None
         damage = (*damage, odometry.damage) if odometry.damage else damage
+        notes = (*notes, *odometry.notes)
         if not inside.all():
             notes = (*notes, f"{int((~inside).sum())} of {len(stamps)} images have no odometry: left out")
         numbers = np.flatnonzero(inside)

@@ -61,6 +61,7 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Collect views, calibrate, print, write."""
+    from mapweave.agent.drive_geometry import check_mount
     from mapweave.agent.drivers.settings_writer import camera_table, write_camera
     from mapweave.hybridmap.errors import InvalidValue, SettingsError
     from mapweave.terminal import plain_or_terminal
@@ -70,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.vision.lens import LensModel
 
     a = arguments
+    check_mount(a.height or 0.0, a.forward or 0.0)
     known = {} if a.robot is None else camera_table(a.robot)
     if a.robot is not None and a.height is None and "height_m" not in known:
         raise SettingsError(

@@ -223,6 +223,7 @@ def single(folder: Path) -> None:
 
 
 ODOMETRY = "frame,turn_rad,forward_m\n" + "0,0,0\n" * COUNT
+POSES = "stamp_s,x_m,y_m,heading_rad\n" + "".join(f"{100 + k},0,0,0\n" for k in range(9))
 WRONG = {
     "no recording": (gone("."), "no such folder"),
     "no images": (gone("images"), "images: no images there"),
@@ -246,6 +247,7 @@ WRONG = {
     "width is text": (replaced("camera.toml", "width = 320", 'width = "a"'), "width 'a' is no whole number"),
     "camera of deep lists": (written("camera.toml", "width = " + "[" * 5000), "camera.toml"),
     "camera with a long number": (replaced("camera.toml", "0.05", "9" * 400), "has too many digits"),
+    "camera height in mm": (replaced("camera.toml", "height_m = 0.3", "height_m = 300"), "is in metres"),
     "one image": (single, "1 images are no drive; there must be two or more"),
     "no odometry": (gone("odometry.csv"), "14 images, but no odometry: give --odometry FILE"),
     "odometry is a folder": (folder_at("odometry.csv"), "odometry.csv"),
@@ -255,7 +257,10 @@ WRONG = {
     "odometry with text": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0,far", 1)), "'far' is no"),
     "odometry with a gap": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0", 1)), "2: forward_m is"),
     "odometry not finite": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0,nan", 1)), "one finite"),
-    "odometry is no text": (written("odometry.csv", b"\xff\xfe\x00" * 9), "odometry.csv"),
+    "odometry is no text": (written("odometry.csv", b"\xff\xfe\x00" * 9), "odometry.csv: is no text"),
+    "odometry is an image": (written("odometry.csv", b"\x89PNG\r\n\x1a\n\0\0"), "odometry.csv: is no text"),
+    "odometry of a sheet": (written("odometry.csv", ODOMETRY.replace(",", ";")), "separated by ';'; separ"),
+    "poses of a sheet": (written("odometry.csv", POSES.replace(",", "\t")), "separated by '\\t'; separ"),
     "odometry with a huge field": (written("odometry.csv", ODOMETRY + "1" * 200_000), "odometry.csv"),
     "times too few": (written("times.txt", "1\n2\n"), "2 times for 14 images"),
     "times go back": (written("times.txt", "\n".join(map(str, [*range(13), 3]))), "line 14: 3.0: times must"),

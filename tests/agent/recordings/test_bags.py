@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
@@ -249,6 +249,22 @@ def test_the_longer_a_cut_bag_is_the_more_images_it_has(
         counts.append(check_prefix(path, drive))
     assert counts == sorted(counts) and counts[0] == 0
     assert counts[2] >= 0.5 * 0.6 * COUNT and counts[3] >= 0.6 * COUNT
+
+
+def test_poses_that_go_back_in_time_are_left_out_and_said(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bag(tmp_path / "drive", drive)
+    messages = bag.Bag.messages
+
+    def again(self: bag.Bag, topic: str) -> Iterator[tuple[int, Any]]:
+        found = list(messages(self, topic))
+        return iter([*found[:4], *found[2:]] if topic == "/odom" else found)
+
+    monkeypatch.setattr(bag.Bag, "messages", again)
+    recording = open_recording(tmp_path / "drive", OPTIONS)
+    assert "2 poses of /odom go back in time or repeat a stamp: left out" in recording.notes
+    assert recording.increments == pytest.approx(drive.increments)
 
 
 def test_a_pose_that_is_no_number_ends_the_odometry(drive: Drive, tmp_path: Path) -> None:

@@ -271,6 +271,58 @@ def test_wrong_poses_are_refused_in_one_line(text: str, words: str, drive: Drive
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
+def test_poses_that_go_back_in_time_are_sorted_and_said(
+    drive: Drive, poses_file: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    tum_rgbd(drive, folder)
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    options = RecordingOptions(camera=tmp_path / "camera.toml", odometry=poses_file)
+    before = open_recording(folder, options)
+    comment, *lines = poses_file.read_text().splitlines()
+    lines[4:6] = lines[5], lines[4], lines[4]
+    poses_file.write_text("\n".join([comment, *lines]) + "\n")
+    after = open_recording(folder, options)
+    assert np.array_equal(after.increments, before.increments)
+    assert after.notes == (
+        f"{poses_file}: stamps go back once, first at pose 5: sorted by time",
+        f"{poses_file}: 1 poses have the stamp of another one: left out",
+        *before.notes,
+    )
+
+
+@pytest.mark.parametrize("name", ["odometry.txt", "odometry.csv"])
+def test_poses_that_a_disk_has_damaged_are_used_up_to_there(name: str, drive: Drive, tmp_path: Path) -> None:
+    """As a loss of power leaves them: the last block is zero, or another file's."""
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    tum_rgbd(drive, folder)
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    rows = [(stamp / 1e9, 0.1 * k) for k, stamp in enumerate(drive.stamps_ns)]
+    lines = [f"{at:.3f} {x} 0 0 0 0 0 1" for at, x in rows]
+    if name.endswith("csv"):
+        lines = ["stamp_s,x_m,y_m,heading_rad", *(f"{at:.3f},{x},0,0" for at, x in rows)]
+    whole = "\n".join(lines[:6]) + "\n"
+    for rest in (bytes(512), b"17\xff\xfe" * 99):
+        (tmp_path / name).write_bytes(whole.encode() + rest)
+        recording = open_recording(
+            folder, RecordingOptions(camera=tmp_path / "camera.toml", odometry=tmp_path / name)
+        )
+        assert len(recording) in (5, 6)
+        words = f"{tmp_path / name}: line 7: is no text; the poses before it are used"
+        assert recording.damage == (words,)
+
+
+@pytest.mark.parametrize("height", [1650.0, -0.1, float("nan")])
+def test_a_height_in_another_unit_is_refused(height: float, drive: Drive, tmp_path: Path) -> None:
+    euroc(drive, tmp_path)
+    with pytest.raises(
+        DeviceError, match=r"^--camera-height: camera: height_m is .*; it is in metres, from 0"
+    ):
+        open_recording(tmp_path, RecordingOptions(camera_height=height))
+
+
 @pytest.mark.parametrize("name", ["notes.txt", "walk.mp4", "walk.mcap", "walk.bag", "walk.db3"])
 def test_what_is_no_recording_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     path = tmp_path / name

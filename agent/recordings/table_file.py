@@ -1,0 +1,81 @@
+"""Tables in text files: rows of columns that commas separate, below a line with their names."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.storage.atomic_file import read_whole
+
+SEPARATORS = ";\t|"
+"""What programs write in the place of commas."""
+
+
+def read_text(path: Path) -> tuple[str, str]:
+    """The lines of a file up to the first that is no text.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The lines before it, and which line it is, in one line; empty if all are text.
+
+    Raises:
+        DeviceError: the file is missing, cannot be read, or does not begin with text.
+    """
+    try:
+        data = read_whole(path)
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    end = data.find(b"\0")
+    end = len(data) if end < 0 else end
+    try:
+        text = data[:end].decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        end = error.start
+        text = data[:end].decode("utf-8-sig", "ignore")
+    if end == len(data):
+        return text, ""
+    text = text[: text.rfind("\n") + 1]
+    if not text:
+        raise DeviceError(f"{path}: is no text in UTF-8; it must be one")
+    return text, f"{path}: line {text.count(chr(10)) + 1}: is no text"
+
+
+def named_columns(lines: Iterable[str]) -> list[str]:
+    """The names in the first line of a table, whatever separates them."""
+    first = next(iter(lines), "")
+    for separator in SEPARATORS:
+        first = first.replace(separator, ",")
+    return next(csv.reader([first]), [])
+
+
+def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str]) -> csv.DictReader[str]:
+    """The rows of a table.
+
+    Args:
+        path: of the file, for the error.
+        lines: of it.
+        columns: that it must have; others are not read.
+
+    Raises:
+        DeviceError: it lacks a column, or something else separates the columns.
+    """
+    reader = csv.DictReader(lines)
+    try:
+        lacking = [name for name in columns if name not in (reader.fieldnames or ())]
+    except csv.Error as error:
+        raise DeviceError(f"{path}: line 1: {error}") from None
+    if not lacking:
+        return reader
+    if lacking[0] in named_columns(lines):
+        found = next(one for one in SEPARATORS if one in lines[0])
+        raise DeviceError(
+            f"{path}: columns are separated by {found!r}; separate them by commas, and write numbers with "
+            "a point"
+        )
+    raise DeviceError(f"{path}: no column {lacking[0]!r}; it must have {', '.join(columns)}")
