@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import multivariate_normal, norm
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
@@ -72,6 +71,9 @@ def factors(linear: Linear) -> np.ndarray:
 
 def expected_ratios(sightings: Sightings, pose_vector: np.ndarray) -> list[float]:
     """By the densities of scipy, with derivatives by differences."""
+    # It takes a second to import, which each process that collects the tests would spend.
+    from scipy.stats import multivariate_normal, norm
+
     stack, ratios = stack_sightings([sightings]), []
     mean = predict(stack, pose_vector, stack.points)
     by_point = derivative(lambda d: predict(stack, pose_vector, stack.points + d), list(np.eye(3)))

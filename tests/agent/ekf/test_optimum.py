@@ -5,7 +5,7 @@ The bounds leave room for chance over few runs; `python -m benchmarks.ekf` measu
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
@@ -17,7 +17,7 @@ from synthetic.track_faults import spoil
 from tests.quick import first_quick
 
 RUNS = 20
-INTERVAL = chi2.ppf([0.001, 0.999], 3 * RUNS) / RUNS
+INTERVAL = chdtri(3 * RUNS, [0.999, 0.001]) / RUNS
 """Of an average NEES with 3 degrees of freedom; a right filter leaves it once in 500 seeds."""
 
 
