@@ -209,7 +209,6 @@ watch({
     listComponents();
     listNames();
     painter.changed();
-    requestAnimationFrame(() => performance.mark("map drawn"));
     loadSaid();
   },
   state({ server, robots }) {

@@ -1,14 +1,12 @@
-// Draws the map. Nodes and edges go into a bitmap that is larger than the window: panning moves it, and it is
-// drawn again when the window leaves it, when the zoom has come to rest, or when the map has changed.
+// Draws the map. A worker draws nodes and edges into a bitmap that is larger than the window. Panning moves it and
+// zooming scales it, until there is a new one.
 import { colours, edgeColour, hue } from "./colours.js";
 import { byId } from "./dom.js";
 import { Labels } from "./labels.js";
 import { SUPERSEDED } from "./map_model.js";
 
 const BORDER = 0.35;      // of the window's size, on each side of the bitmap
-const CHUNK = 400;        // lines in one path: long paths take much longer
-const REST = 120;         // ms without a further zoom
-const QUICK = 12;         // ms: a bitmap that takes no longer is drawn at once
+const NEAR = 0.1;         // of the window's size, from the border at which a new bitmap is asked for
 const NAMED = 38;         // px a metre, from which on nodes have names
 const RULE = 90;          // px, longest ruler
 const SIGMAS = 2;         // of the ellipse about a robot
@@ -18,8 +16,15 @@ const words = robot => robot.name + (robot.doing ? `: ${robot.doing}` : "");
 export class Painter {
   constructor(canvas, model, viewport) {
     Object.assign(this, { canvas, model, viewport, robots: [], underlays: [], overlays: [], selected: -1, link: -1, robot: "" });
-    this.bitmap = document.createElement("canvas");
-    this.drawn = null; this.cost = 0; this.waiting = 0; this.asked = false; this.kept = [];
+    this.bitmap = this.drawn = null; this.stale = this.waiting = this.asked = false; this.kept = [];
+    this.worker = new Worker(new URL("map_bitmap.js", import.meta.url));
+    this.worker.onmessage = ({ data: { bitmap, view } }) => {
+      if (!this.bitmap) requestAnimationFrame(() => performance.mark("map drawn"));
+      this.bitmap?.close();
+      Object.assign(this, { bitmap, drawn: view, waiting: false });
+      this.ask();
+    };
+    this.worker.onerror = () => { byId("undrawn").hidden = false; };
   }
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas, ratio = window.devicePixelRatio || 1;
@@ -29,10 +34,17 @@ export class Painter {
     // The buttons and the ruler.
     const { offsetLeft: left, offsetTop: top, offsetWidth: wide, offsetHeight: high } = byId("tools");
     this.kept = [[left, top, left + wide, top + high], [width - 14 - RULE, height - 32, width, height]];
-    this.drawn = null;
+    this.stale = true;
     this.ask();
   }
-  changed() { this.drawn = null; this.ask(); }
+  // The map or the theme has changed.
+  changed() {
+    const { x, y, nodes, edges, kinds, members = [], components } = this.model, { heading, state } = nodes;
+    const hues = components.map(({ anchor }) => hue(anchor)), all = Object.fromEntries(kinds.map(kind => [kind, edgeColour(kind)]));
+    this.worker.postMessage({ map: { x, y, heading, state, superseded: SUPERSEDED, edges, kinds, members, hues, colours: all } });
+    this.stale = true;
+    this.ask();
+  }
   ask() {
     if (this.asked || !this.ratio) return;
     this.asked = true;
@@ -49,8 +61,9 @@ export class Painter {
     c.setTransform(1, 0, 0, 1, 0, 0);
     if (this.drawn) {
       const d = this.drawn, [u, w] = v.toScreen(d.x, d.y), zoom = v.scale / d.scale;
+      const size = zoom * ratio / d.ratio;
       c.drawImage(this.bitmap, Math.round((u - d.width / 2 * zoom) * ratio), Math.round((w - d.height / 2 * zoom) * ratio),
-        this.bitmap.width * zoom, this.bitmap.height * zoom);
+        this.bitmap.width * size, this.bitmap.height * size);
     }
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     const labels = this.labels = new Labels(c, v, colours.ground);
@@ -63,88 +76,20 @@ export class Painter {
     labels.draw();
     this.rule(c);
   }
+  // Ask for a bitmap where the last one does not fit the window; one at a time.
   refresh() {
-    const d = this.drawn, v = this.viewport;
-    if (d) {
-      const [left, bottom] = v.toPlane(0, v.height), [right, top] = v.toPlane(v.width, 0);
-      const inside = left >= d.left && right <= d.right && bottom >= d.bottom && top <= d.top;
-      if (d.scale === v.scale && inside) return;
-      clearTimeout(this.waiting);
-      if (d.scale !== v.scale && this.cost > QUICK) {
-        this.waiting = setTimeout(() => this.changed(), REST);
-        return;
-      }
-    }
-    const began = performance.now();
-    this.paint();
-    this.cost = performance.now() - began;
-  }
-  paint() {
-    const { viewport: v, ratio, bitmap } = this;
+    const { viewport: v, drawn: d, ratio } = this;
+    if (this.waiting || !this.model.members || !this.stale && d?.scale === v.scale && this.covers(d)) return;
     const width = v.width * (1 + 2 * BORDER), height = v.height * (1 + 2 * BORDER);
-    if (bitmap.width !== Math.ceil(width * ratio) || bitmap.height !== Math.ceil(height * ratio)) {
-      bitmap.width = Math.ceil(width * ratio); bitmap.height = Math.ceil(height * ratio);
-    }
     const wide = width / v.scale, high = height / v.scale;
-    this.drawn = { x: v.x, y: v.y, scale: v.scale, width, height, left: v.x - wide / 2, right: v.x + wide / 2,
-      bottom: v.y - high / 2, top: v.y + high / 2 };
-    const c = bitmap.getContext("2d");
-    c.setTransform(ratio, 0, 0, ratio, 0, 0);
-    c.clearRect(0, 0, width, height);
-    this.paintEdges(c);
-    this.paintNodes(c);
+    this.waiting = true; this.stale = false;
+    this.worker.postMessage({ view: { x: v.x, y: v.y, scale: v.scale, ratio, width, height, left: v.x - wide / 2,
+      right: v.x + wide / 2, bottom: v.y - high / 2, top: v.y + high / 2 } });
   }
-  paintEdges(c) {
-    const { drawn: d, model: m } = this, { a, b, kind, probability } = m.edges, lines = {};
-    const x = m.x, y = m.y, shortest = 1.5 / d.scale;
-    for (let row = 0; row < m.edges.count; row++) {
-      if (!kind[row]) continue;
-      const i = a[row], j = b[row];
-      if (Math.max(x[i], x[j]) < d.left || Math.min(x[i], x[j]) > d.right) continue;
-      if (Math.max(y[i], y[j]) < d.bottom || Math.min(y[i], y[j]) > d.top) continue;
-      if (Math.abs(x[i] - x[j]) + Math.abs(y[i] - y[j]) < shortest) continue;
-      const name = m.kinds[kind[row]], doubtful = name === "merged" && probability[row] < 0.9;
-      (lines[doubtful ? "doubtful" : name] ||= []).push(i, j);
-    }
-    for (const name of ["mapped", "turned", "driven", "loop", "merged", "doubtful"]) {
-      const ends = lines[name] || [], merged = name === "merged" || name === "doubtful";
-      c.strokeStyle = edgeColour(name === "doubtful" ? "merged" : name);
-      c.lineWidth = merged ? 1.6 : name === "driven" ? 1.8 : 1.2;
-      c.setLineDash(name === "doubtful" ? [5, 4] : []);
-      for (let k = 0; k < ends.length; k += 2 * CHUNK) {
-        c.beginPath();
-        for (let n = k; n < Math.min(ends.length, k + 2 * CHUNK); n += 2) {
-          c.moveTo((x[ends[n]] - d.left) * d.scale, (d.top - y[ends[n]]) * d.scale);
-          c.lineTo((x[ends[n + 1]] - d.left) * d.scale, (d.top - y[ends[n + 1]]) * d.scale);
-        }
-        c.stroke();
-      }
-    }
-    c.setLineDash([]);
-  }
-  paintNodes(c) {
-    const { drawn: d, model: m } = this, { state, heading } = m.nodes, far = d.scale < 14;
-    const size = far ? Math.min(3, Math.max(1.5, d.scale / 4)) : Math.min(7, 2.5 + d.scale / 18);
-    m.members?.forEach((rows, component) => {
-      c.fillStyle = c.strokeStyle = hue(m.components[component].anchor);
-      c.lineWidth = 1.4;
-      for (const faint of [true, false]) {
-        c.globalAlpha = faint ? 0.35 : 1;
-        for (const row of rows) {
-          if ((state[row] === SUPERSEDED) !== faint) continue;
-          const x = m.x[row], y = m.y[row];
-          if (x < d.left || x > d.right || y < d.bottom || y > d.top) continue;
-          const u = (x - d.left) * d.scale, w = (d.top - y) * d.scale;
-          if (far) { c.fillRect(u - size / 2, w - size / 2, size, size); continue; }
-          c.beginPath();
-          c.arc(u, w, size / 2, 0, 7);
-          c.moveTo(u, w);
-          c.lineTo(u + 1.8 * size * Math.cos(heading[row]), w - 1.8 * size * Math.sin(heading[row]));
-          c.fill(); c.stroke();
-        }
-      }
-      c.globalAlpha = 1;
-    });
+  covers(d) {
+    const { viewport: v } = this, du = NEAR * v.width, dv = NEAR * v.height;
+    const [left, bottom] = v.toPlane(-du, v.height + dv), [right, top] = v.toPlane(v.width + du, -dv);
+    return left >= d.left && right <= d.right && bottom >= d.bottom && top <= d.top;
   }
   marks(c) {
     const { model: m, viewport: v } = this;

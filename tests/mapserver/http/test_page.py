@@ -159,3 +159,9 @@ def test_labels_do_not_lie_on_each_other(
     assert overlaps == [0] * len(texts)
     assert {"floor ground", *(one.name for one in places)} <= set(texts)
     assert all({f"r{k}", f"r{k}: driving"} & set(texts) for k in range(robots))
+
+
+def test_a_browser_that_cannot_draw_is_told(page: Browser) -> None:
+    assert page.run("return document.getElementById('undrawn').hidden")
+    page.run("mapweave.painter.worker.dispatchEvent(new ErrorEvent('error'))")
+    assert "cannot draw the map" in page.run("return document.querySelector('#map [role=alert]').innerText")
