@@ -119,7 +119,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
         bus.close()
 
 
-@pytest.mark.slow
+@pytest.mark.scenario
 @needs_simulator
 @pytest.mark.timeout(420)
 def test_the_demo_of_another_seed(tmp_path):
