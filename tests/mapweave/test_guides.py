@@ -119,28 +119,32 @@ class Tutorial:
             return subprocess.Popen(command, cwd=self.folder, stdout=output, stderr=output)
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
 @needs_simulator
-def test_the_first_tutorials_run_as_they_stand(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "ready"),
+    [
+        pytest.param("first-map", "(7 nodes)", marks=pytest.mark.slow),
+        pytest.param("two-robots", "r0.1 and r1.1 are one map now", marks=pytest.mark.scenario),
+    ],
+    ids=["first-map", "two-robots"],
+)
+def test_the_first_tutorials_run_as_they_stand(name: str, ready: str, tmp_path: Path) -> None:
     """What a page shows has a line of the same form in what its commands print."""
-    for name, ready in (("first-map", "(7 nodes)"), ("two-robots", "r0.1 and r1.1 are one map now")):
-        page, folder = ROOT / "docs" / f"{name}.md", tmp_path / name
-        folder.mkdir()
-        tutorial = Tutorial(folder)
-        try:
-            for command in blocks(page):
-                going = command.split()[0] in ("server", "sim", "agent")
-                if not going and len(tutorial.going) > 1:
-                    eventually(lambda ready=ready, of=tutorial: ready in of.output(), 300.0)
-                if command.startswith("map show"):
-                    tutorial.end("agent r0")
-                tutorial.run(command)
-            tutorial.end()
-        finally:
-            for process in tutorial.going.values():
-                process.kill()
-                process.wait()
-        printed = {shape(line) for line in tutorial.output().splitlines()}
-        stale = [line for line in shown(page) if not any(shape(line) in one for one in printed)]
-        assert len(shown(page)) > 4 and not stale, "\n".join([name, *stale])
+    page, tutorial = ROOT / "docs" / f"{name}.md", Tutorial(tmp_path)
+    try:
+        for command in blocks(page):
+            going = command.split()[0] in ("server", "sim", "agent")
+            if not going and len(tutorial.going) > 1:
+                eventually(lambda: ready in tutorial.output(), 300.0)
+            if command.startswith("map show"):
+                tutorial.end("agent r0")
+            tutorial.run(command)
+        tutorial.end()
+    finally:
+        for process in tutorial.going.values():
+            process.kill()
+            process.wait()
+    printed = {shape(line) for line in tutorial.output().splitlines()}
+    stale = [line for line in shown(page) if not any(shape(line) in one for one in printed)]
+    assert len(shown(page)) > 4 and not stale, "\n".join(stale)
