@@ -228,7 +228,7 @@ def test_exploring_twin_rooms_are_distinguished_within_100_seconds() -> None:
     [
         pytest.param("arena", 1, marks=pytest.mark.slow),
         pytest.param("arena", 2, marks=pytest.mark.scenario),
-        pytest.param("office", 5, marks=pytest.mark.slow),
+        pytest.param("office", 5, marks=pytest.mark.scenario),
     ],
 )
 def test_robots_that_explore_together_are_never_refused(kind: str, seed: int) -> None:
