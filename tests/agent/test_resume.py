@@ -250,8 +250,10 @@ def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_p
     check_resumed(begun, life, begun.truth | life.truth())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4, 9))
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(s, marks=pytest.mark.slow if s < 6 else pytest.mark.scenario) for s in range(4, 9)],
+)
 def test_kidnapped_again_and_again(tmp_path: Path, seed: int) -> None:
     world, rng = make_office(seed, 3), np.random.default_rng(seed)
     life = Life(world, Journal(tmp_path / "r0.sqlite", ROBOT))
