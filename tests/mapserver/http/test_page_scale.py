@@ -27,8 +27,9 @@ function step(now) {{
 window.frames.done = false;
 requestAnimationFrame(step);
 """
-WHEEL = """{{ every: {every}, count: {count}, act: k => mapweave.painter.canvas.dispatchEvent(new WheelEvent("wheel",
-  {{ deltaY: {delta}, clientX: 500, clientY: 400, cancelable: true, bubbles: true }})) }}"""
+WHEEL = """{{ every: {every}, count: {count}, act: k => mapweave.painter.canvas.dispatchEvent(
+  new WheelEvent("wheel", {{ deltaY: {delta}, clientX: 500, clientY: 400,
+  cancelable: true, bubbles: true }})) }}"""
 GESTURES = {
     "pan": "{ every: 16, count: 120, act: k => { mapweave.viewport.pan(7, k % 50 < 25 ? 4 : -4);"
     " mapweave.painter.ask(); } }",
@@ -66,7 +67,8 @@ def test_20_000_nodes_are_smooth(tmp_path: Path) -> None:
             eventually(lambda: page.run("return window.frames.done"))
             frames = sorted(page.run("return [...window.frames]")[1:])
             late = frames[int(0.95 * len(frames))]
-            print(f"{name}: {frames[len(frames) // 2]:.1f} ms a frame, p95 {late:.1f}, worst {frames[-1]:.1f}")
+            middle, worst = frames[len(frames) // 2], frames[-1]
+            print(f"{name}: {middle:.1f} ms a frame, p95 {late:.1f}, worst {worst:.1f}")
             if late > SMOOTH:
                 slow[name] = late
             # At rest it is sharp.
