@@ -190,6 +190,15 @@ class MapMaking:
         changes, self._changes = tuple(self._changes), []
         return changes
 
+    def finish(self) -> tuple[ChangeBody, ...]:
+        """Make what is left of the last episode at once: no further tick is sure to come.
+
+        Returns:
+            What was changed in the map since the last call of `take_changes`.
+        """
+        self.mapper.finish_pending()
+        return self.take_changes()
+
     @property
     def explored(self) -> bool:
         """Whether the robot stands because there is nothing left to explore."""

@@ -276,6 +276,14 @@ class Pipeline:
         images = self.mapper.take_images()
         return Step(safe, changes, tuple(questions), self._status(warning), self._fault, images)
 
+    def finish(self) -> tuple[tuple[ChangeBody, ...], tuple[tuple[NodeId, RawImage], ...]]:
+        """Make at once what is left of the last mapping episode, before the process ends.
+
+        Returns:
+            Changes to the map since the last step, in order, and the images of the nodes that were made.
+        """
+        return self._map_making.finish(), self.mapper.take_images()
+
     def _make_room(self) -> None:
         """Drive out of the way of another robot, if this one has done its mission, and may."""
         aside, self._others.aside = self._others.aside, None

@@ -197,6 +197,13 @@ class Mapper:
         if node is not None:
             self._keyframes.retire(node)
 
+    def finish_pending(self) -> None:
+        """Make what is left of the last episode: nodes of its further views, and loop closures.
+
+        The ticks that follow do it else, piece by piece.
+        """
+        self._keyframes.finish_pending()
+
     # One tick, and what ends an episode
 
     def step(self, observation: Observation) -> None:

@@ -142,7 +142,7 @@ class Agent:
         self._teleoperation = Teleoperation(refusal=refusal)
         self._options = options
         self._on_step = on_step
-        self._causes = 0
+        self._causes = self._stamp_ns = 0
         self._print, self._server_watch = print_line, ServerWatch(options.server)
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
@@ -261,6 +261,7 @@ class Agent:
         self._print(f"{self._options.name}: {line}")
 
     def _stepped(self, observation: Observation, step: Step) -> None:
+        self._stamp_ns = observation.stamp_ns
         if self._views is not None:
             self._views.keep(step.images, step.changes)
         if self._trajectory is not None:
@@ -285,6 +286,7 @@ class Agent:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
         mission, old, calibration = self.pipeline.mission, self.map_id, self.pipeline.calibration
         cause = "was lifted" if self.pipeline.put_elsewhere else f"cannot find itself on map {old}"
+        self.finish()
         self._leave()
         try:
             self.write_map()
@@ -319,6 +321,14 @@ class Agent:
             lambda: self._fleet.relocalized, lambda: self.pipeline.refuted,
             lambda: self._server_watch.arrivals,
         )  # fmt: skip
+
+    def finish(self) -> None:
+        """Map to its end what was begun, and hand it over: no further tick follows. May be called twice."""
+        changes, images = self.pipeline.finish()
+        if changes:
+            self.replicator.submit(changes, self._stamp_ns)
+        if self._views is not None:
+            self._views.keep(images, changes)
 
     def write_map(self) -> Path:
         """Write the map that it makes to its map file; returns where."""

@@ -83,6 +83,7 @@ def run_agent(
         finally:
             robot.close()
             try:
+                agent.finish()
                 path = agent.write_map()
                 nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
                 say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")

@@ -15,11 +15,13 @@ import pytest
 
 from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.pipeline import Step
 from mapweave.agent.replication import salvage
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.hybridmap.agent_status import AgentStatus
+from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.mission_order import MissionKind
@@ -382,6 +384,57 @@ def test_a_robot_that_is_lifted_begins_a_new_map_and_keeps_the_old_one(tmp_path)
     bus.close()
     assert "r0: was lifted; it begins map r0.2, and the old one stays" in said
     assert len(HybridMap(read_map_file(tmp_path / "r0.1.mapweave").changes).nodes) == mapped
+
+
+class Carried:
+    """A robot that is carried past two photographs; it ends in the tick in which a third node was made."""
+
+    def __init__(self, last: int = len(WAY) - 1) -> None:
+        self.tick = 0
+        self._walls, self._last, self._nodes = PhotoWalls(), last, 0
+
+    def describe(self) -> RobotDescription:
+        return DESCRIPTION
+
+    def sense(self) -> Observation | None:
+        if self._nodes >= 3 or self.tick >= self._last:
+            return None
+        self.tick += 1
+        before, now = (Pose2(float(x)) for x in WAY[self.tick - 1 : self.tick + 1])
+        return self._walls.observe(before, now, self.tick)
+
+    def act(self, command: Command) -> Command:
+        return command
+
+    def close(self) -> None:
+        pass
+
+    def stepped(self, observation: Observation, step: Step) -> None:
+        self._nodes += sum(isinstance(change, NodePut) for change in step.changes)
+
+
+def test_a_process_that_ends_after_an_episode_keeps_what_follows_from_it(tmp_path: Path) -> None:
+    """Loop closures are made in the ticks after a node. Before, there was none, and they were lost."""
+    robot, bus = Carried(), MemoryBus(MemoryHub())
+    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.0)
+    agent = Agent(robot.describe, bus, KEYS, AgentSettings(), options, robot.stepped)
+    agent.run(robot, threading.Event())
+    before = len(agent.pipeline.map.edges)
+    agent.finish()
+    agent.finish()
+    after = tuple(agent.pipeline.map.contents())
+    agent.close()
+    edges = HybridMap(after).edges.keys()
+    assert len(HybridMap(after).nodes) == 3
+    assert len(edges) > before
+    journal = Journal(tmp_path / "r0.sqlite", "r0")
+    assert HybridMap(journal.replay(MapId("r0", 1))).edges.keys() == edges
+    journal.close()
+    options = replace(options, data=tmp_path / "process")
+    run_agent(Carried(robot.tick), bus, KEYS, AgentSettings(), options, threading.Event())
+    bus.close()
+    file = read_map_file(tmp_path / "process" / "r0.1.mapweave")
+    assert HybridMap(file.changes).edges.keys() == edges
 
 
 class Ended:

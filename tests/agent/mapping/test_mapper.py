@@ -10,7 +10,7 @@ import pytest
 
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Odometry
-from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.lens import Lens
@@ -61,6 +61,25 @@ def test_an_edge_is_the_drive_between_two_views(walls, description):
     in_a = a.points_in_robot[edge.shared[:, 0]]
     in_b = Pose2(0.5).apply(b.points_in_robot[edge.shared[:, 1]])
     assert np.median(np.linalg.norm(in_a - in_b, axis=1)) < 0.08
+
+
+def test_what_is_left_of_an_episode_is_made_at_the_end_of_the_process(walls, description):
+    """A node of a further view follows in the next tick; before, a process that ended then lost it."""
+    mapper = Mapper(MapId("r0", 1), description)
+    there = np.arange(0.0, 0.6, 0.025)
+    last = drive(mapper, walls, there)
+    mapper.leaf(last)
+    last = drive(mapper, walls, there[::-1], start=50)
+    assert mapper.finish(last)
+    (node,) = mapper.map.nodes.values()
+    assert mapper.take_changes() == (NodePut(node),)
+    mapper.finish_pending()
+    _, beside = mapper.map.nodes.values()
+    (edge,) = mapper.map.edges.values()
+    assert mapper.take_changes() == (NodePut(beside), EdgePut(edge))
+    assert edge.a_from_b.mean.x == pytest.approx(0.575, abs=0.02)
+    mapper.finish_pending()
+    assert mapper.take_changes() == ()
 
 
 @pytest.mark.parametrize("forward", [0.3, -0.2])
