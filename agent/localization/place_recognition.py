@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -15,6 +18,8 @@ TRIES = 5
 """Nodes that are verified, by descending votes."""
 VOTES = 6
 """A node with fewer votes is not tried."""
+NODES_AT_ONCE = 32
+"""Nodes whose descriptors are compared at once: of all nodes of a large map they took hundreds of MB."""
 LEAST_INLIERS = 24
 """Landmarks that must agree: one node speaks alone here, and the map is small."""
 
@@ -27,7 +32,8 @@ def recognise_places(
     """Find the nodes of a robot's own map that a view shows (paper, section 5: the kidnapped robot).
 
     Every feature votes for the node that holds its nearest descriptor; the nodes with most votes are
-    verified by geometry. One robot's map is small, so all descriptors are compared.
+    verified by geometry. One robot's map is small, so all descriptors are compared, some nodes
+    at a time.
 
     Args:
         hybrid_map: the robot's own map.
@@ -40,10 +46,7 @@ def recognise_places(
     nodes = [n for n in hybrid_map.nodes.values() if len(n.landmarks)]
     if not nodes or not len(view):
         return []
-    descriptors = np.concatenate([decode(n.landmarks.codes) for n in nodes])
-    owner = np.repeat(np.arange(len(nodes)), [len(n.landmarks) for n in nodes])
-    nearest = (decode(view.codes) @ descriptors.T - 0.5 * (descriptors**2).sum(axis=1)).argmax(axis=1)
-    votes = np.bincount(owner[nearest], minlength=len(nodes))
+    votes = np.bincount(_nearest(nodes, decode(view.codes)), minlength=len(nodes))
     recalled: list[tuple[Node, Recognition]] = []
     for index in np.argsort(-votes, kind="stable")[:TRIES]:
         if votes[index] < VOTES:
@@ -52,6 +55,31 @@ def recognise_places(
         if recognition is not None and recognition.inliers >= LEAST_INLIERS:
             recalled.append((nodes[index], recognition))
     return sorted(recalled, key=lambda pair: -pair[1].inliers)
+
+
+def _nearest(nodes: Sequence[Node], features: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Which node has the nearest descriptor of each feature.
+
+    Args:
+        nodes: with landmarks.
+        features: (N, 32) descriptors.
+
+    Returns:
+        (N,) indices of nodes.
+    """
+    best = np.full(len(features), -np.inf, np.float32)
+    nearest = np.zeros(len(features), np.int64)
+    for begin in range(0, len(nodes), NODES_AT_ONCE):
+        some = nodes[begin : begin + NODES_AT_ONCE]
+        descriptors = decode(np.concatenate([node.landmarks.codes for node in some]))
+        owner = np.repeat(np.arange(begin, begin + len(some)), [len(node.landmarks) for node in some])
+        # The nearest has the greatest product less half its square.
+        scores = features @ descriptors.T - 0.5 * (descriptors**2).sum(axis=1)
+        at = scores.argmax(axis=1)
+        score = scores[np.arange(len(features)), at]
+        nearer = score > best
+        best[nearer], nearest[nearer] = score[nearer], owner[at[nearer]]
+    return nearest
 
 
 def aliased_places(
