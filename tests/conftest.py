@@ -14,6 +14,7 @@ import cv2
 import pytest
 from hypothesis import settings
 
+from mapweave.wire.memory import MemoryHub
 from tests.simulator import INSTALLED, SkipWithoutSimulator
 
 # Assertions of these modules are rewritten, as in tests.
@@ -35,3 +36,9 @@ pytest_plugins = ["tests.postgres"]
 
 if not INSTALLED:
     sys.meta_path.insert(0, SkipWithoutSimulator())
+
+
+@pytest.fixture
+def hub() -> MemoryHub:
+    """A network in memory, of buses that a test opens."""
+    return MemoryHub()

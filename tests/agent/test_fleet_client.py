@@ -50,11 +50,6 @@ VIEW = View(
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    return MemoryHub()
-
-
-@pytest.fixture
 def other(hub: MemoryHub) -> Iterator[MemoryBus]:
     """The rest of the fleet."""
     bus = MemoryBus(hub)

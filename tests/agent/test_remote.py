@@ -223,11 +223,6 @@ def silence(request: Request) -> None:
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    return MemoryHub()
-
-
-@pytest.fixture
 def body(hub: MemoryHub) -> Iterator[Body]:
     made = Body(hub)
     yield made

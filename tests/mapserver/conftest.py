@@ -3,41 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import View
 from mapweave.wire.memory import MemoryHub
 from synthetic.maps import changes_of, write_store
-from synthetic.world import World, room, take_map, take_view
+from synthetic.world import room, take_map
+from tests.mapserver.house import ROBOT, House, MappedRoom
 from tests.mapserver.played import HandAgent, Server
-
-ROBOT = MapId("r0", 1)
-
-
-@dataclass(frozen=True, eq=False)
-class MappedRoom:
-    """A room that one robot has mapped, as its map server's store holds it.
-
-    Attributes:
-        path: of the store.
-        world: the room.
-        truth: where each node was made.
-    """
-
-    path: Path
-    world: World
-    truth: dict[NodeId, Pose2]
-
-    def view(self, node: NodeId, seed: int = 5) -> View:
-        """A view a little away from a node."""
-        pose = self.truth[node] @ Pose2(0.1, 0.05, 0.05)
-        return take_view(self.world, pose, np.random.default_rng(seed))[0]
 
 
 @pytest.fixture(scope="session")
@@ -57,9 +33,11 @@ def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Mapped
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    """The network."""
-    return MemoryHub()
+def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
+    """A map server in it, and a person."""
+    house = House(mapped_room())
+    yield house
+    house.close()
 
 
 @pytest.fixture

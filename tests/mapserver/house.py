@@ -3,19 +3,46 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
 
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import View
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from tests.mapserver.conftest import ROBOT, MappedRoom
+from synthetic.world import World, take_view
 from tests.waiting import eventually
 
 KEYS = Keys("fleet")
+ROBOT = MapId("r0", 1)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedRoom:
+    """A room that one robot has mapped, as its map server's store holds it.
+
+    Attributes:
+        path: of the store.
+        world: the room.
+        truth: where each node was made.
+    """
+
+    path: Path
+    world: World
+    truth: dict[NodeId, Pose2]
+
+    def view(self, node: NodeId, seed: int = 5) -> View:
+        """A view a little away from a node."""
+        pose = self.truth[node] @ Pose2(0.1, 0.05, 0.05)
+        return take_view(self.world, pose, np.random.default_rng(seed))[0]
 
 
 class House:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import json
 import threading
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import pytest
@@ -23,19 +22,11 @@ from mapweave.mapserver.http.same_site import is_loopback
 from mapweave.mapserver.http.web import Web
 from mapweave.storage.map_file import unpack_map_file
 from mapweave.wire.messages import encode
-from tests.mapserver.conftest import MappedRoom
 from tests.mapserver.house import KEYS, House
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)
 LIFT = PortalStop("east lift", PortalMeans.LIFT, THERE, NodeId("r1", 1, 5), "2")
-
-
-@pytest.fixture
-def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
-    house = House(mapped_room())
-    yield house
-    house.close()
 
 
 def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:

@@ -54,11 +54,6 @@ class HandRobot:
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    return MemoryHub()
-
-
-@pytest.fixture
 def views(hub: MemoryHub) -> Iterator[NodeViews]:
     views = NodeViews(MemoryBus(hub), KEYS, two_maps)
     yield views

@@ -5,7 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,13 +44,6 @@ from tests.mapserver.house import KEYS, House
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)
-
-
-@pytest.fixture
-def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
-    house = House(mapped_room())
-    yield house
-    house.close()
 
 
 def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house: House) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.storage.map_file import MapFile, read_map_file, unpack_map_file, write_map_file
 from mapweave.storage.plan_image import plan_file
 from mapweave.wire.typed import packed
-from tests.mapserver.conftest import MappedRoom
 from tests.mapserver.house import House
 from tests.mapserver.http.client import ask
 from tests.mapserver.stub_services import two_maps
@@ -55,13 +53,6 @@ def pose_of(fleet: Fleet, node: NodeId) -> Pose2:
 
 def map_of(fleet: Fleet) -> MapFile:
     return unpack_map_file(fleet.map_bytes())
-
-
-@pytest.fixture
-def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
-    house = House(mapped_room())
-    yield house
-    house.close()
 
 
 def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -14,11 +13,6 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 
 KEYS = Keys("test")
-
-
-@pytest.fixture
-def hub() -> Iterator[MemoryHub]:
-    yield MemoryHub()
 
 
 def test_the_second_is_refused_and_the_first_stays(hub: MemoryHub) -> None:

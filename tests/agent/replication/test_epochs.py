@@ -49,11 +49,6 @@ def test_a_broken_answer_is_refused(payload: bytes) -> None:
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    return MemoryHub()
-
-
-@pytest.fixture
 def bus(hub: MemoryHub) -> Iterator[MemoryBus]:
     made = MemoryBus(hub)
     yield made

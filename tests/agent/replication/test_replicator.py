@@ -70,11 +70,6 @@ class Agent:
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    return MemoryHub()
-
-
-@pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "r0.sqlite"
 

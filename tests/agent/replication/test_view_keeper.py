@@ -40,11 +40,6 @@ def node(number: int, epoch: int = 1) -> NodeId:
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    return MemoryHub()
-
-
-@pytest.fixture
 def folder(tmp_path: Path) -> Path:
     return tmp_path / "r0.views"
 
