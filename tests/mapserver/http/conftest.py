@@ -28,10 +28,22 @@ def served(services: StubServices) -> Iterator[Web]:
         yield served
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     with Browser(tmp_path_factory.mktemp("profile")) as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: Browser) -> Iterator[Browser]:
+    """One for all modules, as new for each: it takes a second of processor time to start."""
+    yield chromium
+    chromium.open("about:blank")
+    chromium.devtools("Emulation.clearDeviceMetricsOverride")
+    chromium.devtools("Emulation.setTouchEmulationEnabled", enabled=False)
+    chromium.devtools("Emulation.setEmulatedMedia", features=[])
+    chromium.devtools("Network.clearBrowserCookies")
+    chromium.errors()
 
 
 @pytest.fixture

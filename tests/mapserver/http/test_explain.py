@@ -105,76 +105,71 @@ def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices) -
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: pytest.TempPathFactory) -> None:
-    with Browser(tmp_path_factory.mktemp("profile")) as page:
-        page.open(f"http://127.0.0.1:{served.port}/why")
-        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(RESULT))
-        a, b = (NodeId.parse(word) for word in page.run(LINKS)[0].split(" - "))
-        page.run("document.querySelector('#result a').click()")
-        eventually(lambda: f"{a} and {b}: linked: " in page.run(RESULT))
-        explanation = explain_nodes(two_maps(), a, b)
-        assert page.run(count(".agree")) == len(explanation.shared)
-        assert page.run(count(".alike")) == len(explanation.matches) - len(explanation.shared)
-        assert page.run(count("circle")) == len(explanation.a.landmarks) + len(explanation.b.landmarks)
-        assert f"{explanation.a_from_b.mean.x:.3f} m ahead" in page.run(RESULT)
-        # The address shows the same page at once, and the back button works.
-        address = page.run("return location.href")
-        assert address.endswith(f"/why?a={a}&b={b}")
-        page.run("document.getElementById('all').click()")
-        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(RESULT))
-        page.open(address)
-        eventually(lambda: f"{a} and {b}: linked: " in page.run(RESULT))
-        page.open(f"http://127.0.0.1:{served.port}/why?a=r1.1&b=%20r0.1%20")
-        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(RESULT))
-        assert page.run("return ['a', 'b'].map(name => document.getElementById(name).value)") == [
-            "r1.1",
-            "r0.1",
-        ]
-        page.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=%3Cb%3Ex")
-        eventually(lambda: "'<b>x' is no place of this map: give a node" in page.run(RESULT))
-        assert page.run("return document.querySelector('#result b')") is None
-        assert page.run("return document.querySelectorAll('b').length") == 0
+def test_the_page_leads_from_maps_to_landmarks(served: Web, browser: Browser) -> None:
+    browser.open(f"http://127.0.0.1:{served.port}/why")
+    eventually(lambda: "r0.1 and r1.1 are one map: " in browser.run(RESULT))
+    a, b = (NodeId.parse(word) for word in browser.run(LINKS)[0].split(" - "))
+    browser.run("document.querySelector('#result a').click()")
+    eventually(lambda: f"{a} and {b}: linked: " in browser.run(RESULT))
+    explanation = explain_nodes(two_maps(), a, b)
+    assert browser.run(count(".agree")) == len(explanation.shared)
+    assert browser.run(count(".alike")) == len(explanation.matches) - len(explanation.shared)
+    assert browser.run(count("circle")) == len(explanation.a.landmarks) + len(explanation.b.landmarks)
+    assert f"{explanation.a_from_b.mean.x:.3f} m ahead" in browser.run(RESULT)
+    # The address shows the same page at once, and the back button works.
+    address = browser.run("return location.href")
+    assert address.endswith(f"/why?a={a}&b={b}")
+    browser.run("document.getElementById('all').click()")
+    eventually(lambda: "r0.1 and r1.1 are one map: " in browser.run(RESULT))
+    browser.open(address)
+    eventually(lambda: f"{a} and {b}: linked: " in browser.run(RESULT))
+    browser.open(f"http://127.0.0.1:{served.port}/why?a=r1.1&b=%20r0.1%20")
+    eventually(lambda: "r0.1 and r1.1 are one map: " in browser.run(RESULT))
+    assert browser.run("return ['a', 'b'].map(name => document.getElementById(name).value)") == [
+        "r1.1",
+        "r0.1",
+    ]
+    browser.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=%3Cb%3Ex")
+    eventually(lambda: "'<b>x' is no place of this map: give a node" in browser.run(RESULT))
+    assert browser.run("return document.querySelector('#result b')") is None
+    assert browser.run("return document.querySelectorAll('b').length") == 0
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_the_page_shows_the_route_of_its_form_and_of_its_address(
-    served: Web, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_the_page_shows_the_route_of_its_form_and_of_its_address(served: Web, browser: Browser) -> None:
     start, goal = NodeId("r0", 1, 1), NodeId("r1", 1, 7)
     explanation = explain_route(Router(two_maps()), start, goal)
     assert explanation.found and ask(served, f"?a={start}&b={goal}", "route") == (
         200,
         json_values(explanation),
     )
-    with Browser(tmp_path_factory.mktemp("profile")) as page:
-        page.open(f"http://127.0.0.1:{served.port}/why")
-        page.type("#a", str(start))
-        page.type("#b", str(goal))
-        page.run("document.querySelector('[name=route]').click()")
-        eventually(lambda: f"{start} to {goal}: the route is: {explanation.reason}" in page.run(RESULT))
-        assert page.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in explanation.hops]
-        address = page.run("return location.href")
-        assert address.endswith(f"/why?a={start}&b={goal}&route=1")
-        page.open(f"http://127.0.0.1:{served.port}/why")
-        page.open(address)
-        eventually(lambda: f"{start} to {goal}: the route is" in page.run(RESULT))
-        page.run("document.querySelector('#result a').click()")
-        eventually(lambda: f"{explanation.hops[0].a} and {explanation.hops[0].b}: " in page.run(RESULT))
+    browser.open(f"http://127.0.0.1:{served.port}/why")
+    browser.type("#a", str(start))
+    browser.type("#b", str(goal))
+    browser.run("document.querySelector('[name=route]').click()")
+    eventually(lambda: f"{start} to {goal}: the route is: {explanation.reason}" in browser.run(RESULT))
+    assert browser.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in explanation.hops]
+    address = browser.run("return location.href")
+    assert address.endswith(f"/why?a={start}&b={goal}&route=1")
+    browser.open(f"http://127.0.0.1:{served.port}/why")
+    browser.open(address)
+    eventually(lambda: f"{start} to {goal}: the route is" in browser.run(RESULT))
+    browser.run("document.querySelector('#result a').click()")
+    eventually(lambda: f"{explanation.hops[0].a} and {explanation.hops[0].b}: " in browser.run(RESULT))
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_the_history_is_listed_newest_first_and_goes_on(
-    served: Web, services: StubServices, tmp_path_factory: pytest.TempPathFactory
+    served: Web, services: StubServices, browser: Browser
 ) -> None:
     shown = "return [...document.querySelectorAll('#history li')].map(one => one.textContent)"
     services.events = (MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now"),)
-    with Browser(tmp_path_factory.mktemp("profile")) as page:
-        page.open(f"http://127.0.0.1:{served.port}/")
-        joined = "2001-09-09 01:46:40 UTC joined: r0.1 and r1.1 are one map now"
-        eventually(lambda: page.run(shown) == [joined])
-        services.events += (MapEvent(10**18 + 7 * 10**9, MapEventKind.PARTED, "<b>x"),)
-        eventually(lambda: page.run(shown) == ["2001-09-09 01:46:47 UTC parted: <b>x", joined])
+    browser.open(f"http://127.0.0.1:{served.port}/")
+    joined = "2001-09-09 01:46:40 UTC joined: r0.1 and r1.1 are one map now"
+    eventually(lambda: browser.run(shown) == [joined])
+    services.events += (MapEvent(10**18 + 7 * 10**9, MapEventKind.PARTED, "<b>x"),)
+    eventually(lambda: browser.run(shown) == ["2001-09-09 01:46:47 UTC parted: <b>x", joined])
 
 
 def test_the_history_is_listed_with_times(served: Web, services: StubServices) -> None:

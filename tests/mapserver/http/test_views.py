@@ -87,11 +87,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
 
 
 @pytest.fixture(scope="module")
-def page(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile")) as page:
-        page.open(f"http://127.0.0.1:{fleet.web.port}/")
-        eventually(lambda: page.run("return window.mapweave?.model?.order.length"))
-        yield page
+def page(fleet: Fleet, browser: Browser) -> Browser:
+    browser.open(f"http://127.0.0.1:{fleet.web.port}/")
+    eventually(lambda: browser.run("return window.mapweave?.model?.order.length"))
+    return browser
 
 
 @pytest.fixture
