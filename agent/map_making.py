@@ -201,8 +201,8 @@ class MapMaking:
 
     @property
     def explored(self) -> bool:
-        """Whether the robot stands because there is nothing left to explore."""
-        return self._explorer is not None and self._explorer.finished and self.located
+        """Whether the robot stands because there is nothing left to explore, at least for now."""
+        return self._explorer is not None and self._explorer.idle and self.located
 
     def account(self, exploring: bool) -> tuple[str, str, bool]:
         """For people.

@@ -94,7 +94,7 @@ class MappingMonitor:
         self._command = command
         if now - self._last_look_ns >= 1e9 and now - self._last_node_ns >= QUIET * 1e9:
             self._last_look_ns = now
-            self._fault = self._find_fault(observation.image)
+            self._fault = self._find_fault(observation.image, status.mission)
         if now - self._last_node_ns < PATIENCE * 1e9 or status.mission not in (*MAPPING, "idle"):
             return ""
         reason = self.reason(status)
@@ -129,7 +129,7 @@ class MappingMonitor:
             )
         )  # fmt: skip
 
-    def _find_fault(self, image: NDArray[np.uint8] | None) -> str:
+    def _find_fault(self, image: NDArray[np.uint8] | None, mission: str) -> str:
         if not any(moment.small is not None for moment in self._moments):
             return f"no image for {len(self._moments) * self._tick:.0f} s: is the camera connected?"
         quality = "" if image is None else ImageQuality.of(image).fault
@@ -146,7 +146,8 @@ class MappingMonitor:
             return "the image moves and the encoders do not count: check their cable and [robot.options]"
         if wheels == "standing" and image_moves is False and commanded == "moving" and self._driven:
             return "the wheels do not obey: check motor power, emergency stop, and whether the robot is stuck"
-        if wheels == "standing" and image_moves is False:
+        # A robot that explores says itself why it stands.
+        if wheels == "standing" and image_moves is False and mission != "explore":
             return "the robot stands still: depths are measured in motion"
         return ""
 

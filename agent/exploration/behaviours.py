@@ -29,6 +29,12 @@ MOST_TURN = 1.0
 """The turn to the next view ends at this angle, rad."""
 TRAVEL_STEP = 0.8
 """Longest way between two nodes on the way to the next place, m."""
+LEAST_MOTION = 0.1
+"""A turn that ends before this angle, rad, has not moved the robot."""
+STUCK_TURNS = 3
+"""After so many of them in a row its wheels are stuck."""
+STUCK_PAUSE = (60.0, 600.0)
+"""A stuck robot tries another turn after so long, s; later after twice as long each, up to the second."""
 USUAL_TICK = 0.1
 """s; durations are bounded by numbers of these."""
 PATIENCE = 4.0
@@ -55,6 +61,7 @@ class ExplorationBehaviours:
         self._settings = settings
         self._drive = ImageDrive(description, settings.drive_speed)
         self._observation: Observation | None = None
+        self._without_motion, self._pause = 0, STUCK_PAUSE[0]
 
     def see(self, observation: Observation) -> None:
         """Begin a tick. The mapper has seen the observation already."""
@@ -123,7 +130,28 @@ class ExplorationBehaviours:
         yield Command()
         turned = abs(wrap_angle(self._mapper.map_from_robot.mean.heading - start))
         yield EpisodeRequest.FINISH
+        if turned >= LEAST_MOTION:
+            self._without_motion, self._pause = 0, STUCK_PAUSE[0]
+        else:
+            self._without_motion += 1
+            if self._without_motion >= STUCK_TURNS:
+                yield from self._stand_stuck()
         return turned
+
+    def _stand_stuck(self) -> Iterator[Move]:
+        """Stand for a while, or until a person has moved the robot. Motors that go on to push get hot."""
+        self.phase = Phase.STUCK
+        self.detail = (
+            f"{self._without_motion} turns in a row had no effect: check motor power, emergency stop and "
+            f"what blocks the wheels; it tries again within {self._pause:.0f} s, or once it is moved"
+        )
+        start = self._mapper.map_from_robot.mean
+        for _ in self._ticks(self._pause / USUAL_TICK):
+            yield Command()
+            moved = start.inverse() @ self._mapper.map_from_robot.mean
+            if math.hypot(moved.x, moved.y) > LEAST_MOTION or abs(moved.heading) > LEAST_MOTION:
+                break
+        self._pause = min(2.0 * self._pause, STUCK_PAUSE[1])
 
     def travel(self, path: list[Array]) -> Generator[Move, None, bool]:
         """Follow the corners of a way: turn toward each, then drive straight to it, adding nodes.

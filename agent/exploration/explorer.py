@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import numpy as np
 
+from mapweave.agent.exploration.avoided_places import AvoidedPlaces
 from mapweave.agent.exploration.behaviours import ExplorationBehaviours
 from mapweave.agent.exploration.fleet_coverage import FleetCoverage
 from mapweave.agent.exploration.phase import Phase
@@ -63,13 +64,15 @@ class Explorer:
         self._fleet_coverage = FleetCoverage(map_id, REACH + SPACING)
         self._rng = np.random.default_rng(seed)
         self._side = self._either_side()
-        self._avoid: list[Array] = []
+        self._avoided = AvoidedPlaces(self.spacing)
+        self._now = 0.0
         self._questions: list[Question] = []
         self._behaviour = self._explore()
 
     def see(self, observation: Observation, answers: tuple[Answer, ...] = ()) -> None:
         """Begin a tick. The mapper and the floor have seen the observation already."""
         self._moves.see(observation)
+        self._now += self._description.tick
         self._questions = []
         for answer in answers:
             self._fleet_coverage.take(answer)
@@ -98,6 +101,11 @@ class Explorer:
         """Whether there is nothing left to explore."""
         return self.phase is Phase.DONE
 
+    @property
+    def idle(self) -> bool:
+        """Whether it stands because there is nothing to explore now."""
+        return self.phase in (Phase.DONE, Phase.WAITING)
+
     def restart(self) -> None:
         """Begin again from the present pose, after the robot was lost."""
         self._moves.phase, self._moves.detail = Phase.LOOKING, ""
@@ -112,13 +120,25 @@ class Explorer:
             else:
                 yield from self._look_around()
             self.places.append(self._moves.position)
-            path = self._way_on()
+            path = yield from self._await_way_on()
             if not path:
                 break
             self._ask()
             if not (yield from self._moves.travel(path)):
-                self._avoid.append(path[-1])
+                self._avoided.add(path[-1], self._now)
         yield from self._stand()
+
+    def _await_way_on(self) -> Generator[Move, None, list[Array]]:
+        """Corners of the way to the next place; waits if there is none but to a place to be tried again."""
+        while not (path := self._way_on()):
+            until = self._avoided.next_try(self._now)
+            if until is None:
+                break
+            self._moves.phase = Phase.WAITING
+            while self._now < until:
+                self._moves.detail = f"in {until - self._now:.0f} s"
+                yield Command()
+        return path
 
     def _stand(self) -> Iterator[Move]:
         """There is no place left to go."""
@@ -152,7 +172,7 @@ class Explorer:
     def _way_on(self) -> list[Array]:
         """Corners of the way to the next place; empty if there is none."""
         s = self._settings
-        been = np.array(self.places + self._avoid)
+        been = np.array([*self.places, *self._avoided.places(self._now)])
         fleet_places = self._fleet_coverage.places(self._views, COVERED_REACH, COVERED_SHARE)
         return next_viewpoint(self._floor, self._moves.position, been, fleet_places, s, self.spacing)
 

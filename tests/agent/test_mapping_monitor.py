@@ -105,6 +105,14 @@ def test_what_the_pipeline_says_itself_is_reported(drive, description) -> None:
     ]
 
 
+def test_a_robot_that_explores_says_itself_why_it_stands(drive, description) -> None:
+    def stands(seen: Observation) -> Observation:
+        return replace(dead_encoders(seen), image=drive[0].image)
+
+    (line,) = lines(drive, description, stands, PATIENCE + 5.0, Command(), "explore")
+    assert line.endswith(": mapping: 9 tracks")
+
+
 def test_an_idle_robot_says_that_it_is_idle(drive, description) -> None:
     (line,) = lines(drive, description, working, PATIENCE + 5.0, Command(), "idle")
     assert "the mission is idle" in line
