@@ -43,12 +43,15 @@ class QuotaSettings:
         questions: per second, over 20 s. A robot asks one after the other.
         maps: that are not retired. A robot begins one when it cannot find itself in its last.
         nodes: of its maps together. Robots of the demo make one in 4 s.
+        megabytes: of its changes that are kept. Superseded ones count until they are deleted, when they are
+            as much as the rest. 20 000 nodes like those of the demo, with their edges, are 60 MB.
     """
 
     changes: Annotated[float, Meta(gt=0.0)] = 50.0
     questions: Annotated[float, Meta(gt=0.0)] = 10.0
     maps: Annotated[int, Meta(ge=1)] = 64
     nodes: Annotated[int, Meta(ge=1)] = 20_000
+    megabytes: Annotated[float, Meta(gt=0.0)] = 512.0
 
     @property
     def landmarks(self) -> int:

@@ -78,7 +78,7 @@ class Follower:
                     self._logs.add(agent_log)
                 if agent_log.log_id != log_id or watermark <= agent_log.watermark:
                     continue
-                self._intakes.of(map_id.agent).recount()
+                self._intakes.of(map_id.agent).recount(map_id)
                 for change in up_to(watermark, self._store.replay(map_id, agent_log.watermark)):
                     self._pass_on([change])
                     agent_log.settled(Applied((), (), change.sequence))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.entry import Applied, Entry
-from mapweave.mapserver.log.intake import Intakes
+from mapweave.mapserver.log.intake import Full, Intakes
 from mapweave.mapserver.log.store import Run, Store
 
 log = logging.getLogger(__name__)
@@ -27,13 +27,13 @@ class NextRun:
         log: whose.
         entries: in order.
         covered: the agent has nothing else up to here; None: nothing is missing between the entries.
-        full: why the robot's quota has room for no more; empty if it has.
+        full: why the robot's quota has room for no more; None if it has.
     """
 
     log: AgentLog
     entries: Sequence[Entry]
     covered: int | None = None
-    full: str = ""
+    full: Full | None = None
 
 
 class GroupCommit:
@@ -54,8 +54,8 @@ class GroupCommit:
         Raises:
             InvalidFile: the store cannot be read.
         """
-        fits, full = self._intakes.of(run.log.map.agent).fitting(run.entries)
-        if not full:
+        fits, full = self._intakes.of(run.log.map.agent).fitting(run.log.map, run.entries)
+        if full is None:
             return run
         covered = None if run.covered is None else run.entries[fits].sequence - 1
         return replace(run, entries=run.entries[:fits], covered=covered, full=full)

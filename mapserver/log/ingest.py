@@ -31,7 +31,7 @@ from mapweave.mapserver.log.group_commit import GroupCommit, NextRun
 from mapweave.mapserver.log.inbox import Inbox
 from mapweave.mapserver.log.ingest_counters import IngestCounters
 from mapweave.mapserver.log.ingest_settings import IngestSettings
-from mapweave.mapserver.log.intake import Intakes
+from mapweave.mapserver.log.intake import Full, Intakes
 from mapweave.mapserver.log.known_logs import KnownLogs, Lag
 from mapweave.mapserver.log.pulled import Piece, Pieces, Pulled
 from mapweave.mapserver.log.puller import Puller
@@ -306,7 +306,7 @@ class Ingest:
         except InvalidFile as error:
             self._commit_failed(agent_log, error)
             return None
-        if run.full and not run.entries:
+        if run.full is not None and not run.entries:
             self._rest(agent_log, run.full)
             return None
         return run
@@ -336,7 +336,7 @@ class Ingest:
             self._acks.acknowledge(run.log)
             for at in received:
                 self._observe_ack(time.monotonic() - at)
-            if run.full:
+            if run.full is not None:
                 self._rest(run.log, run.full)
 
     def _recover(self, agent_log: AgentLog, first: int, piece: Piece) -> None:
@@ -381,12 +381,12 @@ class Ingest:
             raise InvalidMessage(f"{agent_log.map}: {reason}")
         agent_log.announce(newest, time.monotonic())
 
-    def _rest(self, agent_log: AgentLog, reason: str) -> None:
+    def _rest(self, agent_log: AgentLog, full: Full) -> None:
         """There is no room for more of a log now: it stays on the robot's disk."""
-        self._quotas.hold_back(agent_log.map.agent, "nodes")
+        self._quotas.hold_back(agent_log.map.agent, full.what)
         agent_log.forget_ahead()
         agent_log.resting_until = time.monotonic() + QUOTA_PAUSE
-        self._acks.refuse(agent_log.map, agent_log.log_id, reason, agent_log.watermark)
+        self._acks.refuse(agent_log.map, agent_log.log_id, full.reason, agent_log.watermark)
 
     def _commit_failed(self, agent_log: AgentLog, error: MapweaveError) -> None:
         agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)

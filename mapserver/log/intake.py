@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from typing import NamedTuple
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.kept_bytes import KeptBytes
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.quotas import CHANGE_BYTES, DRIVEN, EDGES, MOST_ROBOTS, Quotas, TokenBucket
 from mapweave.wire.log_messages import MAX_ROWS
@@ -16,8 +18,21 @@ WORTHWHILE = 16
 """Changes for which it is worth asking a robot; fewer wait until so many may come."""
 RETIRE = "retire maps with `mapweave map retire`"
 ADVICE = f"{RETIRE}, or raise in [quotas]"
+QUOTA = f"which is its quota: {ADVICE}"
 MOST_UNMERGED = 1024
 """Changes of a robot that wait to be merged; further ones stay on its disk."""
+
+
+class Full(NamedTuple):
+    """Why there is no room for more of a robot.
+
+    Attributes:
+        what: is held back.
+        reason: in words, for the robot.
+    """
+
+    what: str
+    reason: str
 
 
 class Intake:
@@ -35,6 +50,8 @@ class Intake:
         self._current: AgentLog | None = None
         self._nodes = self._landmarks = 0
         self._edges_left = DRIVEN
+        self._bytes_kept = KeptBytes(agent, store)
+        self._retired_maps: frozenset[MapId] = frozenset()
         self._stale = True
 
     def beacon(self) -> bool:
@@ -79,50 +96,60 @@ class Intake:
             self._current.forget_ahead()
         self._current = agent_log
 
-    def recount(self) -> None:
-        """Another server has taken some of its changes: count again before the next."""
+    def recount(self, map_id: MapId) -> None:
+        """Another server has taken changes of a map: count again before the next."""
         self._stale = True
+        self._bytes_kept.grown(map_id)
 
-    def fitting(self, entries: Sequence[Entry]) -> tuple[int, str]:
-        """How many of these changes, in order, the robot's quotas have room for, and why not more.
+    def fitting(self, map_id: MapId, entries: Sequence[Entry]) -> tuple[int, Full | None]:
+        """How many changes of a map, in order, the robot's quotas have room for, and why not more.
 
         Those that fit count as kept from now on.
 
         Raises:
-            InvalidFile: the store cannot be read.
+            InvalidFile: the store cannot be read, or does not take that a map is compacted.
         """
         if self._stale:
             self._count()
-        count, reason = self._fitting(entries)
-        if reason:
+        self._bytes_kept.compact(map_id, entries)
+        count, full = self._fitting(map_id, entries)
+        if full is not None:
             # People may have retired a map meanwhile.
             self._count()
-            count, reason = self._fitting(entries)
-        return count, reason
+            count, full = self._fitting(map_id, entries)
+        return count, full
 
-    def _fitting(self, entries: Sequence[Entry]) -> tuple[int, str]:
+    def _fitting(self, map_id: MapId, entries: Sequence[Entry]) -> tuple[int, Full | None]:
         settings = self._quotas.settings
         added: dict[NodeId, int] = {}
         edges_here: set[NodeId] = set()
+        # A retired map counts for itself: its robot may be the reason why it is.
+        kept = self._bytes_kept.total(self._retired_maps - {map_id})
         for count, entry in enumerate(entries):
+            added_bytes = self._bytes_kept.added_by(map_id, entry)
+            if kept + added_bytes > settings.megabytes * 1e6:
+                what = f"{kept / 1e6:.3g} MB of changes"
+                return count, Full("changes", f"{self._agent} has {what} here, {QUOTA} `megabytes`")
             if isinstance(entry.change, Change) and isinstance(entry.change.body, EdgePut):
                 edges_here.add(entry.change.body.edge.id)
                 self._edges_left -= 1
                 if self._edges_left < 0 and (edges := self._count_edges(len(edges_here))):
                     self._edges_left = 0
-                    return count, f"{self._agent} has {edges} edges here, which is its quota: {RETIRE}"
-            if not (isinstance(entry.change, Change) and isinstance(entry.change.body, NodePut)):
-                continue
-            node = entry.change.body.node
-            before = added.get(node.id, self._store.landmarks(node.id))
-            nodes = self._nodes + (before is None)
-            landmarks = self._landmarks + len(node.landmarks) - (before or 0)
-            if nodes > settings.nodes or landmarks > settings.landmarks:
-                what = f"{self._nodes} nodes with {self._landmarks} landmarks"
-                return count, f"{self._agent} has {what} here, which is its quota: {ADVICE} `nodes`"
-            self._nodes, self._landmarks = nodes, landmarks
-            added[node.id] = len(node.landmarks)
-        return len(entries), ""
+                    reason = f"{self._agent} has {edges} edges here, which is its quota: {RETIRE}"
+                    return count, Full("nodes", reason)
+            if isinstance(entry.change, Change) and isinstance(entry.change.body, NodePut):
+                node = entry.change.body.node
+                before = added.get(node.id, self._store.landmarks(node.id))
+                nodes = self._nodes + (before is None)
+                landmarks = self._landmarks + len(node.landmarks) - (before or 0)
+                if nodes > settings.nodes or landmarks > settings.landmarks:
+                    what = f"{self._nodes} nodes with {self._landmarks} landmarks"
+                    return count, Full("nodes", f"{self._agent} has {what} here, {QUOTA} `nodes`")
+                self._nodes, self._landmarks = nodes, landmarks
+                added[node.id] = len(node.landmarks)
+            self._bytes_kept.add(map_id, entry)
+            kept += added_bytes
+        return len(entries), None
 
     def _count_edges(self, coming: int) -> int:
         """How many edges there are if there is no room for those that come, else 0.
@@ -136,11 +163,13 @@ class Intake:
         return edges if self._edges_left < 0 else 0
 
     def _count(self) -> None:
-        self._stale = False
         kept, retired = self._store.kept(self._agent), self._retired()
+        self._bytes_kept.read()
+        self._retired_maps = frozenset(map_id for map_id in retired if map_id.agent == self._agent)
         counts = [count for map_id, count in kept.items() if map_id not in retired]
         self._nodes = sum(nodes for nodes, _ in counts)
         self._landmarks = sum(landmarks for _, landmarks in counts)
+        self._stale = False
 
 
 class Intakes:
@@ -166,4 +195,4 @@ class Intakes:
         kept = sum(other.agent == map_id.agent and other not in retired for other in known)
         if kept < self._quotas.settings.maps:
             return ""
-        return f"{map_id.agent} has {kept} maps here, which is its quota: {ADVICE} `maps`"
+        return f"{map_id.agent} has {kept} maps here, {QUOTA} `maps`"

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import logging
-import threading
-from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
-from typing import Any
 
 from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.node import EdgeId, MapId, NodeId
-from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
+from mapweave.mapserver.log.entry import Applied, Entry, Position
 from mapweave.mapserver.log.integrity import Gap
+from mapweave.mapserver.log.sql_sizes import SqlSizes
 from mapweave.mapserver.log.store import (
     ANNOTATIONS,
     CONSTRAINTS,
     MAX_CONSTRAINTS,
+    MOST_REFUSALS,
     MOST_REFUSED_KEPT,
     Run,
     Store,
@@ -37,57 +35,15 @@ RETIREMENTS: dict[str, Callable[[NodeId], NodeRetired | EdgeRetired]] = {
 """By the kind of change that they undo."""
 PRUNED_AT_ONCE = 256
 """Elements of one map: a log is read through once for so many."""
+OLDEST_REASON = (
+    "DELETE FROM refused WHERE agent = ? AND epoch = ? AND sequence = (SELECT sequence FROM refused "
+    "WHERE agent = ? AND epoch = ? ORDER BY sequence LIMIT 1 OFFSET ?)"
+)
+"""The first refusal of a map behind those of which the bytes are kept."""
 
 
-class SqlStore(Store):
-    """Tables as in mapweave.mapserver.log.integrity. Marks of values are `?`."""
-
-    def __init__(self) -> None:
-        self._traffic_lock = threading.Lock()
-        self._counted: dict[tuple[str, int], int] = {}
-        """Up to which change of each map, by robot and epoch, `_sums` counts."""
-        self._sums: dict[str, tuple[int, int]] = {}
-        """Changes and their bytes on the wire, by kind."""
-
-    @abstractmethod
-    def _wire_bytes(self, grown: Sequence[tuple[str, int, int, int]]) -> Iterable[tuple[str, int, int]]:
-        """Changes and their bytes by kind, of stretches of logs.
-
-        Args:
-            grown: agent, epoch, the change before the first one and the last one.
-        """
-
-    @abstractmethod
-    def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
-        """The rows of a query, inside a transaction or outside.
-
-        Raises:
-            InvalidFile: they cannot be read.
-        """
-
-    @abstractmethod
-    def _transaction(self) -> AbstractContextManager[None]:
-        """All that is written inside is committed at the end, or nothing of it; one thread at a time.
-
-        Raises:
-            InvalidFile: it is not committed.
-        """
-
-    @abstractmethod
-    def _write(self, query: str, values: Sequence[object]) -> None:
-        """Inside a transaction."""
-
-    @abstractmethod
-    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
-        """The logs of these runs that are stored; only this transaction changes them until the commit."""
-
-    @abstractmethod
-    def _lock_table(self, table: str) -> None:
-        """Only this transaction changes it until the commit."""
-
-    @abstractmethod
-    def _put(self, table: str, values: Sequence[object]) -> None:
-        """Inside a transaction: put a row into a table, in the place of one with the same key."""
+class SqlStore(SqlSizes, Store):
+    """The logs, and the server's own results."""
 
     def maps(self) -> list[MapId]:
         """All maps of which something is known."""
@@ -243,30 +199,6 @@ class SqlStore(Store):
         self._count_again()
         return list(retired.values())
 
-    def landmarks(self, node: NodeId) -> int | None:
-        """How many landmarks a node has; None if there is no such node."""
-        rows = self._read("SELECT landmarks FROM node WHERE agent = ? AND epoch = ? AND number = ?", node)
-        return int(rows[0][0]) if rows else None
-
-    def kept(self, agent: str) -> dict[MapId, tuple[int, int]]:
-        """Nodes and landmarks of each map of a robot."""
-        query = (
-            "SELECT epoch, count(*), CAST(sum(landmarks) AS BIGINT) FROM node WHERE agent = ? GROUP BY epoch"
-        )
-        return {MapId(agent, epoch): (nodes, total) for epoch, nodes, total in self._read(query, (agent,))}
-
-    def edges(self, agent: str) -> dict[MapId, int]:
-        """Edges of each map of a robot; see `Store`."""
-        query = (
-            "SELECT epoch, number, kind FROM change WHERE agent = ? AND kind IN (?, ?) "
-            "ORDER BY epoch, sequence"
-        )
-        edges: dict[MapId, set[int]] = {}
-        for epoch, number, kind in self._read(query, (agent, EdgePut.__name__, EdgeRetired.__name__)):
-            there = edges.setdefault(MapId(agent, epoch), set())
-            (there.add if kind == EdgePut.__name__ else there.discard)(number)
-        return {map_id: len(there) for map_id, there in edges.items()}
-
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
         """The newest changes of a map that were refused, in order."""
         query = (
@@ -278,41 +210,6 @@ class SqlStore(Store):
     def refused(self) -> int:
         """How many changes of any map were refused."""
         return int(self._read("SELECT count(*) FROM refused")[0][0])
-
-    def traffic(self, map_id: MapId | None = None) -> Traffic:
-        """What a map has cost on the wire, or all maps together if none is named.
-
-        A server asks twice a second, so of all maps only what has come since the last time is read.
-        """
-        if map_id is None:
-            with self._traffic_lock:
-                self._count_new_changes()
-                sums = dict(self._sums)
-            rows = self._read("SELECT count(*) FROM node")
-        else:
-            whole = (*map_id, 0, self.watermark(map_id))
-            sums = {kind: (puts, size) for kind, puts, size in self._wire_bytes([whole])}
-            rows = self._read("SELECT count(*) FROM node WHERE agent = ? AND epoch = ?", map_id)
-        put, edge = (sums.get(kind.__name__, (0, 0)) for kind in (NodePut, EdgePut))
-        return Traffic(int(rows[0][0]), *put, *edge)
-
-    def _count_new_changes(self) -> None:
-        counted = self._counted
-        grown = [
-            (agent, epoch, counted.get((agent, epoch), 0), watermark)
-            for agent, epoch, watermark in self._read("SELECT agent, epoch, watermark FROM log")
-            if watermark > counted.get((agent, epoch), 0)
-        ]
-        for kind, puts, size in self._wire_bytes(grown) if grown else ():
-            before = self._sums.get(kind, (0, 0))
-            self._sums[kind] = before[0] + puts, before[1] + size
-        counted |= {(agent, epoch): last for agent, epoch, _, last in grown}
-
-    def _count_again(self) -> None:
-        """After changes that were counted are deleted, or others are put among them."""
-        with self._traffic_lock:
-            self._counted.clear()
-            self._sums.clear()
 
     def constraints(self) -> list[bytes]:
         """The manual constraints, in order."""
@@ -382,9 +279,11 @@ class SqlStore(Store):
         reason = entry.change if isinstance(entry.change, str) else self._objection(entry.change)
         if isinstance(entry.change, str) or reason:
             refusals.append(Refusal(entry.sequence, reason))
-            count = "SELECT count(*) FROM refused WHERE agent = ? AND epoch = ?"
-            many = self._read(count, map_id)[0][0] >= MOST_REFUSED_KEPT
-            self._put("refused", (*map_id, entry.sequence, reason, b"" if many else entry.message))
+            count = self._read("SELECT count(*) FROM refused WHERE agent = ? AND epoch = ?", map_id)[0][0]
+            if count >= MOST_REFUSALS:
+                self._write(OLDEST_REASON, (*map_id, *map_id, MOST_REFUSED_KEPT))
+            message = b"" if count >= MOST_REFUSED_KEPT else entry.message
+            self._put("refused", (*map_id, entry.sequence, reason, message))
         else:
             changes.append(entry.change)
             self._insert(entry, entry.change, restored)

@@ -26,6 +26,10 @@ PRUNING = "pruning"
 """Likewise: see mapweave.mapserver.merging.pruning."""
 MOST_REFUSED_KEPT = 100
 """Refused changes of a map of which the bytes are kept; of further ones only the reason."""
+MOST_REFUSALS = 1000
+"""Reasons of a map that are kept; then a new one takes the place of the oldest that is kept without bytes."""
+ROW_BYTES = 100
+"""That a change takes beside its message: its key, its columns and its place in the table."""
 MAX_CONSTRAINTS = 10_000
 """Made by hand, one by one."""
 
@@ -203,11 +207,40 @@ class Store(Protocol):
     def edges(self, agent: str) -> dict[MapId, int]:
         """Edges of each map of a robot; this reads through all of its logs."""
 
+    def stored_bytes(self, map_id: MapId, after: int, last: int) -> int:
+        """Bytes that are kept of the changes of a map behind `after`, up to `last`, taken or refused.
+
+        Each counts with its message and `ROW_BYTES`. This reads through that part of the log.
+        """
+
+    def superseded(self, map_id: MapId, most: int) -> list[tuple[int, int]]:
+        """Changes of a map that later ones of it supersede: without them its replay is the same map.
+
+        Of each node and edge that was put or retired the newest change stays, and the last retirement. This
+        reads through the log.
+
+        Args:
+            map_id: of the map.
+            most: so many at most.
+
+        Returns:
+            Sequence number and bytes of each, as in `stored_bytes`.
+        """
+
+    def drop(self, map_id: MapId, sequences: Sequence[int]) -> None:
+        """Delete superseded changes of a map.
+
+        The watermark stays, so the robot does not send again what is deleted.
+
+        Raises:
+            InvalidFile: the disk does not take it; nothing is deleted.
+        """
+
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
         """The newest changes of a map that were refused, in order."""
 
     def refused(self) -> int:
-        """How many changes of any map were refused."""
+        """How many changes of any map were refused; of each map at most `MOST_REFUSALS` count."""
 
     def traffic(self, map_id: MapId | None = None) -> Traffic:
         """What a map has cost on the wire, or all maps together if none is named."""

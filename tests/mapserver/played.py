@@ -77,6 +77,7 @@ class Server:
     def __init__(self, hub: MemoryHub, path: Path, name: str = "s0", quotas: Quotas | None = None) -> None:
         self.hub, self.path, self.name, self.quotas = hub, path, name, quotas
         self.seen: list[Change] = []
+        self.retired: set[MapId] = set()
         self.on_change: Callable[[Change], None] = self.seen.append
         self.begin()
 
@@ -84,8 +85,9 @@ class Server:
         self.bus = MemoryBus(self.hub)
         self.store = SqliteStore(self.path)
         self.ingest = Ingest(
-            self.bus, KEYS, self.store, self.name, lambda c: self.on_change(c), QUICK, quotas=self.quotas
-        )
+            self.bus, KEYS, self.store, self.name, lambda c: self.on_change(c), QUICK, quotas=self.quotas,
+            retired=lambda: self.retired,
+        )  # fmt: skip
 
     def end(self) -> None:
         self.ingest.close()

@@ -13,13 +13,15 @@ import pytest
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.log import ingest, intake, known_logs, pull_schedule, pulled
+from mapweave.mapserver.log import ingest, intake, kept_bytes, known_logs, pull_schedule, pulled
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.intake import ADVICE
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
 from mapweave.wire.bus import Request
+from mapweave.wire.codec import encode_body
 from mapweave.wire.log_messages import Refusal
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.mapserver.log.acknowledged_fleet import AGENT, edge, node
@@ -198,6 +200,60 @@ def test_edges_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     monkeypatch.setattr(intake, "DRIVEN", 100)
     assert replicator.wait_acknowledged(60)
     server.end()
+
+
+def test_a_node_that_is_put_again_and_again_fills_no_disk(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kept_bytes, "LEAST_GROWN", 20_000)
+    server = Server(hub, tmp_path / "s0.sqlite")
+    map_id, replicator = robot(hub, tmp_path, cleanup)
+    rng = np.random.default_rng(1)
+    start = [node(map_id, 1, rng), node(map_id, 2, rng), edge(map_id, 3, 1, 2)]
+    again = [node(map_id, 2, rng) for _ in range(300)]
+    sent = sum(len(encode_body(body)) for body in again)
+    replicator.submit([*start, *again], 1)
+    assert replicator.wait_acknowledged(60)
+    assert sent > 4 * server.store.stored_bytes(map_id, 0, 303), "most of it is superseded"
+    server.end()
+    server.begin()
+    cleanup.callback(server.end)
+    replicator.submit([edge(map_id, 4, 1, 2)], 1)
+    assert replicator.wait_acknowledged(60)
+    assert server.store.stored_bytes(map_id, 0, 304) < 40_000, "once more after a start"
+    kept = HybridMap(change.body for change in server.store.replay(map_id))
+    wanted = HybridMap([*start, *again, edge(map_id, 4, 1, 2)])
+    assert {encode_body(b) for b in kept.contents()} == {encode_body(b) for b in wanted.contents()}
+
+
+def test_bytes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
+    monkeypatch.setattr(kept_bytes, "LEAST_GROWN", 10_000)
+    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(megabytes=0.2)))
+    cleanup.callback(server.end)
+    map_id, replicator = robot(hub, tmp_path, cleanup)
+    rng = np.random.default_rng(1)
+    replicator.submit([node(map_id, number, rng) for number in range(1, 101)], 1)
+    eventually(lambda: "`megabytes`" in replicator.status().failure)
+    assert "MB of changes here, which is its quota" in replicator.status().failure
+    kept = server.store.watermark(map_id)
+    assert 10 < kept < 80 and server.store.stored_bytes(map_id, 0, kept) <= 200_000
+    other = other_agent(hub, cleanup)
+    other.publish(1)
+    eventually(lambda: server.store.watermark(OTHER) == 1)
+    # That its map is retired makes room for its next, and not for more of this one.
+    server.retired.add(map_id)
+    following = other_agent(hub, cleanup, MapId("r0", 9))
+    following.serve(5)
+    following.beacon(5)
+    eventually(lambda: server.store.watermark(following.map) == 5)
+    assert server.store.watermark(map_id) == kept and replicator.unacknowledged() == 100 - kept
+    server.end()
+    server.quotas = Quotas(QuotaSettings(megabytes=1.0))
+    server.begin()
+    assert replicator.wait_acknowledged(60)
 
 
 def test_logs_that_never_answer_do_not_hold_up_one_that_does(

@@ -13,14 +13,16 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.log import sql_store
 from mapweave.mapserver.log.entry import Applied, Entry
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.mapserver.log.store import Run, Store
+from mapweave.mapserver.log.store import ROW_BYTES, Run, Store
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.log_messages import Refusal
 from tests.postgres import PostgresServer
@@ -326,3 +328,72 @@ def test_a_journal_is_no_store(tmp_path: Path) -> None:
     Journal(tmp_path / "j", "r0").close()
     with pytest.raises(InvalidFile, match="is not a Mapweave map store"):
         SqliteStore(tmp_path / "j")
+
+
+def contents(store: Store) -> set[bytes]:
+    """What the map is, by its replay."""
+    return {encode_body(body) for body in HybridMap(change.body for change in store.replay(MAP)).contents()}
+
+
+def test_what_later_changes_supersede_is_compacted(place: Path | str) -> None:
+    gone = NodeRetired(NodeId(*MAP, 3))
+    bodies: list[ChangeBody] = [
+        node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2), node_put(1, 4), node_put(3, 1), gone,
+        edge_put(11, 1, 2), node_put(1, 6), node_put(3, 2), gone, EdgeRetired(EdgeId(*MAP, 11)),
+        edge_put(11, 2, 1), edge_put(12, 1, 3), node_put(3, 7),
+    ]  # fmt: skip
+    store = open_store(place)
+    log = [entry(sequence, body) for sequence, body in enumerate(bodies, 1)]
+    store.apply(MAP, 5, log)
+    store.apply(OTHER, 5, [Entry.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))])
+    before, size = contents(store), store.stored_bytes(MAP, 0, 14)
+    assert size == sum(len(one.message) + ROW_BYTES for one in log)
+    assert store.stored_bytes(MAP, 3, 13) == sum(len(one.message) + ROW_BYTES for one in log[3:13])
+    found = dict(store.superseded(MAP, 100))
+    assert sorted(found) == [1, 3, 4, 5, 6, 7, 9] and len(store.superseded(MAP, 3)) == 3
+    assert found == {sequence: len(log[sequence - 1].message) + ROW_BYTES for sequence in found}
+    store.drop(MAP, list(found))
+    for _ in range(2):
+        assert sequences(store) == [2, 8, 10, 11, 12, 13, 14], "of each the newest, and the last retirement"
+        assert contents(store) == before and sequences(store, OTHER) == [1]
+        assert store.landmarks(NodeId(*MAP, 1)) == 6 and store.kept("r0") == {MAP: (3, 18)}
+        assert store.watermark(MAP) == 14 and store.damaged() == [] and store.unverified(MAP) is None
+        assert store.apply(MAP, 5, log).changes == (), "a robot that sends all again changes nothing"
+        assert store.stored_bytes(MAP, 0, 14) < size
+        store.close()
+        store = open_store(place)
+    store.close()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 4), st.integers(5, 6)), max_size=30))
+def test_a_compacted_map_is_the_same(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, int, int]]
+) -> None:
+    """Also for a server that has read a part of the log before, and reads the rest of it afterwards."""
+    bodies: list[ChangeBody] = []
+    for kind, number, other in steps:
+        node, edge = NodeId(*MAP, number), EdgeId(*MAP, 10 + number)
+        made = [node_put(number, len(bodies)), NodeRetired(node), edge_put(10 + number, number, other),
+                EdgeRetired(edge)]  # fmt: skip
+        bodies.append(made[kind])
+    store = SqliteStore(tmp_path_factory.mktemp("store") / "s")
+    store.apply(MAP, 5, [entry(sequence, body) for sequence, body in enumerate(bodies, 1)])
+    whole = contents(store)
+    read_before = [HybridMap(bodies[:known]) for known in range(len(bodies) + 1)]
+    store.drop(MAP, [sequence for sequence, _ in store.superseded(MAP, 10_000)])
+    assert contents(store) == whole
+    for known, hybrid in enumerate(read_before):
+        for change in store.replay(MAP, known):
+            hybrid.apply(change.body)
+        assert {encode_body(body) for body in hybrid.contents()} == whole, f"after {known}"
+    store.close()
+
+
+def test_reasons_of_refusals_are_bounded(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sql_store, "MOST_REFUSED_KEPT", 3)
+    monkeypatch.setattr(sql_store, "MOST_REFUSALS", 10)
+    store.apply(MAP, 5, [broken(k) for k in range(1, 41)])
+    assert store.refused() == 10 and store.watermark(MAP) == 40
+    assert [refusal.sequence for refusal in store.refusals(MAP)] == [1, 2, 3, *range(34, 41)]
+    assert store.stored_bytes(MAP, 0, 40) < 10 * (ROW_BYTES + 200)
