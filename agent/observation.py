@@ -68,7 +68,8 @@ class Observation:
         image: (H, W) uint8 grey as it comes from the camera (lens distortion still in it), or None if
             this tick has no frame.
         proximity: (K,) m, free distance along each of the robot's rangers from the robot's edge; the
-            ranger's maximum where nothing is in reach. Empty if the robot has none.
+            ranger's maximum where nothing is in reach, 0 where something is too near to be measured.
+            Empty if the robot has none.
         bumped: whether the bumper is pressed.
         battery: charge, as a share; None if the robot does not tell.
         kidnapped: whether the robot notices that it has been lifted. The wheels have not measured how it is

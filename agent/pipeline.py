@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.blind_zone import BlindZone
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.cautious_driving import CautiousDriving, lacks_rangers
 from mapweave.agent.command_guard import CommandGuard
@@ -105,6 +106,7 @@ class Pipeline:
         self._caution = CautiousDriving(description) if lacks_rangers(description) else None
         self._driven: Driven | None = None
         self._sensors = SensorMonitor(description)
+        self._blind_zone = BlindZone(description)
         self._others = RobotsInView(description)
         self._command: Command | None = None
         self._mission: Mission = Idle()
@@ -237,7 +239,7 @@ class Pipeline:
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
         self._image = observation.image
         observation = self.calibration.correct(observation)
-        observation = self._sensors.see(observation, self._command)
+        observation = self._blind_zone.fill(self._sensors.see(observation, self._command))
         if self._sensors.clock_jumped:
             self.mapper.forget_clock()
         if self._sensors.pose_lost:
