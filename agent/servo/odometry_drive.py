@@ -77,6 +77,11 @@ class OdometryDrive:
         ):  # just driven past the goal: come back, do not turn about
             self._direction = -self._direction
             error = wrap_angle(error - math.pi)
+        in_the_way = self._in_the_way(obstacles, min(rho, 0.25), error)
+        if self._blocked > PATIENCE_TICKS and in_the_way:
+            # It gets no nearer. With the goal's heading it may see the goal, and know better where that is.
+            turn = clip(-TURN_GAIN * heading, self._max_turn) if abs(heading) > HEADING_TOLERANCE else 0.0
+            return _step(Command(0.0, turn), "stuck", "an obstacle is in the way")
         if abs(error) > (0.3 if self._aligned else 0.05):
             self._aligned = False
             return _step(
@@ -85,18 +90,17 @@ class OdometryDrive:
                 "turning to drive " + ("forward" if self._direction > 0 else "backward"),
             )
         self._aligned = True
-        if self._in_the_way(obstacles, min(rho, 0.25)):
+        if in_the_way:
             self._blocked += 1
-            stuck = self._blocked > PATIENCE_TICKS
-            return _step(Command(), "stuck" if stuck else "driving", "an obstacle is in the way")
+            return _step(Command(), "driving", "an obstacle is in the way")
         self._blocked = 0
         speed = self._direction * min(max(FORWARD_GAIN * rho, 0.015), self._max_forward)
         speeds = saturate(speed, TURN_GAIN * error, self._max_forward, self._max_turn)
         return _step(Command(*speeds), "driving", "driving straight to the goal")
 
-    def _in_the_way(self, obstacles: NDArray[Any], way: float) -> bool:
-        """Whether the footprint, driven `way` (m) straight on, comes too near a point ahead of it."""
-        points = np.asarray(obstacles, dtype=np.float64).reshape(-1, 2)
+    def _in_the_way(self, obstacles: NDArray[Any], way: float, error: float) -> bool:
+        """Whether the footprint, turned by `error` (rad) and driven `way` (m), comes too near a point."""
+        points = Pose2(heading=error).inverse().apply(np.asarray(obstacles, dtype=np.float64).reshape(-1, 2))
         along, aside = self._direction * points[:, 0], points[:, 1]
         beyond = np.maximum(along - way, 0.0)
         near = np.hypot(beyond, aside) < self._description.radius + CLEARANCE

@@ -66,3 +66,20 @@ def test_an_obstacle_stops_it_then_it_is_stuck(robot: RobotDescription) -> None:
     assert steps[0].state == "driving"
     assert steps[-1].state == "stuck"
     assert drive.command(pose, NOTHING).command.forward == pytest.approx(0.24)
+
+
+def test_what_is_in_the_way_does_not_keep_it_from_the_goal_s_heading(
+    robot: RobotDescription, integrate: Integrate
+) -> None:
+    drive, pose, obstacle = OdometryDrive(robot), Pose2(0.0, 0.09, 2.0), np.array([[0.0, -0.12]])
+    drive.start(pose)
+    for _ in range(120):
+        step = drive.command(pose, pose.inverse().apply(obstacle))
+        assert step.command.forward == 0.0
+        pose = integrate(pose, step.command, robot.tick, 3)[-1]
+    assert step.state == "stuck"
+    assert abs(wrap_angle(pose.heading)) < 0.03
+    for _ in range(150):
+        step = drive.command(pose, NOTHING)
+        pose = integrate(pose, step.command, robot.tick, 3)[-1]
+    assert step.state == "arrived", "the obstacle has left"
