@@ -90,9 +90,9 @@ class BlindZone:
         along = np.arange(0.0, self._least + SLACK, STEP)
         beam = (self._radius + along)[:, None] * np.array([math.cos(bearing), math.sin(bearing)])
         apart = self._odom_from_robot.apply(beam)[:, None] - self._stood
-        covered = (np.hypot(apart[..., 0], apart[..., 1]) < self._radius).any(axis=1)
-        covered[0] = True
-        return 0.0 if covered.all() else float(along[covered.argmin() - 1])
+        beyond = np.hypot(apart[..., 0], apart[..., 1]).min(axis=1, initial=math.inf) >= self._radius
+        first = int(beyond[1:].argmax())
+        return float(along[first]) if beyond[1:].any() else 0.0
 
     def _remember(self, kept: NDArray[np.bool_], bearings: Array, distances: Array) -> None:
         fresh = distances[:, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
