@@ -22,7 +22,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.known_logs import Lag
 from mapweave.mapserver.places import Places
-from mapweave.mapserver.quotas import Quotas
+from mapweave.mapserver.quotas import MOST_ROBOTS, Quotas
 from mapweave.merge.explanation.map_standing import MapStanding, map_standings
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Sample
@@ -33,6 +33,8 @@ OWN_PERIOD = 0.5
 """Between two statuses of a robot that is not asked for fewer, s."""
 STATUSES_PER_S = 400.0
 """Of all robots that a server wants: up to 200 robots each as it likes, of a thousand one every 2.5 s."""
+MOST_ALIVE = 8
+"""Maps under which a robot is alive at once: it makes one, and two while it begins the next."""
 NO_LAG = Lag(0, 0.0)
 UNKNOWN = MapStanding(None, 0, "")
 """Of a map that is not merged yet."""
@@ -176,10 +178,18 @@ class Roster:
     def _see(self, key: str, alive: bool) -> None:
         map_id = self._keys.parse_agent_alive(key)
         with self._turn:
-            maps = self._alive.setdefault(map_id.agent, set())
-            (maps.add if alive else maps.discard)(map_id)
-            if not maps:
-                del self._alive[map_id.agent]
+            maps = self._alive.get(map_id.agent, set())
+            full = len(maps) >= MOST_ALIVE or (not maps and len(self._alive) >= MOST_ROBOTS)
+            if not alive:
+                maps.discard(map_id)
+            elif not full:
+                maps.add(map_id)
+            if maps:
+                self._alive[map_id.agent] = maps
+            else:
+                self._alive.pop(map_id.agent, None)
+        if alive and full:
+            self._quotas.hold_back(map_id.agent, "liveliness tokens")
 
 
 def whereabouts(status: AgentStatus, merged: MergedMap) -> tuple[Pose2 | None, int]:

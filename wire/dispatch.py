@@ -56,7 +56,7 @@ class Dispatcher:
 
         def task() -> None:
             if wanted():
-                _guarded(lambda: handler(sample), sample.key)
+                guarded(lambda: handler(sample), sample.key)
 
         if not self._put(task, sample.key, len(sample.payload)):
             self.lost += 1
@@ -90,16 +90,9 @@ class Dispatcher:
             busy = Busy(FULL_PAUSE)
             request.refuse(str(busy), busy.retry_after)
 
-    def presence(
-        self, handler: Callable[[str, bool], None], key: str, alive: bool, wanted: Callable[[], bool]
-    ) -> None:
-        """Hand over a change of liveliness."""
-
-        def task() -> None:
-            if wanted():
-                _guarded(lambda: handler(key, alive), key)
-
-        self._put(task, key, bounded=False)
+    def presence(self, report: Callable[[], None], key: str) -> None:
+        """Hand over that liveliness has changed; see mapweave.wire.alive_keys, which does so rarely."""
+        self._put(report, key, bounded=False)
 
     def close(self) -> None:
         """Finish the running handler, forget what waits. Twice is no error.
@@ -133,7 +126,7 @@ class Dispatcher:
             task()
 
 
-def _guarded(call: Callable[[], None], key: str) -> None:
+def guarded(call: Callable[[], None], key: str) -> None:
     """Run a handler whose caller is far away: its failure ends here, in the log, once."""
     try:
         call()

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from mapweave.wire.alive_keys import AliveKeys
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.refusal import decode_refusal, encode_refusal
@@ -81,15 +82,15 @@ class Watcher(Declared):
         handler: Callable[[str, bool], None],
     ) -> None:
         super().__init__(key, dispatcher, remove)
-        self._handler = handler
+        self._alive = AliveKeys(dispatcher, handler, self.wanted)
         self._seen: set[str] = set()
 
     def see(self, alive: set[str]) -> None:
         """Report the differences from the last report."""
         for key in sorted(self._seen - alive):
-            self._dispatcher.presence(self._handler, key, False, self.wanted)
+            self._alive.note(key, False)
         for key in sorted(alive - self._seen):
-            self._dispatcher.presence(self._handler, key, True, self.wanted)
+            self._alive.note(key, True)
         self._seen = alive
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import zenoh
 
 from mapweave.hybridmap.errors import NotConnected
+from mapweave.wire.alive_keys import AliveKeys
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.keyexpr import answered
@@ -150,8 +151,7 @@ class Watcher(Declared):
 
     def __init__(self, owner: Owner, key: str, handler: Callable[[str, bool], None]) -> None:
         super().__init__(owner, key)
-        self._handler = handler
-        self._seen: set[str] = set()
+        self._alive = AliveKeys(owner.dispatcher, handler, self.wanted)
 
     def _declare_in(self, session: zenoh.Session) -> Any:
         return session.liveliness().declare_subscriber(self.key, self._receive, history=True)
@@ -159,17 +159,12 @@ class Watcher(Declared):
     def detach(self) -> None:
         """Take it back; who comes again is alive again."""
         super().detach()
-        seen, self._seen = self._seen, set()
-        for key in seen:
-            self._owner.dispatcher.presence(self._handler, key, False, self.wanted)
+        self._alive.end()
 
     def _receive(self, sample: zenoh.Sample) -> None:
         self._owner.heard()
-        key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
         # History and news may both contain the same token.
-        if alive != (key in self._seen):
-            (self._seen.add if alive else self._seen.discard)(key)
-            self._owner.dispatcher.presence(self._handler, key, alive, self.wanted)
+        self._alive.note(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
 
 class ZenohRequest:

@@ -7,12 +7,16 @@ from contextlib import ExitStack
 import pytest
 
 from mapweave.hybridmap.agent_status import MAX_ROBOTS, AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.mission_order import MAX_VIA, MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
-from mapweave.mapserver.roster import Roster
+from mapweave.mapserver.roster import MOST_ALIVE, Roster
+from mapweave.mapserver.routes import Router
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
@@ -47,3 +51,20 @@ def test_one_answer_holds_all_robots_whatever_they_do() -> None:
     said = AgentStatus(status, 1, "r0", 1, mission=report, battery=0.5)
     entries = tuple(RobotEntry(f"r{k}", True, 0.0, said, Pose2(), 0, newest=node) for k in range(MAX_ROBOTS))
     assert decode(encode(FleetStatus(entries)), FleetStatus).robots == entries
+
+
+def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone() -> None:
+    with ExitStack() as stack:
+        bus, quotas = MemoryBus(MemoryHub()), Quotas()
+        stack.callback(bus.close)
+        roster = Roster(bus, KEYS, lambda: 0.0, lambda status: None, quotas)
+        stack.callback(roster.close)
+        tokens = [bus.announce(KEYS.agent_alive(MapId("r3", epoch))) for epoch in range(40)]
+        bus.announce(KEYS.agent_alive(MapId("r1", 1)))
+        eventually(lambda: roster.alive("r1"))
+        eventually(lambda: quotas.over() == {"r3": "over its quota: 32 liveliness tokens"})
+        assert roster.robots(Places(Router(MergedMap.empty()), Annotations())).robots[1].over_quota
+        assert roster.alive("r3") and len(roster._alive["r3"]) == MOST_ALIVE
+        for token in tokens:
+            token.close()
+        eventually(lambda: not roster.alive("r3"))

@@ -9,6 +9,7 @@ import time
 import pytest
 
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError
+from mapweave.wire.alive_keys import MOST_OF_ONE
 from mapweave.wire.bus import Reply, Request, Sample
 from tests.waiting import eventually
 from tests.wire.fleets import Fleet, settle, subscribe
@@ -229,3 +230,23 @@ def test_handlers_run_one_at_a_time_and_may_use_the_bus(fleet: Fleet) -> None:
     bus.subscribe("two", handler)
     eventually(lambda: bus.publish("one", b"go") or bus.publish("two", b"") or echoed)
     assert not overlaps
+
+
+def test_tokens_of_one_robot_are_bounded(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+    """Whatever one session declares, others are seen, and so is that a known key of it ends."""
+    flooding, honest, watcher = fleet.join(), fleet.join(), fleet.join()
+    news: list[tuple[str, bool]] = []
+    root = "mapweave/1/f/agent"
+    tokens = [flooding.announce(f"{root}/r3/alive/{epoch}") for epoch in range(MOST_OF_ONE + 40)]
+    watcher.watch(f"{root}/*/alive/*", lambda key, alive: news.append((key, alive)))
+    honest.announce(f"{root}/r1/alive/1")
+    eventually(lambda: (f"{root}/r1/alive/1", True) in news)
+    eventually(lambda: len(news) == MOST_OF_ONE + 1)
+    assert "liveliness tokens left out so far, the last of agent/r3" in caplog.text
+    for token in tokens:
+        token.close()
+    eventually(lambda: sum(not alive for _, alive in news) == MOST_OF_ONE)
+    assert {key for key, alive in news if not alive} == {key for key, _ in news} - {f"{root}/r1/alive/1"}
+    again = flooding.announce(f"{root}/r3/alive/9999")
+    eventually(lambda: news[-1] == (f"{root}/r3/alive/9999", True))
+    again.close()

@@ -150,7 +150,7 @@ def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(
             dispatcher.message(lambda s: seen.append(s.key), Sample(f"m{n}", b""), lambda: True)
         question = _Question()
         dispatcher.question(lambda _: None, question, lambda: True)
-    dispatcher.presence(lambda key, alive: seen.append(f"{key} {alive}"), "token", True, lambda: True)
+    dispatcher.presence(lambda: seen.append("token True"), "token")
     assert (question.refusal, question.retry_after) == ("busy, retry after 1.0 s", 1.0)
     assert (dispatcher.lost, dispatcher.refused) == (3, 1)
     assert [record.levelname for record in caplog.records] == ["WARNING"] * 3, (
