@@ -13,6 +13,10 @@ class InvalidValue(MapweaveError):
     """A value is out of range, not finite, or of the wrong shape."""
 
 
+class Refused(InvalidValue):
+    """What is asked for was understood and looked at, and the answer is no; the words say why."""
+
+
 class InvalidMessage(MapweaveError):
     """A message from outside does not decode or does not validate."""
 

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from msgspec import Meta
 
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.limits import Amount, Coordinate, Number, Probability, Words
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
@@ -245,10 +245,10 @@ class PlacedPlans:
         """One of them.
 
         Raises:
-            InvalidValue: there is none of this name.
+            Refused: there is none of this name.
         """
         for placed in self.plans:
             if placed.name == name:
                 return placed
         names = ", ".join(placed.name for placed in self.plans) or "none; add one with `mapweave plan add`"
-        raise InvalidValue(f"there is no plan {name!r}; there are: {names}")
+        raise Refused(f"there is no plan {name!r}; there are: {names}")

@@ -42,9 +42,10 @@ from mapweave.commands import (
     status,
 )
 from mapweave.commands.examples import add_examples
-from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA
+from mapweave.commands.usage import UsageError
+from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA, NO, USAGE
 from mapweave.extras import MissingExtra, extra_of
-from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.errors import MapweaveError, Refused
 from mapweave.json_log import json_line
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help, with examples."
@@ -123,6 +124,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"{arguments.command} {MissingExtra([extra])}", file=sys.stderr)
         return MISSING_EXTRA
+    except UsageError as error:
+        _complain(str(error))
+        return USAGE
+    except Refused as error:
+        _complain(str(error))
+        return NO
     except MapweaveError as error:
         _complain(str(error))
         return FAILED

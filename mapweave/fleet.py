@@ -23,7 +23,7 @@ from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
 from mapweave.fleet_plans import FleetPlans
 from mapweave.hybridmap.agent_status import SILENT, AgentStatus, FleetStatus, RobotEntry
-from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.hybridmap.mission_order import (
     MissionKind,
     MissionOrder,
@@ -94,7 +94,7 @@ def send_portal_done(bus: Bus, keys: Keys, done: PortalDone, timeout: float = 10
 
     Raises:
         NotConnected: it does not answer.
-        InvalidValue: it does not wait at a portal.
+        Refused: it does not wait at a portal.
     """
     replies = bus.ask(sent_by(keys.portal(done.robot), sender), encode(done), timeout)
     if not replies:
@@ -102,7 +102,7 @@ def send_portal_done(bus: Bus, keys: Keys, done: PortalDone, timeout: float = 10
             f"robot {done.robot} does not answer: is its agent running? `mapweave status` lists the robots"
         )
     if replies[0].error:
-        raise InvalidValue(replies[0].error.removeprefix("refused: "))
+        raise Refused(replies[0].error.removeprefix("refused: "))
     return str(decode_record(replies[0].payload)["said"])
 
 
@@ -207,14 +207,14 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
 
         Raises:
             NotConnected: no map server answers.
-            InvalidValue: no such robot was ever heard of.
+            Refused: no such robot was ever heard of.
         """
         reports = decode(self._question(self._keys.any_missions(), b"", ANSWERED), Missions).reports
         found = tuple(report for report in reports if robot in ("", report.order.robot))
         if robot and not found:
             known = [entry.robot for entry in self.status().robots]
             if robot not in known:
-                raise InvalidValue(f"there is no robot {robot}; there are: {', '.join(known) or 'none'}")
+                raise Refused(f"there is no robot {robot}; there are: {', '.join(known) or 'none'}")
         return found
 
     def go(self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = ()) -> MissionReport:
@@ -227,7 +227,8 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             via: what to pass before, in order, in the same words.
 
         Raises:
-            MapweaveError: the robot or the goal does not exist, or the robot does not answer.
+            Refused: the robot or the goal does not exist, or no way leads there.
+            NotConnected: the robot does not answer.
         """
         return self._give(robot, MissionKind.GO, goal, wait, tuple(via))
 
@@ -257,7 +258,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
 
         Raises:
             NotConnected: it does not answer.
-            InvalidValue: it does not wait at a portal.
+            Refused: it does not wait at a portal.
         """
         self._check_role()
         done = PortalDone(check_name(robot), self._by)
@@ -323,7 +324,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             replies = self._bus.ask(key, encode(request), 2.0 * ANSWERED)
             taken = [reply for reply in replies if not reply.error]
             if not taken and replies:
-                raise InvalidValue(replies[0].error.removeprefix("refused: "))
+                raise Refused(replies[0].error.removeprefix("refused: "))
             if not taken:
                 nodes = tuple(node for word in via if (node := _node(word)) is not None)
                 report = self._direct(robot, kind, _node(goal), goal, nodes)

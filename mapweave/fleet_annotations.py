@@ -10,6 +10,7 @@ from mapweave.fleet_questions import FleetQuestions
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
+from mapweave.refusals import refusals
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import sent_by
@@ -36,7 +37,8 @@ class FleetAnnotations(FleetQuestions):
             What it says, in words.
 
         Raises:
-            MapweaveError: it says nothing new, is about something that is not there, or no server answers.
+            Refused: it says nothing new, or is about something that is not there.
+            NotConnected: no map server answers.
         """
         return self._annotate(name, {"kind": kind, **fields}, False, because)
 
@@ -56,15 +58,16 @@ class FleetAnnotations(FleetQuestions):
         """Nodes for words: names of places, and positions in the merged map.
 
         Raises:
-            InvalidValue: a word is none, with the reason.
+            Refused: a word is none, with the reason.
             NotConnected: no map server answers.
         """
         return decode(self._question(self._keys.any_resolve(), encode(request), ANSWER), ResolveAnswer)
 
     def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
         self._check_role()
-        annotation = annotation_of_words(
-            name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
-        )
+        with refusals():
+            annotation = annotation_of_words(
+                name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
+            )
         key = sent_by(self._keys.any_annotate(), self._sender)
         return str(decode_record(self._question(key, encode(annotation), ANSWER))["said"])

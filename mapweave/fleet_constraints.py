@@ -16,7 +16,7 @@ from mapweave.hybridmap.constraint_subject import (
     read_ends,
     read_window,
 )
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.named_nodes import own_ids_of, retired_of
 from mapweave.hybridmap.node import NodeId
@@ -48,7 +48,7 @@ class FleetConstraints(FleetAnnotations):
             What the server made of it, in words.
 
         Raises:
-            InvalidValue: the images do not agree, or the map contradicts it: the evidence, and what to do.
+            Refused: the images do not agree, or the map contradicts it: the evidence, and what to do.
             NotConnected: no map server answers.
         """
         first, second = map(NodeId.parse, own_ids_of((a, b), self.annotations, self.resolve))
@@ -103,7 +103,7 @@ class FleetConstraints(FleetAnnotations):
         if isinstance(what, int):
             record = self.constraints()
             if not 1 <= what <= len(record):
-                raise InvalidValue(f"there is no constraint {what}: the record has {len(record)}")
+                raise Refused(f"there is no constraint {what}: the record has {len(record)}")
             what = record[what - 1]
         return self.constrain(what.about, False, because, check=check)
 

@@ -26,7 +26,7 @@ class FleetPlans(FleetQuestions):
         """The PNG file of a plan, by the name of its image.
 
         Raises:
-            InvalidValue: the server does not have it.
+            Refused: the server does not have it.
             NotConnected: no map server answers.
         """
         return self._question(self._keys.any_plan_image(), sha256.encode(), ANSWER)

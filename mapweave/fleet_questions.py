@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mapweave.connection import no_server
-from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.keys import Keys
@@ -23,7 +23,7 @@ class FleetQuestions:
 
         Raises:
             NotConnected: no map server answers, or all stay busy.
-            InvalidValue: it refuses the question.
+            Refused: it refuses the question.
         """
         replies = ask_patiently(self._bus, key, payload, timeout)
         for reply in replies:
@@ -32,7 +32,7 @@ class FleetQuestions:
         if not replies:
             raise no_server(self._keys.fleet, self._key_holder)
         reason = replies[0].error.removeprefix("refused: ")
-        raise NotConnected(f"the map server is {reason}") if replies[0].retry_after else InvalidValue(reason)
+        raise NotConnected(f"the map server is {reason}") if replies[0].retry_after else Refused(reason)
 
     @property
     def _sender(self) -> str:

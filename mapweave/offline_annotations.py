@@ -24,6 +24,7 @@ from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.opened_map import MapSource, open_map
+from mapweave.refusals import refusals
 from mapweave.storage.atomic_file import check_place
 from mapweave.storage.map_file import write_map_file
 from mapweave.storage.plan_image import check_plan_png
@@ -56,7 +57,8 @@ class OfflineAnnotations:
         """See Fleet.annotate; the file is written.
 
         Raises:
-            MapweaveError: it says nothing new, is about something that is not there, or cannot be written.
+            Refused: it says nothing new, or is about something that is not there.
+            MapweaveError: the file cannot be written.
         """
         return self._annotate(name, {"kind": kind, **fields}, False, because)
 
@@ -72,9 +74,10 @@ class OfflineAnnotations:
         """Nodes for words.
 
         Raises:
-            InvalidValue: a word is none, with the reason.
+            Refused: a word is none, with the reason.
         """
-        return Places(self._router, self.annotations()).answer(request)
+        with refusals():
+            return Places(self._router, self.annotations()).answer(request)
 
     def plans(self) -> PlacedPlans:
         """Floor plans under the map."""
@@ -111,12 +114,13 @@ class OfflineAnnotations:
                 f"{self._opened.path} is a {self._opened.source}, which is not written: give -o"
             )
         check_place(self._out)
-        annotation = annotation_of_words(
-            name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
-        )
-        constraints = ManualConstraints(self._opened.content.constraints)
-        check_annotation(self._router.merged, self.annotations(), annotation, constraints)
-        check_closure(self._router, self.annotations(), annotation)
+        with refusals():
+            annotation = annotation_of_words(
+                name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
+            )
+            constraints = ManualConstraints(self._opened.content.constraints)
+            check_annotation(self._router.merged, self.annotations(), annotation, constraints)
+            check_closure(self._router, self.annotations(), annotation)
         words = "; ".join(
             (annotation.words, *effects_of(annotation, Places(self._router, self.annotations())))
         )

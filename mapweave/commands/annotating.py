@@ -48,18 +48,23 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
     """The options of `add_area_options` as fields of an annotation.
 
     Raises:
-        InvalidValue: a corner is no position.
+        UsageError: a corner is no position, there are too few or too many, or the radius is no length.
     """
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
+    from mapweave.hybridmap.area import FARTHEST, LEAST_CORNERS, MOST_CORNERS
     from mapweave.mapserver.places import position_of
 
     fields: dict[str, object] = {}
     if arguments.radius is not None:
+        # Written so that NaN fails.
+        if not 0.0 < arguments.radius <= FARTHEST:
+            raise UsageError(f"--radius {arguments.radius:g}: give metres, at most {FARTHEST:g}")
         fields["radius"] = arguments.radius
     if arguments.corners:
         corners = [position_of(word) for word in arguments.corners]
-        if None in corners:
-            raise InvalidValue("--corners: give positions, as 3.1,-2.0 4,-2 4,1.5")
+        if None in corners or not LEAST_CORNERS <= len(corners) <= MOST_CORNERS:
+            many = f"{LEAST_CORNERS} to {MOST_CORNERS}"
+            raise UsageError(f"--corners: give {many} positions, as 3.1,-2.0 4,-2 4,1.5")
         fields["corners"] = corners
     if arguments.near:
         fields["near"] = arguments.near
@@ -73,14 +78,14 @@ def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineAnnotati
     Raises:
         MapweaveError: no server answers, or the file cannot be read.
     """
+    from mapweave.commands.usage import UsageError
     from mapweave.fleet import login
-    from mapweave.hybridmap.errors import InvalidValue
 
     if arguments.map is None:
         from mapweave.commands.missions import fleet_of
 
         if getattr(arguments, "out", None) is not None:
-            raise InvalidValue("--out goes with --map: a server keeps its own record")
+            raise UsageError("--out goes with --map: a server keeps its own record")
         with fleet_of(arguments) as fleet:
             yield fleet
     else:

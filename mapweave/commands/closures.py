@@ -78,13 +78,15 @@ def _add_where(parser: argparse.ArgumentParser) -> None:
 
 def run_close(arguments: argparse.Namespace) -> int:
     """Close a way."""
+    from mapweave.commands.usage import arguments_read
     from mapweave.hybridmap.wall_time import local_words, read_time, utc_words
 
     now_ns = time.time_ns()
     times: dict[str, Any] = {}
     for field, text, word in (("begin_ns", arguments.begin, "from"), ("end_ns", arguments.end, "until")):
         if text is not None:
-            times[field] = stamp_ns = read_time(text, now_ns)
+            with arguments_read():
+                times[field] = stamp_ns = read_time(text, now_ns)
             print(f"{word} {local_words(stamp_ns)} ({utc_words(stamp_ns)})")
     with record_of(arguments) as record:
         name, fields = _meant(arguments, record)
@@ -94,10 +96,10 @@ def run_close(arguments: argparse.Namespace) -> int:
 
 def run_prefer(arguments: argparse.Namespace) -> int:
     """Prefer or avoid a way, or withdraw that."""
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
 
     if (arguments.factor < 1.0) != (arguments.verb == "prefer"):
-        raise InvalidValue(f"--factor {arguments.factor:g}: below 1 prefers a way, above 1 avoids it")
+        raise UsageError(f"--factor {arguments.factor:g}: below 1 prefers a way, above 1 avoids it")
     if arguments.undo:
         return _withdraw(arguments, "preference")
     with record_of(arguments) as record:
@@ -142,14 +144,14 @@ def _meant(arguments: argparse.Namespace, record: Fleet | OfflineAnnotations) ->
     """Name and fields of what WHERE means.
 
     Raises:
-        InvalidValue: nothing, or too much, is given.
+        UsageError: nothing, or too much, is given.
     """
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
     from mapweave.mapserver.annotation_words import AROUND
 
     where, fields = arguments.where, dict[str, Any](area_fields(arguments))
     if len(where) > 2 or bool(where) == ("corners" in fields) or (len(where) == 2 and "radius" in fields):
-        raise InvalidValue("give two nodes, or one place, node or position, or --corners")
+        raise UsageError("give two nodes, or one place, node or position, or --corners")
     if len(where) == 2:
         fields["edge"] = where
     elif where and record.annotations().last("place", where[0]) is not None:

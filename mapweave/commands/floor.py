@@ -27,11 +27,11 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Label a map, or withdraw its label."""
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.query import ResolveRequest
 
     if (arguments.label is None) != arguments.undo:
-        raise InvalidValue("give the name of a floor and a node; with --undo a node alone")
+        raise UsageError("give the name of a floor and a node; with --undo a node alone")
     with record_of(arguments) as record:
         node = record.resolve(ResolveRequest((arguments.node,))).found[0].node
         name, because = str(node.map), arguments.because

@@ -114,10 +114,10 @@ def _token(arguments: argparse.Namespace) -> int:
 
 
 def _check_days(days: float) -> None:
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
 
     if not 0.0 < days <= 3650.0:
-        raise InvalidValue(f"--days {days:g}: give 1 to 3650")
+        raise UsageError(f"--days {days:g}: give 1 to 3650")
 
 
 def _list(arguments: argparse.Namespace) -> int:

@@ -36,15 +36,16 @@ def constrain(arguments: argparse.Namespace, about: Subject) -> None:
     Raises:
         MapweaveError: the constraint has no effect, or there is no place to keep it.
     """
+    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.fleet import author
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.manual_constraint import ManualConstraint
 
     if arguments.out is not None and arguments.map is None:
-        raise InvalidValue("--out goes with --map: a server keeps its own record")
+        raise UsageError("--out goes with --map: a server keeps its own record")
     holder = None if arguments.map is not None else key_holder(network_of(arguments, settings_of(arguments)))
     by = author(holder, arguments.by or "")
-    constraint = ManualConstraint(about, not arguments.undo, by, time.time_ns(), arguments.because)
+    with arguments_read():
+        constraint = ManualConstraint(about, not arguments.undo, by, time.time_ns(), arguments.because)
     if arguments.map is None:
         _send_to_server(arguments, constraint, "" if holder is None else holder.name)
     else:
@@ -106,6 +107,7 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     from mapweave.merge.constraint_checks import check_manual_constraint
     from mapweave.offline_merge import parts_of
     from mapweave.opened_map import MapSource, source_of
+    from mapweave.refusals import refusals
     from mapweave.storage.atomic_file import check_place
     from mapweave.storage.map_file import read_map_file, write_map_file
 
@@ -120,7 +122,8 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     content = read_map_file(arguments.map, "merged")
     before = merged_of(content, settings)
     earlier = ManualConstraints(content.constraints, floors=Annotations(content.annotations).floors)
-    constraint, effects = check_manual_constraint(before, earlier, constraint, settings=settings)
+    with refusals():
+        constraint, effects = check_manual_constraint(before, earlier, constraint, settings=settings)
     words = f"{event_words(constraint)}{f'; {effects}' if effects else ''}"
     if arguments.check:
         print(f"only checked, nothing is changed: {words}")

@@ -9,12 +9,14 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from mapweave.commands.network import key_holder, network_of, reach, settings_of
+from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
-from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.hybridmap.named_nodes import Record, Resolve, ids_of
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest, ResolveAnswer, ResolveRequest
+from mapweave.refusals import refusals
 from mapweave.wire.bus import Reply
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, decode_explanation, encode
@@ -29,11 +31,12 @@ def ends_of(words: list[str]) -> Ends:
     """Read two nodes or two maps.
 
     Raises:
-        InvalidValue: they are neither.
+        UsageError: they are neither.
     """
     if len(words) != 2:
-        raise InvalidValue(f"give two nodes or two maps, not {len(words)}: {EXAMPLE}")
-    return read_ends(words[0], words[1])
+        raise UsageError(f"give two nodes or two maps, not {len(words)}: {EXAMPLE}")
+    with arguments_read():
+        return read_ends(words[0], words[1])
 
 
 def resolved(arguments: argparse.Namespace, words: list[str], router: Router | None = None) -> list[str]:
@@ -64,9 +67,14 @@ def names_of(arguments: argparse.Namespace, router: Router | None = None) -> tup
     from mapweave.mapserver.places import Places
 
     known = cache(lambda: router or router_of(arguments))
+
+    def answered(request: ResolveRequest) -> ResolveAnswer:
+        with refusals():
+            return Places(known(), known().annotations).answer(request)
+
     return (
         lambda: known().annotations,
-        lambda request: _noted(request, Places(known(), known().annotations).answer(request)),
+        lambda request: _noted(request, answered(request)),
     )
 
 
@@ -95,21 +103,22 @@ def explanation_of(
     from mapweave.commands.map_input import router_of
     from mapweave.mapserver.explanations import explained
 
-    return explained(request, router or router_of(arguments), settings_of(arguments).merge.consistency)
+    with refusals():
+        return explained(request, router or router_of(arguments), settings_of(arguments).merge.consistency)
 
 
 def map_of(word: str) -> MapId:
     """Read a map.
 
     Raises:
-        InvalidValue: it is none.
+        UsageError: it is none.
     """
     try:
         end = read_end(word)
     except InvalidValue:
-        raise InvalidValue(f"{word!r} is no map: write it as r0.1, the robot and the map's number") from None
+        raise UsageError(f"{word!r} is no map: write it as r0.1, the robot and the map's number") from None
     if isinstance(end, NodeId):
-        raise InvalidValue(f"{word} is a node: give its map, {end.map}")
+        raise UsageError(f"{word} is a node: give its map, {end.map}")
     return end
 
 
@@ -117,11 +126,12 @@ def node_of(word: str) -> NodeId:
     """Read a node.
 
     Raises:
-        InvalidValue: it is none.
+        UsageError: it is none.
     """
-    end = read_end(word)
+    with arguments_read():
+        end = read_end(word)
     if isinstance(end, MapId):
-        raise InvalidValue(f"{word} is a map: give one of its nodes, {word}.1 for example")
+        raise UsageError(f"{word} is a map: give one of its nodes, {word}.1 for example")
     return end
 
 
@@ -137,7 +147,8 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
         Answers, at least one; none of them an error.
 
     Raises:
-        NotConnected: no server answers, or all refuse.
+        NotConnected: no server answers, or all are busy.
+        Refused: all refuse.
     """
     from mapweave.connection import no_server
 
@@ -151,7 +162,9 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
         raise no_server(network.fleet, key_holder(network))
     good = [reply for reply in replies if not reply.error]
     if not good:
-        raise NotConnected(f"the map server refused: {replies[0].error}")
+        if any(reply.retry_after for reply in replies):
+            raise NotConnected(f"the map server is {replies[0].error}")
+        raise Refused(f"the map server refused: {replies[0].error}")
     for reply in replies:
         if reply.error:
             print(f"mapweave: another map server refused: {reply.error}", file=sys.stderr)

@@ -34,10 +34,10 @@ def add_to(actions: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print, draw."""
     from mapweave.commands.map_ends import ends_of, explanation_of, resolved
+    from mapweave.commands.usage import UsageError
     from mapweave.explanation_text import maps_words, pair_words
     from mapweave.extras import need
     from mapweave.hybridmap.constraint_subject import EXAMPLE
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation
     from mapweave.hybridmap.node import NodeId
     from mapweave.hybridmap.query import ExplainRequest
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
         need("viz")
     ends = ends_of(resolved(arguments, arguments.ends)) if arguments.ends else None
     if arguments.draw is not None and not (ends and all(isinstance(end, NodeId) for end in ends)):
-        raise InvalidValue(f"--draw needs two nodes: {EXAMPLE}")
+        raise UsageError(f"--draw needs two nodes: {EXAMPLE}")
     explanation = explanation_of(arguments, ExplainRequest(ends))
     values = json_values(explanation)
     if isinstance(explanation, PairExplanation):

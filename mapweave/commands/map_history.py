@@ -34,11 +34,11 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
     from mapweave.mapserver.http.json_values import json_values, time_of
 
     if arguments.most < 1:
-        raise InvalidValue(f"--most {arguments.most}: give 1 or more")
+        raise UsageError(f"--most {arguments.most}: give 1 or more")
     events = _history(arguments)
     if arguments.json:
         print(json.dumps(json_values(events)))

@@ -31,10 +31,12 @@ def add_to(actions: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Set the constraint, and print its effect."""
     from mapweave.commands.map_ends import names_of, node_of
+    from mapweave.commands.usage import arguments_read
     from mapweave.hybridmap.constraint_subject import Linked, read_pose
     from mapweave.hybridmap.named_nodes import own_ids_of
 
     a, b = map(node_of, own_ids_of(arguments.nodes, *names_of(arguments)))
-    pose = None if arguments.pose is None else read_pose(arguments.pose.split(","))
-    constrain(arguments, Linked(a, b, pose))
+    with arguments_read():
+        about = Linked(a, b, None if arguments.pose is None else read_pose(arguments.pose.split(",")))
+    constrain(arguments, about)
     return 0

@@ -31,12 +31,12 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Pin a node, take a pin out, or list them."""
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.query import ResolveRequest
 
     if arguments.node is None:
         if arguments.undo:
-            raise InvalidValue("name the node whose pin is taken out")
+            raise UsageError("name the node whose pin is taken out")
         return _list(arguments)
     fields: dict[str, Any] = {}
     if arguments.pose is not None:
@@ -72,9 +72,9 @@ def _pose(word: str) -> list[float]:
     """`12.5,-3,90` as m, m, rad.
 
     Raises:
-        InvalidValue: it is no pose.
+        UsageError: it is no pose.
     """
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.pin import FARTHEST
 
     try:
@@ -83,5 +83,5 @@ def _pose(word: str) -> list[float]:
         x = y = degrees = math.nan
     # Written so that NaN fails.
     if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and abs(degrees) <= 360.0):
-        raise InvalidValue(f"pose {word!r}: give x,y,heading, m and degrees, for example 12.5,-3,90")
+        raise UsageError(f"pose {word!r}: give x,y,heading, m and degrees, for example 12.5,-3,90")
     return [x, y, math.radians(degrees)]

@@ -45,17 +45,20 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _subject(arguments: argparse.Namespace) -> Subject:
     from mapweave.commands.map_ends import map_of, node_of, resolved
+    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.hybridmap.area import Area, read_corner
     from mapweave.hybridmap.constraint_subject import RetiredArea, read_retired, read_window
-    from mapweave.hybridmap.errors import InvalidValue
 
     in_time = bool(arguments.begin or arguments.end)
     if (arguments.area is not None) == bool(arguments.which) or (in_time and len(arguments.which) != 1):
-        raise InvalidValue("give a map or nodes, or --area; --from and --to go with one map")
+        raise UsageError("give a map or nodes, or --area; --from and --to go with one map")
     if arguments.area is not None:
         anchor, corners = arguments.area
         (node,) = map(node_of, resolved(arguments, [anchor]))
-        return RetiredArea(Area(node, tuple(map(read_corner, corners.split()))))
-    if in_time:
-        return read_window(map_of(arguments.which[0]), arguments.begin, arguments.end, time.time_ns(), None)
-    return read_retired(arguments.which)
+        with arguments_read():
+            return RetiredArea(Area(node, tuple(map(read_corner, corners.split()))))
+    with arguments_read():
+        if in_time:
+            window = arguments.begin, arguments.end, time.time_ns(), None
+            return read_window(map_of(arguments.which[0]), *window)
+        return read_retired(arguments.which)

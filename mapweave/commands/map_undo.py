@@ -25,14 +25,14 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """List, or take back."""
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.errors import Refused
     from mapweave.hybridmap.manual_constraint import event_words
     from mapweave.mapserver.http.json_values import constraint_values
 
     record = constraints_of(arguments)
     if arguments.number is not None:
         if not 1 <= arguments.number <= len(record.made):
-            raise InvalidValue(f"there is no constraint {arguments.number}: `mapweave map undo` lists them")
+            raise Refused(f"there is no constraint {arguments.number}: `mapweave map undo` lists them")
         constrain(arguments, record.made[arguments.number - 1].about)
         return 0
     if arguments.json:

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.mission_order import MissionReport
 
 STATUS = (
-    "Exit status: 0 if the robot took the mission (with --wait: has done it), 4 if it did not, 1 if it "
-    "cannot be asked."
+    "Exit status: 0 if the robot took the mission (with --wait: has done it), 4 if it did not, or the map "
+    "server refused it, 1 if neither can be asked."
 )
 
 
@@ -103,12 +103,11 @@ def fleet_of(arguments: argparse.Namespace) -> Fleet:
 
 def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -> int:
     """Give a mission, and wait for its end if that is wanted."""
-    from mapweave.hybridmap.errors import InvalidValue
-    from mapweave.hybridmap.node import check_name
+    from mapweave.commands.usage import UsageError
 
     if arguments.wait and not arguments.timeout > 0.0:
-        raise InvalidValue(f"--timeout {arguments.timeout:g}: give seconds")
-    check_name(arguments.robot)
+        raise UsageError(f"--timeout {arguments.timeout:g}: give seconds")
+    _robot(arguments)
     with fleet_of(arguments) as fleet:
         report = give(fleet)
         if arguments.wait and report.open:
@@ -120,9 +119,7 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
 
 def run_stop(arguments: argparse.Namespace) -> int:
     """Stop robots."""
-    from mapweave.hybridmap.node import check_name
-
-    robot = check_name(arguments.robot) if arguments.robot else ""
+    robot = _robot(arguments)
     with fleet_of(arguments) as fleet:
         reports = list(fleet.stop(robot))
     if not reports and not arguments.json:
@@ -133,15 +130,22 @@ def run_stop(arguments: argparse.Namespace) -> int:
 
 def run_missions(arguments: argparse.Namespace) -> int:
     """List missions."""
-    from mapweave.hybridmap.node import check_name
-
-    robot = check_name(arguments.robot) if arguments.robot else ""
+    robot = _robot(arguments)
     with fleet_of(arguments) as fleet:
         reports = list(fleet.missions(robot))
     if not reports and not arguments.json:
         print("no missions yet")
     _print(reports, arguments.json)
     return DONE
+
+
+def _robot(arguments: argparse.Namespace) -> str:
+    """The robot that is named, or none."""
+    from mapweave.commands.usage import arguments_read
+    from mapweave.hybridmap.node import check_name
+
+    with arguments_read():
+        return check_name(arguments.robot) if arguments.robot else ""
 
 
 def words(report: MissionReport) -> str:

@@ -60,13 +60,14 @@ def add_to(commands: Any) -> None:
 
 def run_add(arguments: argparse.Namespace) -> int:
     """Name a place."""
+    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.hybridmap.annotation import check_place_name
-    from mapweave.hybridmap.errors import InvalidValue
 
-    check_place_name(arguments.name)
+    with arguments_read():
+        check_place_name(arguments.name)
     fields = area_fields(arguments)
     if (arguments.where is None) == ("corners" not in fields):
-        raise InvalidValue("give a node, a position, or --corners")
+        raise UsageError("give a node, a position, or --corners")
     if arguments.where is not None:
         fields["node"] = arguments.where
     with record_of(arguments) as record:

@@ -99,8 +99,8 @@ def _add_component(parser: argparse.ArgumentParser) -> None:
 
 def run_add(arguments: argparse.Namespace) -> int:
     """Read the image, keep it, and say how it fits."""
+    from mapweave.commands.usage import UsageError
     from mapweave.formats.plan_export import plan_words
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.storage.nav2_map import SUFFIXES, read_nav2_map
     from mapweave.storage.plan_image import read_plan_file
     from mapweave.wire.typed import packed
@@ -108,12 +108,12 @@ def run_add(arguments: argparse.Namespace) -> int:
     pairs = [_pair(word) for word in arguments.pairs]
     scale = arguments.metres_per_pixel
     if scale is not None and not 0.0 < scale < math.inf:
-        raise InvalidValue(f"--metres-per-pixel {scale:g}: give metres, for example 0.05")
+        raise UsageError(f"--metres-per-pixel {scale:g}: give metres, for example 0.05")
     path = arguments.file
     fields: dict[str, Any] = {"pairs": pairs}
     if path.suffix.lower() in SUFFIXES:
         if scale is not None:
-            raise InvalidValue("--metres-per-pixel goes with an image: a map.yaml has its resolution")
+            raise UsageError("--metres-per-pixel goes with an image: a map.yaml has its resolution")
         described = read_nav2_map(path)
         fields |= {"metres_per_pixel": described.resolution, "origin": packed(described.origin)}
         kept = read_plan_file(described.image, described.negate)
@@ -134,8 +134,8 @@ def run_add(arguments: argparse.Namespace) -> int:
 
 def run_show(arguments: argparse.Namespace) -> int:
     """Print, and draw."""
+    from mapweave.commands.usage import UsageError
     from mapweave.formats.plan_export import plan_words
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.floor_plan import PlacedPlans
     from mapweave.mapserver.http.json_values import json_values
 
@@ -148,7 +148,7 @@ def run_show(arguments: argparse.Namespace) -> int:
             print("\n".join(line for placed in shown for line in plan_words(placed)) or "there is no plan")
         if arguments.picture is not None:
             if len(shown) != 1:
-                raise InvalidValue("name the plan to draw: mapweave plan show NAME -o PNG")
+                raise UsageError("name the plan to draw: mapweave plan show NAME -o PNG")
             _draw(record, shown[0], arguments)
     return 0
 
@@ -201,15 +201,15 @@ def _pair(word: str) -> dict[str, Any]:
     """`r0.1.17=412,230` as fields of an annotation.
 
     Raises:
-        InvalidValue: it is none.
+        UsageError: it is none.
     """
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import UsageError
     from mapweave.mapserver.places import position_of
 
     place, equals, pixel = word.rpartition("=")
     position = position_of(pixel) if equals and place.strip() else None
     if position is None:
-        raise InvalidValue(f"--pair {word}: write {PAIR}")
+        raise UsageError(f"--pair {word}: write {PAIR}")
     return {"at": place.strip(), "u": position[0], "v": position[1]}
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from mapweave import Fleet
 from mapweave.cli import main
+from mapweave.exit_status import NO
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.constraint_subject import Linked, RetiredArea, RetiredNodes
@@ -238,7 +239,7 @@ def test_a_closure_of_an_edge_that_is_none_is_refused_and_others_say_how_much_th
     path = tmp_path / "both.mapweave"
     small.fleet.save(path)
     capfd.readouterr()
-    assert main(["close", "a.1.1", "b.1.5", "--map", str(path)]) == 1
+    assert main(["close", "a.1.1", "b.1.5", "--map", str(path)]) == NO
     assert capfd.readouterr().err.startswith("mapweave: no edge joins a.1.1 and b.1.5 (")
     assert main(["close", "a.1.1", "a.1.3", "--map", str(path)]) == 0
     assert re.search(r"; it closes \d+ ways? of robots$", capfd.readouterr().out.strip())

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
+from mapweave.exit_status import NO, USAGE
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
@@ -277,14 +278,17 @@ def test_places_of_a_map_file_from_the_shell(
     assert status == 0 and json.loads(out)["start"] == "r0.1.3"
     assert "r0.1.3" in run("map", "explain", "kitchen", "r0.1.9")[1]
     assert run("map", "route", "kitschen", "r0.1.9") == (
-        1, "", "mapweave: 'kitschen' is no place of this map (is it kitchen?): give a node (r0.1.17), the "
+        NO, "", "mapweave: 'kitschen' is no place of this map (is it kitchen?): give a node (r0.1.17), the "
         "name of a place, or a position in the merged map (3.1,-2.0)\n",
     )  # fmt: skip
     for wrong in (["add", "x"], ["add", "x", "r0.1.3", "--corners", "0,0"], ["add", "r0.1", "r0.1.3"],
                   ["add", "x", "r0.1.3", "--radius", "-1"], ["add", "x", "--corners", "0,0", "1,0"],
-                  ["remove", "attic"]):  # fmt: skip
+                  ["add", "x", "r0.1.3", "--radius", "nan"]):  # fmt: skip
         status, _, err = run("place", *wrong)
-        assert status == 1 and err.count("\n") == 1, wrong
+        assert status == USAGE and err.count("\n") == 1, wrong
+    for refused in (["remove", "attic"], ["add", "x", "r0.1.99"]):
+        status, _, err = run("place", *refused)
+        assert status == NO and err.count("\n") == 1, refused
     assert main(["place", "remove", "hall", "--map", str(path), "-o", str(other)]) == 0
     assert [one.name for one in read_map_file(other).annotations] == ["kitchen", "hall", "cube", "hall"]
     assert len(read_map_file(path).annotations) == 3, "the first file is as it was"

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
+from mapweave.exit_status import FAILED, NO, USAGE
 from mapweave.fleet import Fleet, login
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import PIECE, PlanPiece
@@ -268,30 +269,35 @@ def test_plans_and_pins_of_a_map_file_from_the_shell(
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    ("words", "reason", "status"),
     [
-        (["plan", "add", "none.png", "--pair", "r0.1.3=1,2"], "cannot be read"),
-        (["plan", "add", "none.yaml", "--pair", "r0.1.3=1,2"], "cannot be read"),
-        (["plan", "add", "none.png", "--pair", "r0.1.3"], "write r0.1.17=412,230"),
-        (["plan", "add", "none.png", "--pair", "=1,2"], "write r0.1.17=412,230"),
+        (["plan", "add", "none.png", "--pair", "r0.1.3=1,2"], "cannot be read", FAILED),
+        (["plan", "add", "none.yaml", "--pair", "r0.1.3=1,2"], "cannot be read", FAILED),
+        (["plan", "add", "none.png", "--pair", "r0.1.3"], "write r0.1.17=412,230", USAGE),
+        (["plan", "add", "none.png", "--pair", "=1,2"], "write r0.1.17=412,230", USAGE),
         (
             ["plan", "add", "none.yaml", "--pair", "r0.1.3=1,2", "--metres-per-pixel", "0.1"],
             "has its resolution",
+            USAGE,
         ),
-        (["plan", "add", "none.png", "--pair", "r0.1.3=1,2", "--metres-per-pixel", "-1"], "give metres"),
-        (["plan", "export", "none", "--format", "tf"], "there is no plan 'none'"),
-        (["map", "pin", "r0.1.3", "1,2"], "give x,y,heading"),
-        (["map", "pin", "r0.1.3", "nan,2,3"], "give x,y,heading"),
-        (["map", "pin", "--undo"], "name the node"),
+        (
+            ["plan", "add", "none.png", "--pair", "r0.1.3=1,2", "--metres-per-pixel", "-1"],
+            "give metres",
+            USAGE,
+        ),
+        (["plan", "export", "none", "--format", "tf"], "there is no plan 'none'", NO),
+        (["map", "pin", "r0.1.3", "1,2"], "give x,y,heading", USAGE),
+        (["map", "pin", "r0.1.3", "nan,2,3"], "give x,y,heading", USAGE),
+        (["map", "pin", "--undo"], "name the node", USAGE),
     ],
 )
 def test_mistakes_are_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], reason: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], reason: str, status: int
 ) -> None:
     path = tmp_path / "room.mapweave"
     write_map_file(path, map_file_of(two_maps()))
     before = path.read_bytes()
-    status = main([*words, "--map", str(path)])
+    assert main([*words, "--map", str(path)]) == status
     out, err = capsys.readouterr()
-    assert (status, out, err.count("\n")) == (1, "", 1) and reason in err
+    assert (out, err.count("\n")) == ("", 1) and reason in err
     assert path.read_bytes() == before

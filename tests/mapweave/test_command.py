@@ -16,7 +16,7 @@ from rich.console import Console
 from mapweave.cli import main
 from mapweave.commands import status as status_command
 from mapweave.commands.status import COLUMNS, SPARE, cells, table
-from mapweave.exit_status import INTERRUPTED, NO
+from mapweave.exit_status import INTERRUPTED, NO, USAGE
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.errors import NotConnected
@@ -111,8 +111,11 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
 
             assert shell("map", "fetch", str(tmp_path / "m.mapweave"))[0] == 0
             assert len(read_map_file(tmp_path / "m.mapweave", "merged").poses) >= 2
-            assert "there is no robot r9; there are: r0" in complaint(capfd, "missions", "r9", *network)
-            assert "r0.7.1 is not in the merged map" in complaint(capfd, "go", "r0", "r0.7.1", *network)
+            refused = complaint(capfd, "missions", "r9", *network, status=NO)
+            assert "there is no robot r9; there are: r0" in refused
+            refused = complaint(capfd, "go", "r0", "r0.7.1", *network, status=NO)
+            assert "r0.7.1 is not in the merged map" in refused
+            complaint(capfd, "go", "r.0", "r0.7.1", *network, status=USAGE)
             code, printed = shell("go", "r0", "r0.1.999")
             assert code == NO and "refused: there is no node r0.1.999" in printed
             code, printed = shell("status")

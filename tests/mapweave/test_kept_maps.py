@@ -20,6 +20,7 @@ from mapweave.agent.replication import salvage
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
+from mapweave.exit_status import USAGE
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import InvalidFile
@@ -229,7 +230,7 @@ def test_what_is_left_of_a_damaged_journal_is_extracted_and_the_agent_says_how(t
     path = tmp_path / "r0.sqlite"
     journal = Journal(path, "r0")
     map_id, (put,) = journal.open_map(1), one_node()
-    nodes = [replace(put, node=replace(put.node, id=NodeId("r0", 1, k))) for k in range(1, 2001)]
+    nodes = [replace(put, node=replace(put.node, id=NodeId("r0", 1, k))) for k in range(1, 601)]
     journal.append(map_id, nodes, 0)
     journal.close()
     data = bytearray(path.read_bytes())
@@ -248,7 +249,7 @@ def test_what_is_left_of_a_damaged_journal_is_extracted_and_the_agent_says_how(t
     assert f"mapweave: {path} had pages that cannot be read" in capfd.readouterr().err
     assert path.read_bytes() == data, "the file is not changed"
     left = HybridMap(read_map_file(tmp_path / "out" / "r0.1.mapweave", "agent").changes)
-    missing = sorted(set(range(1, 2001)) - {node.number for node in left.nodes})
+    missing = sorted(set(range(1, 601)) - {node.number for node in left.nodes})
     runs = [a for a, b in zip(missing, [*missing[1:], 0], strict=True) if b != a + 1]
     assert len(runs) == 2 and len(missing) < 100
 
@@ -312,7 +313,7 @@ def test_a_journal_of_which_nothing_can_be_read_is_one_line(tmp_path, capfd):
 
 def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, closed, simulator):
     arguments = "agent", "r0", "--connect", closed, "--data", tmp_path, "--resume"
-    assert complaint(capfd, *arguments, "foo") == (
+    assert complaint(capfd, *arguments, "foo", status=USAGE) == (
         "mapweave: 'foo' is no map: write it as r0.1, the robot and the map's number"
     )
     output = complaint(capfd, *arguments, "r0.3")

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
-from mapweave.exit_status import NO
+from mapweave.exit_status import NO, USAGE
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.map_files import merged_of
@@ -144,7 +144,7 @@ def test_a_route_is_explained(
     out, err = capfd.readouterr()
     assert f"{none} is not drawn: there is no way" in err and not none.exists()
     assert "there is no way: " in out and "r0.1 and r2.1 are not one map" in out
-    assert main(["map", "route", "r0.1", "r2.1.1", "--map", str(files[3])]) == 1
+    assert main(["map", "route", "r0.1", "r2.1.1", "--map", str(files[3])]) == USAGE
     assert "r0.1 is a map: give one of its nodes" in capfd.readouterr().err
 
 
@@ -213,7 +213,7 @@ def test_linking_in_a_file_and_taking_it_back(
     path = tmp_path / "m.mapweave"
     path.write_bytes(files[3].read_bytes())
     wrong = ["map", "link", "r0.1.1", "r2.1.3", "--map", str(path)]
-    assert main(wrong) == 1
+    assert main(wrong) == NO
     assert "do not show one place: " in capfd.readouterr().err
     by_hand = [*wrong, "--pose=-1,0.5,90", "--because", "the same door", "--by", "anna"]
     only_checked = "only checked, nothing is changed: r0.1.1 and r2.1.3: linked by hand by anna"
@@ -237,45 +237,47 @@ def test_linking_in_a_file_and_taking_it_back(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "words", "status"),
     [
-        (["explain", "r0.1.1"], "give two nodes or two maps, not 1"),
-        (["explain", "r0.1.1", "r1.1"], "are a node and a map"),
-        (["explain", "here", "there"], "'here' is no place of this map"),
-        (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
+        (["explain", "r0.1.1"], "give two nodes or two maps, not 1", USAGE),
+        (["explain", "r0.1.1", "r1.1"], "are a node and a map", USAGE),
+        (["explain", "here", "there"], "'here' is no place of this map", NO),
+        (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
         (
             ["explain", "r0.1.1", "r1.1.2"],
             "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
+            NO,
         ),
-        (["explain", "r0.1", "r1.1", "--draw", "x.png"], "--draw needs two nodes"),
-        (["explain", "--draw", "x.png"], "--draw needs two nodes"),
-        (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo"),
-        (["unmerge", "r0.1.3", "r0.1.1"], "joined by their robot's way (edge r0.1.2, "),
-        (["unmerge", "r0.1", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
+        (["explain", "r0.1", "r1.1", "--draw", "x.png"], "--draw needs two nodes", USAGE),
+        (["explain", "--draw", "x.png"], "--draw needs two nodes", USAGE),
+        (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo", NO),
+        (["unmerge", "r0.1.3", "r0.1.1"], "joined by their robot's way (edge r0.1.2, ", NO),
+        (["unmerge", "r0.1", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
         (
             ["unmerge", "r0.1.1", "r1.1.2"],
             "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
+            NO,
         ),
-        (["unmerge", "r0.1", "r0.1"], "two different maps"),
-        (["retire", "r0.1", "r0.1.1"], "give one map (r0.1), or nodes"),
-        (["retire", "r0.1.99"], "map r0.1 has no node 99"),
-        (["retire", "--area", "r0.1.1", "0,0 1,0"], "3 to 64 corners"),
-        (["retire", "r0.1.1", "--from", "7"], "r0.1.1 is a node: give its map, r0.1"),
-        (["link", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2"),
-        (["link", "r0.1.1", "r2.1.1", "--undo"], "r0.1.1 and r2.1.1 are not linked by hand"),
-        (["undo", "7"], "there is no constraint 7"),
-        (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
-        (["retire", "r0.1", "--undo"], "map r0.1 is not retired"),
-        (["unmerge", "r0.1", "r1.1", "--undo"], "no manual constraint keeps r0.1 and r1.1 apart"),
-        (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line"),
+        (["unmerge", "r0.1", "r0.1"], "two different maps", USAGE),
+        (["retire", "r0.1", "r0.1.1"], "give one map (r0.1), or nodes", USAGE),
+        (["retire", "r0.1.99"], "map r0.1 has no node 99", NO),
+        (["retire", "--area", "r0.1.1", "0,0 1,0"], "3 to 64 corners", USAGE),
+        (["retire", "r0.1.1", "--from", "7"], "r0.1.1 is a node: give its map, r0.1", USAGE),
+        (["link", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2", NO),
+        (["link", "r0.1.1", "r2.1.1", "--undo"], "r0.1.1 and r2.1.1 are not linked by hand", NO),
+        (["undo", "7"], "there is no constraint 7", NO),
+        (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
+        (["retire", "r0.1", "--undo"], "map r0.1 is not retired", NO),
+        (["unmerge", "r0.1", "r1.1", "--undo"], "no manual constraint keeps r0.1 and r1.1 apart", NO),
+        (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line", USAGE),
     ],
 )
 def test_bad_input_is_reported_in_one_line(
-    files: list[Path], capfd: pytest.CaptureFixture[str], arguments: list[str], words: str
+    files: list[Path], capfd: pytest.CaptureFixture[str], arguments: list[str], words: str, status: int
 ) -> None:
     before = files[3].read_bytes()
     capfd.readouterr()
-    assert main(["map", *arguments, "--map", str(files[3])]) == 1
+    assert main(["map", *arguments, "--map", str(files[3])]) == status
     out, err = capfd.readouterr()
     assert out == "" and len(err.splitlines()) == 1 and words in err
     assert files[3].read_bytes() == before and not Path("x.png").exists()
@@ -317,7 +319,7 @@ def test_mismatched_files_are_reported_in_one_line(
     out = tmp_path / "m.mapweave"
     assert main(["map", "unmerge", "r0.1", "r1.1", "--map", str(files[0])]) == 1
     assert "of kind agent, not merged" in capfd.readouterr().err
-    assert main(["map", "unmerge", "r0.1", "r1.1", "-o", str(out)]) == 1
+    assert main(["map", "unmerge", "r0.1", "r1.1", "-o", str(out)]) == USAGE
     assert "--out goes with --map" in capfd.readouterr().err
 
 

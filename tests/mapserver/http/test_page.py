@@ -161,7 +161,7 @@ def test_labels_do_not_lie_on_each_other(
     assert all({f"r{k}", f"r{k}: driving"} & set(texts) for k in range(robots))
 
 
-def test_a_browser_that_cannot_draw_is_told(page: Browser) -> None:
+def test_a_browser_that_cannot_draw_says_so(page: Browser) -> None:
     assert page.run("return document.getElementById('undrawn').hidden")
     page.run("mapweave.painter.worker.dispatchEvent(new ErrorEvent('error'))")
     assert "cannot draw the map" in page.run("return document.querySelector('#map [role=alert]').innerText")
