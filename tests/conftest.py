@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 
@@ -22,8 +23,8 @@ pytest.register_assert_rewrite(
     "tests.waiting", "tests.postgres", "tests.mapweave.command_line", "tests.sim.measured_world"
 )
 
-# The duration of an example means nothing on a busy machine.
-settings.register_profile("patient", deadline=None)
+# The duration of an example means nothing on a busy machine. Other examples are drawn in each run.
+settings.register_profile("patient", deadline=None, max_examples=50)
 settings.load_profile("patient")
 cv2.setNumThreads(1)
 
@@ -33,6 +34,14 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 pytest_plugins = ["tests.postgres"]
+
+# All that is imported and collected stays: to look for what does not takes each process a second.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.enable()
+
 
 if not INSTALLED:
     sys.meta_path.insert(0, SkipWithoutSimulator())
