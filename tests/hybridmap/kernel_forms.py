@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 import pytest
 
@@ -19,7 +20,11 @@ def in_numpy() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(params=["numba", "numpy"], scope="module")
+# NumPy's form is slower; test_kernel_forms.py and test_landmark_codec.py compare both in any case.
+NUMPY = pytest.param("numpy", marks=[pytest.mark.slow] if find_spec("numba") else [])
+
+
+@pytest.fixture(params=["numba", NUMPY], scope="module")
 def form(request: pytest.FixtureRequest) -> Iterator[str]:
     """Either form, for all tests of a module that uses it."""
     if request.param == "numba":
