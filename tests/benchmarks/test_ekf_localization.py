@@ -44,6 +44,7 @@ def test_a_start_is_judged_from_its_nineteenth_step_on() -> None:
     assert not late.converged
 
 
+@pytest.mark.slow
 def test_driving_again_makes_the_map_better() -> None:
     kept = [try_drives(np.random.default_rng([35, k]), 3, steps=60) for k in range(5)]
     errors = np.median([[place.error for place in places] for places in kept], axis=0)

@@ -42,6 +42,7 @@ def test_the_period_of_statuses_grows_with_the_number_of_robots(robots: int, per
         eventually(lambda: roster.status_period() == 0.0)
 
 
+@pytest.mark.slow
 def test_one_answer_holds_all_robots_whatever_they_do() -> None:
     node = NodeId("r0", 1, 3)
     wait = PortalWait(PortalStop("lift", PortalMeans.LIFT, node, node._replace(number=4)))

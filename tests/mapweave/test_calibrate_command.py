@@ -98,6 +98,7 @@ def test_a_robot_is_watched_while_it_is_driven(
     assert "too short" in complaint(capfd, "calibrate", "drive", *given[:-1], 3)
 
 
+@pytest.mark.slow
 def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     command = ["calibrate", "drive", folder, "--calibration", tmp_path]
     assert "--robot DRIVER" in complaint(capfd, "calibrate", "drive")

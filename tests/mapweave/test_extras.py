@@ -183,6 +183,7 @@ def test_without_extras_a_command_works_or_names_what_it_needs(filled: dict[str,
             assert status == MISSING_EXTRA, what
 
 
+@pytest.mark.slow
 def test_each_extra_is_enough_for_its_commands(filled: dict[str, object]) -> None:
     """With the server's libraries alone every command works that asks for no more."""
     lines = [f"{command} {arguments}".format(**filled) for command, arguments, words in CASES

@@ -161,6 +161,7 @@ def test_commands_that_change_a_map_refuse_stores_and_journals(
         copy.unlink()
 
 
+@pytest.mark.slow
 def test_a_store_whose_server_was_killed_is_read_with_its_last_commits(tmp_path: Path) -> None:
     path = tmp_path / "s0.sqlite"
     code = (

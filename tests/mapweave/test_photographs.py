@@ -122,6 +122,7 @@ def test_an_invalid_stretch_is_reported_in_one_line(stretch, tmp_path: Path, cap
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_a_walk_is_repeatable_and_keeps_clear() -> None:
     world = world_from_table({"kind": "office", "rooms": 2}, 4, Path())
     first, again = (walk(world, PHONE, 4, 0.5, 9) for _ in range(2))

@@ -112,6 +112,7 @@ def test_a_lost_robot_gets_the_place_but_not_the_distance(video, made: Path) -> 
     assert np.median(errors) < 0.15 and max(errors) < 0.8, "right but for the scale"
 
 
+@pytest.mark.slow
 def test_the_same_video_gives_the_same_map(video, made: Path, tmp_path: Path) -> None:
     path, _ = video
     (again,) = replayed(path, path.with_name("camera.toml"), tmp_path)

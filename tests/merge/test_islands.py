@@ -74,7 +74,8 @@ def test_joint_decisions_agree_with_a_fresh_merge(
             assert contents(merged) == contents(life.rebuilt())
 
 
-@pytest.mark.parametrize("seed", first_quick([43, 44, 45], 1))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [43, 44, 45])
 def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is ever decided again here, and few nodes are moved at a time."""
     monkeypatch.setattr(islands_module, "CHANGED", math.inf)
@@ -117,7 +118,8 @@ def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int
     assert links > 15 and apart <= 0.1 * links
 
 
-@pytest.mark.parametrize("exact", first_quick([0, 600], 1))
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [0, 600])
 def test_links_by_hand_and_retired_nodes_hold_in_whatever_order_all_comes(exact: int) -> None:
     """Small islands against a merge from nothing; large ones in what no order may change."""
     life, islands = Life(51, 0.3), Islands(exact=exact)
@@ -159,6 +161,7 @@ def test_all_is_decided_together_now_and_then_only(monkeypatch: pytest.MonkeyPat
     assert times == [False]
 
 
+@pytest.mark.slow
 def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(component_solver, "WHOLE", 0)
     monkeypatch.setattr(component_solver, "LEAST", 12)

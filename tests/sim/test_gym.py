@@ -17,11 +17,12 @@ from gymnasium.utils.env_checker import check_env
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.gym import MapweaveEnv
+from tests.quick import first_quick
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-@pytest.mark.parametrize("name", ["ten_lines", "gym_random"])
+@pytest.mark.parametrize("name", first_quick(["ten_lines", "gym_random"], 1))
 def test_examples_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """As they stand."""
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")

@@ -33,6 +33,7 @@ SCALE = 0.02
 PLAN_FROM_MERGED = Pose2(4.0, 4.0, 0.4)
 
 
+@pytest.mark.slow
 def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, tmp_path: Path) -> None:
     port, stack = free_port(), ExitStack()
     stack.enter_context(Web(("127.0.0.1", port), server))

@@ -43,6 +43,7 @@ fetch("constraints", { method: "POST", headers: { "Content-Type": "application/j
 """
 
 
+@pytest.mark.slow
 def test_a_viewer_looks_and_an_operator_commands(
     mapped_room: Callable[[], MappedRoom], tmp_path: Path
 ) -> None:

@@ -186,6 +186,7 @@ def test_decisions_on_one_server_reach_the_other(
     assert content_hash(open_map(address).content) == before
 
 
+@pytest.mark.slow
 def test_robots_keep_what_they_have_while_postgresql_is_away(journals: list[Journal]) -> None:
     """Also a robot that the server has not known before."""
     servers = started()

@@ -78,6 +78,7 @@ def test_everything_is_there_and_nothing_half_written(written):
     assert set(merged.nodes) == set(HybridMap(recording.merged.changes).nodes)
 
 
+@pytest.mark.slow
 def test_evo_reads_the_trajectories_and_finds_the_same_errors(written, tmp_path):
     out, _, figures = written
     files = ("r1.truth.tum", "r1.map-1.tum")

@@ -18,7 +18,6 @@ from mapweave.merge.mutual_exclusion.exclusion import chances_clear, clash_of
 from mapweave.merge.mutual_exclusion.trajectories import RobotTrajectory, trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ExclusionSettings
-from tests.quick import first_quick
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 
@@ -235,7 +234,8 @@ def test_robots_that_meet_closely_are_not_refused(
     assert clash_of(graph(a, b, rng, sigma=sigma), first, second) is None
 
 
-@pytest.mark.parametrize("segments", first_quick([False, True], 1))
+@pytest.mark.slow
+@pytest.mark.parametrize("segments", [False, True])
 def test_robots_that_nearly_touch_rarely_count_as_collisions(segments: bool) -> None:
     """The bound holds even for footprints exactly as small as supposed: here at 0.2 m, with loose doubt."""
     s = ExclusionSettings(doubt=0.1, least_moments=1)

@@ -22,7 +22,6 @@ from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInter
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
-from tests.quick import first_quick
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 RADIUS = 0.16
@@ -134,7 +133,8 @@ def chain(share: float = 1.0, n: int = 8) -> PoseGraph:
     return solve_graph(a[0], Pose2(), [*way, Measurement(a[0], b[0], across)])
 
 
-@pytest.mark.parametrize("on_the_way", first_quick([1.0, 0.0], 1))
+@pytest.mark.slow
+@pytest.mark.parametrize("on_the_way", [1.0, 0.0])
 def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
     """Both look at each other; what each would see is computed from poses that are drawn."""
     rng = np.random.default_rng(2)
