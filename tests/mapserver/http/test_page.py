@@ -165,3 +165,19 @@ def test_a_browser_that_cannot_draw_says_so(page: Browser) -> None:
     assert page.run("return document.getElementById('undrawn').hidden")
     page.run("mapweave.painter.worker.dispatchEvent(new ErrorEvent('error'))")
     assert "cannot draw the map" in page.run("return document.querySelector('#map [role=alert]').innerText")
+
+
+def test_fingers_hit_every_button(page: Browser, services: StubServices) -> None:
+    services.fleet = FleetStatus((RobotEntry("r0", True),))
+    page.look(390, 844, mobile=True)
+    try:
+        eventually(lambda: page.run("return document.querySelectorAll('#robots button').length"))
+        small = page.run("""
+            return [...document.querySelectorAll("button, a, select, input")].filter(one => {
+              const { width, height } = one.getBoundingClientRect();
+              return width && (width < 24 || height < 24);
+            }).map(one => one.outerHTML)
+        """)
+    finally:
+        page.look(420, 800)
+    assert small == []
