@@ -15,7 +15,10 @@ MAX_STARTS = 8
 MAX_NEARBY = 16
 """Robots in one answer, nearest first: more do not stand around one robot."""
 
-Size = Annotated[float, Meta(ge=0.0, le=100.0)]
+Size = Annotated[float, Meta(ge=0.0, le=5.0)]
+"""m, of a robot that drives indoors."""
+Sigma = Annotated[float, Meta(ge=0.0, le=100.0)]
+"""m or rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +38,8 @@ class NearbyRequest:
 
     robot: Name
     starts: Annotated[tuple[tuple[NodeId, Pose2], ...], Meta(max_length=MAX_STARTS)]
-    sigma: Size
-    heading_sigma: Size
+    sigma: Sigma
+    heading_sigma: Sigma
     radius: Size
     height: Size
     speed: Annotated[float, Meta(ge=0.0, le=1000.0)]

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
+from itertools import accumulate
 from typing import TypeVar
 
 from mapweave.hybridmap.annotation import Annotations
@@ -97,9 +98,13 @@ class ConstraintRecord:
                 log.error("a manual constraint cannot be read (%s); it is left out", error)
         if not self._base.constraints.made:
             return ManualConstraints(made)
-        # By date only where there are two records: clocks differ, and one record is in order.
-        both = dict.fromkeys((*self._base.constraints.made, *made))
-        return ManualConstraints(sorted(both, key=lambda one: one.stamp_ns))
+        # By date only where there are two records, each of which is in order: clocks differ, and what comes
+        # behind a constraint of far ahead may take it back.
+        dated: dict[ManualConstraint, int] = {}
+        for record in (self._base.constraints.made, made):
+            latest = accumulate((one.stamp_ns for one in record), max)
+            dated |= {one: at for one, at in zip(record, latest, strict=True) if one not in dated}
+        return ManualConstraints(sorted(dated, key=lambda one: dated[one]))
 
 
 class Explainer:

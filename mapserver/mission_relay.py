@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from mapweave.hybridmap.agent_status import AgentStatus
@@ -31,7 +32,8 @@ from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.roster import Roster
-from mapweave.wire.bus import Bus
+from mapweave.wire.bus import Bus, Reply
+from mapweave.wire.each_robot import in_parallel
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
@@ -44,6 +46,8 @@ ANSWER = 2.0
 """How long a robot may take to acknowledge, s."""
 EXPIRY = 600.0
 """A robot that is away for longer does not get a mission of before, s: it would drive off unexpectedly."""
+MOST_AHEAD = 86_400.0
+"""By which a mission may be given ahead of the server's clock, s: none comes behind the greatest stamp."""
 EVERY = 1.0
 """Time between two attempts, s."""
 
@@ -104,10 +108,15 @@ class MissionRelay:
         """Hand a mission on to its robot; returns what has become of it. It waits for the robot's answer.
 
         Raises:
-            InvalidValue: there is no such robot.
+            InvalidValue: there is no such robot, or the mission is of a time that is far ahead.
         """
         with self._turn:
             known = self._reports.get(_key(request))
+        # In lock-step the server's time is the simulator's, and a person's is not.
+        ahead = (request.stamp_ns - max(self._time_ns(), time.time_ns())) * 1e-9
+        if known is None and ahead > MOST_AHEAD:
+            days = f"{ahead / 86_400:.0f} days"
+            raise InvalidValue(f"mission {request.id} is given {days} ahead of the server's clock")
         if known is not None and known.state is not MissionState.SENT:
             return known
         if known is None:
@@ -163,13 +172,17 @@ class MissionRelay:
         """Try to hand on what robots could not be reached for."""
         with self._turn:
             waiting = [report for report in self._reports.values() if report.state is MissionState.SENT]
+        orders: list[MissionOrder] = []
         for report in waiting:
             robot, age = report.order.robot, (self._time_ns() - report.order.stamp_ns) * 1e-9
             if age > EXPIRY:
                 reason = f"{robot} did not answer within {EXPIRY:g} s"
                 self._note(replace(report, state=MissionState.FAILED, reason=reason))
             elif self.roster is not None and self.roster.alive(robot):
-                self._hand_on(report.order)
+                orders.append(report.order)
+        # All at once: one that hangs keeps no other from its mission.
+        for order, replies in zip(orders, in_parallel(orders, self._give), strict=True):
+            self._answered(order, replies)
 
     def _resolved(self, request: MissionRequest) -> MissionReport:
         """The mission as the robot gets it, or refused."""
@@ -203,7 +216,13 @@ class MissionRelay:
             self._note(replace(report, state=MissionState.REPLACED, reason=reason))
 
     def _hand_on(self, order: MissionOrder) -> MissionReport:
-        replies = self._bus.ask(self._keys.mission(order.robot), encode(order), ANSWER)
+        return self._answered(order, self._give(order))
+
+    def _give(self, order: MissionOrder) -> Sequence[Reply]:
+        return self._bus.ask(self._keys.mission(order.robot), encode(order), ANSWER)
+
+    def _answered(self, order: MissionOrder, replies: Sequence[Reply]) -> MissionReport:
+        """Note what a robot has answered to an order; no reply: it may be away."""
         for reply in replies:
             if reply.error:
                 return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reply.error))

@@ -20,6 +20,10 @@ from mapweave.hybridmap.errors import SettingsError
 from mapweave.storage.atomic_file import read_whole
 
 T = TypeVar("T")
+MOST_PARTS = 64
+"""Of a key with dots: the parser takes a time that grows with the square of their number."""
+_PART = r"""(?>[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*"""
+MANY_PARTS = re.compile(rf"(?:{_PART}\.[ \t]*){{{MOST_PARTS - 1}}}{_PART}")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -30,7 +34,10 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     try:
         # Editors of Windows begin a file with an invisible mark.
-        return tomllib.loads(read_whole(path).decode("utf-8-sig"))
+        text = read_whole(path).decode("utf-8-sig")
+        if MANY_PARTS.search(text):
+            raise SettingsError(f"{path}: a key has {MOST_PARTS} parts with dots between them, or more")
+        return tomllib.loads(text)
     except FileNotFoundError:
         raise SettingsError(f"{path}: no such file") from None
     except OSError as error:

@@ -30,7 +30,7 @@ from mapweave.wire.pose_codec import MAX_MEASURED, pack_camera, pack_pose, unpac
 from mapweave.wire.range_codec import pack_ranges, unpack_ranges
 from mapweave.wire.trajectory_codec import MAX_SEGMENT_BYTES, pack_trajectory, unpack_trajectory
 
-MAX_RADIUS_MM = 100_000
+MAX_RADIUS_MM = 5000
 MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + MAX_SEGMENT_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 BODY = Limit("change", MAX_BODY_BYTES)

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from mapweave.hybridmap.errors import MapweaveError, NotConnected
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 AT_ONCE = 64
@@ -24,19 +25,27 @@ def each_robot(robots: Sequence[str], ask: Callable[[str], T]) -> list[T]:
     Raises:
         NotConnected: some do not answer, or not with what was asked; all others have been asked.
     """
-    if not robots:
-        return []
-    with ThreadPoolExecutor(min(len(robots), AT_ONCE), thread_name_prefix="robot") as threads:
-        asked = [threads.submit(ask, robot) for robot in robots]
     answers, errors = [], []
-    for robot, done in zip(robots, asked, strict=True):
-        error = done.exception()
-        if error is None:
-            answers.append(done.result())
-        elif isinstance(error, MapweaveError):
-            errors.append(str(error) if robot in str(error) else f"{robot}: {error}")
+
+    def guarded(robot: str) -> T | MapweaveError:
+        try:
+            return ask(robot)
+        except MapweaveError as error:
+            return error
+
+    for robot, answer in zip(robots, in_parallel(robots, guarded), strict=True):
+        if isinstance(answer, MapweaveError):
+            errors.append(str(answer) if robot in str(answer) else f"{robot}: {answer}")
         else:
-            raise error
+            answers.append(answer)
     if errors:
         raise NotConnected("; ".join(errors))
     return answers
+
+
+def in_parallel(asked: Sequence[S], ask: Callable[[S], T]) -> list[T]:
+    """What `ask` returns for each, in order; it is called in several threads."""
+    if not asked:
+        return []
+    with ThreadPoolExecutor(min(len(asked), AT_ONCE), thread_name_prefix="robot") as threads:
+        return list(threads.map(ask, asked))

@@ -22,10 +22,12 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     Standing,
 )
-from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
+from mapweave.hybridmap.limits import MAX_STAMP_NS
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
+from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import map_file_of, merged_of
@@ -298,4 +300,18 @@ def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.L
     ConstraintRecord(store).add(ManualConstraint(Apart((MapId("r0", 1), MapId("r1", 1))), True, "anna", 5))
     assert [constraint.who for constraint in ConstraintRecord(store).constraints.made] == ["anna"]
     assert "a manual constraint cannot be read" in caplog.text
+    store.close()
+
+
+def test_beside_a_base_map_a_constraint_of_far_ahead_can_be_taken_back(path: Path) -> None:
+    """Records are joined by date; each stays in its own order."""
+    pairs = [Apart((MapId("r0", 1), MapId(f"r{number}", 1))) for number in (1, 2, 3)]
+    base = BaseMap(constraints=ManualConstraints([ManualConstraint(pairs[0], True, "ben", 3)]))
+    store = SqliteStore(path)
+    record = ConstraintRecord(store, base)
+    for pair, holds, stamp_ns in ((pairs[1], True, 2), (pairs[2], True, MAX_STAMP_NS), (pairs[2], False, 5)):
+        record.add(ManualConstraint(pair, holds, "anna", stamp_ns))
+    record = ConstraintRecord(store, base)
+    wanted = [("anna", 2, True), ("ben", 3, True), ("anna", MAX_STAMP_NS, True), ("anna", 5, False)]
+    assert [(one.who, one.stamp_ns, one.holds) for one in record.constraints.made] == wanted
     store.close()

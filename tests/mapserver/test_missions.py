@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -13,7 +14,15 @@ from mapweave import fleet
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.limits import MAX_STAMP_NS
-from mapweave.hybridmap.mission_order import MAX_KEPT, MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.mission_order import (
+    MAX_KEPT,
+    MissionKind,
+    MissionOrder,
+    MissionReport,
+    MissionRequest,
+    MissionState,
+    new_id,
+)
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
@@ -238,6 +247,49 @@ def test_no_robot_keeps_others_from_being_stopped(
     over.set()
     stopping.join()
     assert ("a1" if by_http else "a0") in errors[0]
+    link.close()
+
+
+def test_robots_that_hang_keep_no_other_from_a_mission_that_waits(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their own time to answer is waited for once, and not once for each of them."""
+    monkeypatch.setattr(mission_relay, "ANSWER", 0.2)
+    over, bus = threading.Event(), house.bus()
+    names = [f"a{number}" for number in range(5)]
+    for name in names:
+        bus.publish(KEYS.agent_status(name), encode(standing(name)))
+        eventually(lambda name=name: house.entry(name).status is not None)
+        assert house.person.explore(name).state is MissionState.SENT
+    link, _ = house.robot()
+    link.close()
+    eventually(lambda: not house.entry("r0").alive)
+    house.person.explore("r0")
+    monkeypatch.setattr(mission_relay, "ANSWER", 5.0)
+    for name in names:
+        other = house.bus()
+        other.serve(KEYS.mission(name), lambda request: (over.wait(60.0), request.reply(b"?")))
+        other.announce(KEYS.agent_alive(MapId(name, 1)))
+    eventually(lambda: all(house.entry(name).alive for name in names))
+    link, control = house.robot()
+    eventually(lambda: control.report is not None, 20.0)
+    over.set()
+    link.close()
+
+
+def standing(robot: str) -> AgentStatus:
+    return AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, robot, 1)
+
+
+def test_a_mission_of_far_ahead_is_refused(house: House) -> None:
+    """Behind the greatest stamp no order could come, not even to stop."""
+    link, control = house.robot()
+    for stamp_ns in (MAX_STAMP_NS, time.time_ns() + 2 * 86_400 * 10**9):
+        request = MissionRequest(new_id(), "r0", MissionKind.EXPLORE, stamp_ns, "eve")
+        with pytest.raises(InvalidValue, match=r"days ahead of the server's clock"):
+            house.server.command(request)
+    assert control.report is None and house.person.missions() == ()
+    assert house.person.explore("r0").state is MissionState.RUNNING
     link.close()
 
 

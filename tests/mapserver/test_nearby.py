@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.nearby import MAX_NEARBY, NearbyAnswer, NearbyRequest
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.nearby import CELL, KEPT, MAP_SIGMA, Nearby
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.messages import decode, encode
 from tests.agent.scripted_fleet import bare
 
 EXACT = np.diag([1e-4, 1e-4, 1e-4])
@@ -140,3 +142,12 @@ def test_a_robot_has_left_once_it_is_known_elsewhere(merged: MergedMap) -> None:
     assert left(2.5) and not left(2.1 + KEPT), "what is old says nothing"
     nearby.ask(request("r1", 2, Pose2()), merged, 3.0)
     assert left(3.5), "it is on another map"
+
+
+@pytest.mark.parametrize("field", ["radius", "height"])
+def test_no_robot_is_as_large_as_a_room(field: str) -> None:
+    """It would stand in the way of all others, and in all of their images."""
+    honest = NearbyRequest("r0", ((NodeId("r0", 1, 1), Pose2()),), 9.0, 0.02, 0.16, 0.3, 0.25)
+    assert decode(encode(honest), NearbyRequest) == honest
+    with pytest.raises(InvalidValue, match=field):
+        encode(replace(honest, **{field: 6.0}))

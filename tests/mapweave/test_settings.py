@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +180,7 @@ values = st.recursive(
 )
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=80, suppress_health_check=[HealthCheck.too_slow])
 @given(st.data())
 def test_any_value_anywhere_is_taken_or_refused(data):
     """A walk down the settings to any one of them, then anything as its value."""
@@ -213,3 +214,18 @@ def test_a_camera_is_written_into_a_file_of_an_editor_of_windows(tmp_path: Path)
     path.write_bytes(b'\xef\xbb\xbf[robot.camera]\r\nsource = "1"\r\n')
     write_camera(path, {"fx": 300.0})
     assert read_toml(path)["robot"]["camera"] == {"source": "1", "fx": 300.0}
+
+
+def test_a_key_of_thousands_of_parts_is_refused_at_once(tmp_path):
+    """The parser takes a time that grows with their square."""
+    for key in (
+        ".".join(["a"] * 8000),
+        " . ".join(["a", '"b.c"', "'d'"] * 3000),
+        f"[{'.'.join(['a'] * 64)}]",
+    ):
+        began = time.monotonic()
+        assert "a key has 64 parts" in refused(tmp_path, f"x = 1\n{key} = 1" if "[" not in key else key)
+        assert time.monotonic() - began < 0.5
+    many = ", ".join(f"{number}.5" for number in range(500))
+    (tmp_path / "numbers.toml").write_text(f"a.{'.'.join('b' * 62)} = [{many}]\nname = {'a.' * 40!r}")
+    assert len(read_toml(tmp_path / "numbers.toml")) == 2
