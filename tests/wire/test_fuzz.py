@@ -145,7 +145,7 @@ def test_garbage(some: SimpleNamespace, garbage: bytes) -> None:
         refused_or_read(decode, garbage)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.data())
 def test_good_messages_gone_bad(some: SimpleNamespace, data: st.DataObject) -> None:
     decode, good = data.draw(st.sampled_from(messages_once(some)))

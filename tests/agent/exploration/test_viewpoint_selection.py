@@ -31,7 +31,7 @@ readings = st.lists(st.floats(0.0, 3.0), min_size=16, max_size=16).map(np.array)
 directions = st.sampled_from(BEARINGS)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(readings, directions)
 @example(np.array([3.0, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1]), -math.pi)  # nothing in reach
 def test_the_footprint_moves_freely_within_the_clearance(proximity, direction):

@@ -33,7 +33,7 @@ def read_rangers(robot: RobotDescription, pose: Pose2, posts: Array) -> Array:
     return readings
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(seed=0, speed=2e-311, turn=0.5)  # the arc of a speed of almost nothing
 @given(seed=st.integers(0, 100_000), speed=st.floats(-0.3, 0.3), turn=st.floats(-0.8, 0.8))
 def test_no_collision_in_a_random_world(

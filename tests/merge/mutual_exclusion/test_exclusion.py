@@ -213,7 +213,7 @@ def test_unknown_poses_are_no_evidence() -> None:
     assert clash(a, b, rng) is None
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.integers(0, 10**6), st.sampled_from(["follows", "wanders"]), st.sampled_from([0.005, 0.02, 0.04]),
     st.booleans(),
