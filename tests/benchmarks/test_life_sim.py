@@ -17,6 +17,7 @@ def fleet() -> Fleet:
     return made
 
 
+@pytest.mark.slow
 def test_landmarks_of_moved_furniture_are_on_its_outline(fleet: Fleet) -> None:
     pairs = zip(fleet.before.plan.furniture, fleet.after.plan.furniture, strict=True)
     moved = [old for old, new in pairs if old != new]

@@ -66,6 +66,7 @@ def test_mismatched_comparisons_are_reported() -> None:
     assert "no landmark was left" in result[2]
 
 
+@pytest.mark.slow
 def test_a_run_is_near_the_truth(run: MappingDrive) -> None:
     """Bounds with room for chance: `python -m benchmarks.mapping_run` measures the figures."""
     result = figures(run)

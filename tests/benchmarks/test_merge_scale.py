@@ -27,6 +27,7 @@ def test_links_that_are_drawn_are_those_that_would_be_found() -> None:
         assert item.a_from_b.mean.distance(true) < 0.4
 
 
+@pytest.mark.slow
 def test_a_small_fleet_becomes_one_map() -> None:
     figures = at_size(200, 0, Progress(disable=True), measured=6)
     assert figures["false_links"] == 0.0 and figures["links"] > 50.0

@@ -29,6 +29,7 @@ sys.stdin.readline()
 """
 
 
+@pytest.mark.slow
 def test_threads_that_have_ended_still_count_where_they_belong() -> None:
     with subprocess.Popen(
         [sys.executable, "-c", BURN], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -203,6 +203,7 @@ def test_answers_are_judged_by_the_truth() -> None:
     assert scored(Pose2(0.2, 0.1, 0.1), 0, "twins")["false_accept"] == 1
 
 
+@pytest.mark.slow
 def test_the_fit_finds_the_weights_that_made_the_data() -> None:
     rng = np.random.default_rng(11)
     weights = np.array([-2.0, 1.2, 1.0, 1.5, 0.4, -2.5])

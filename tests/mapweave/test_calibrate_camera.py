@@ -131,6 +131,7 @@ class EmulatedCamera:
         self.closed = True
 
 
+@pytest.mark.slow
 def test_a_person_is_guided_live_until_the_views_suffice(frames, monkeypatch, capfd, tmp_path: Path) -> None:
     camera = EmulatedCamera(frames["fisheye"] * 2)
     opened: list[str] = []

@@ -89,7 +89,7 @@ def test_the_optimum_is_that_of_scipy(known: float | None) -> None:
         assert fit.freedom == 2 * len(a) - (3 if known else 4)
 
 
-@pytest.mark.parametrize("known", [None, TRUTH.scale])
+@pytest.mark.parametrize("known", first_quick([None, TRUTH.scale], 1))
 def test_the_covariance_is_that_of_many_trials(known: float | None) -> None:
     count, trials = 5, 1500
     _, b, covariance = world(1, count)

@@ -35,6 +35,7 @@ def test_ten_lines_are_ten() -> None:
     assert sum(bool(line.strip()) for line in lines) <= 10
 
 
+@pytest.mark.slow
 def test_gymnasium_accepts_the_environment() -> None:
     """Spaces, seeds, types, rendering."""
     env = gymnasium.make("mapweave.sim.gym:mapweave/Park-v0", seconds=5.0, render_mode="rgb_array")

@@ -17,7 +17,7 @@ MOVING = [
 ]
 
 
-@pytest.mark.parametrize(("name", "seed"), first_quick(MOVING, 2))
+@pytest.mark.parametrize(("name", "seed"), first_quick(MOVING, 1))
 def test_rearranged_worlds_keep_everything_else(name: str, seed: int) -> None:
     """What did not move is the same object; what did is the same box with the same pictures elsewhere."""
     world = world_of(name, seed)
@@ -50,7 +50,7 @@ def test_rearranged_worlds_keep_everything_else(name: str, seed: int) -> None:
         np.testing.assert_allclose(base.corners, place.corners, atol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "seed"), first_quick(MOVING, 2))
+@pytest.mark.parametrize(("name", "seed"), first_quick(MOVING, 1))
 def test_rearranged_worlds_can_be_driven_through(name: str, seed: int) -> None:
     """However often: no room is cut off, no corner catches a robot, nothing stands in anything."""
     world = world_of(name, seed)

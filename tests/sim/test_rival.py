@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
@@ -67,6 +68,7 @@ class TinyRenderer:
         self._physics.close()
 
 
+@pytest.mark.slow
 def test_same_picture_sooner_and_steadier(office: World, stand, tmp_path: Path) -> None:
     """40 panels, 12 neighbouring places: pictures agree, and ours costs less and moves more smoothly."""
     start = office.start_poses(1, 4)[0]

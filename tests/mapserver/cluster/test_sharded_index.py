@@ -190,6 +190,7 @@ def test_whatever_is_lost_killed_or_slow_nothing_is_missing_in_the_end(seed: int
         assert_same(cluster.index, one, tuple(there.values()))
 
 
+@pytest.mark.slow
 def test_merging_by_shards_finds_the_same_links_though_one_dies() -> None:
     building = Building.draw(4, 12, 2)
     log = [change for robot in range(4) for change in building.log(robot)]

@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.node import MapId
@@ -103,6 +104,7 @@ class Life:
         assert self.process.returncode == 0
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_when_processes_are_killed(tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
