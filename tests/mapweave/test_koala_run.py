@@ -30,7 +30,7 @@ from tests.mapweave.koala_in_simulation import (
 )
 
 EXPLORE = 90.0
-"""s of exploration."""
+"""Longest exploration, s."""
 SEED = 11
 
 
@@ -110,8 +110,7 @@ def test_a_koala_maps_is_carried_off_and_parks(
                     return "r0" in result and condition(result["r0"].status)
 
                 wait_for(lambda: agent(lambda status: True), 40, "no agent")
-                time.sleep(EXPLORE)
-                children.check()
+                wait_for(lambda: agent(lambda status: status.nodes >= least_nodes), EXPLORE, "few nodes")
                 assert send_order(bus, keys, MissionOrder.new("r0", MissionKind.STOP, "test")).open
                 wait_for(lambda: agent(lambda status: status.mission == "idle"), 10, "does not stop")
                 stored = lambda status: reports.server("s0").nodes == status.nodes  # noqa: E731
