@@ -7,14 +7,16 @@ import math
 import re
 import time
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
 from mapweave.agent.drivers.serial_port import TIMEOUT, SerialPort
-from mapweave.agent.drivers.settings import Geometry, RobotSettings
+from mapweave.agent.drivers.settings import Geometry, Positive, RobotSettings
 from mapweave.agent.drivers.wheeled import WheeledRobot
-from mapweave.hybridmap.errors import DeviceError, SettingsError
+from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.settings_file import build
 
 STATE = re.compile(r"S( -?[0-9]{1,10}){2} [01]( -?[0-9]{1,6}){0,256}")
@@ -34,9 +36,9 @@ class ArduinoOptions:
     """
 
     port: str
-    wheel_radius: float
-    counts_per_turn: float
-    baud: int = 115200
+    wheel_radius: Positive
+    counts_per_turn: Positive
+    baud: Annotated[int, Meta(ge=50, le=10_000_000)] = 115200
 
 
 class ArduinoBase:
@@ -120,12 +122,6 @@ class Arduino(WheeledRobot):
     """Any Arduino with ten lines of text protocol (docs/arduino.md)."""
 
     def __init__(self, settings: RobotSettings) -> None:
-        """Connect to the port in the options.
-
-        Raises:
-            SettingsError: a dimension of the wheels is not positive.
-        """
+        """Connect to the port in the options."""
         options = build(ArduinoOptions, settings.options, "[robot.options]")
-        if not (options.wheel_radius > 0.0 and options.counts_per_turn > 0.0):
-            raise SettingsError("[robot.options]: wheel_radius and counts_per_turn must be positive")
         super().__init__(ArduinoBase(options, settings.geometry), settings)

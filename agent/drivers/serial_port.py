@@ -75,7 +75,7 @@ class SerialPort:
         with self._failing():
             data = bytes(self._serial.read(count))
         if len(data) < count:
-            raise DeviceError(f"{self.path}: no answer for {TIMEOUT:g} s")
+            raise self._silent()
         return data
 
     def line(self) -> str:
@@ -91,7 +91,7 @@ class SerialPort:
                 self._rest = rest.lstrip(b" \n")
                 return line.decode("ascii", "replace").strip()
             if time.monotonic() >= end or len(self._rest) > LONGEST_LINE:
-                raise DeviceError(f"{self.path}: no answer for {TIMEOUT:g} s")
+                raise self._silent()
             self._take(1)
 
     def line_waiting(self) -> bool:
@@ -105,6 +105,11 @@ class SerialPort:
             came = self._serial.read(max(least, self._serial.in_waiting))
         # Empty lines are skipped.
         self._rest = (self._rest + came).replace(b"\r", b"\n").lstrip(b" \n")
+
+    def _silent(self) -> DeviceError:
+        return DeviceError(
+            f"{self.path}: no answer for {TIMEOUT:g} s; is the robot switched on, and at this port?"
+        )
 
     @contextlib.contextmanager
     def _failing(self) -> Iterator[None]:

@@ -14,7 +14,7 @@ from mapweave.agent.drivers.base import BaseReading, Wheels
 from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheeled import WheeledRobot
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.errors import DeviceError, SettingsError
 from mapweave.storage.settings_file import build
 
 SPEEDS, FEEDBACK, STREAM, WATCHDOG, INTERVAL, ECHO = 1, 130, 131, 136, 142, 143
@@ -28,7 +28,7 @@ STREAM_MS = 50
 FASTEST = 0.5
 """Largest speed of a command, m/s."""
 TIMEOUT = 0.5
-"""s for an answer over HTTP."""
+"""s for an answer over HTTP, and for a line about the wheels."""
 
 LARGEST_SPEED = 5.0
 """m/s; a greater value means a damaged line."""
@@ -93,9 +93,13 @@ class SerialLine:
 
     def feedback(self) -> BaseInfo:
         """Wait for a line; returns the newest."""
+        end = time.monotonic() + TIMEOUT
         newest: BaseInfo | None = None
         while newest is None or self._port.line_waiting():
-            newest = parse_info(self._port.line()) or newest
+            line = self._port.line()
+            newest = parse_info(line) or newest
+            if newest is None and time.monotonic() >= end:
+                raise DeviceError(f"{self._port.path}: {line[:80]!r} is not what a UGV's base streams")
         return newest
 
     def close(self) -> None:
@@ -134,8 +138,9 @@ class HttpLine:
             return self._connection.getresponse().read().decode("utf-8", "replace")
         except (OSError, http.client.HTTPException) as error:
             self._connection.close()
+            reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
             raise DeviceError(
-                f"{self._address}: {' '.join(str(error).split()) or type(error).__name__}"
+                f"{self._address}: {reason}; is the robot switched on, and this computer in its network?"
             ) from error
 
 
@@ -156,6 +161,15 @@ def _pair(answer: Json, left: str, right: str, scale: float, largest: float) -> 
     values = [answer.get(left), answer.get(right)]
     numbers = [scale * v for v in values if isinstance(v, int | float) and -largest <= v <= largest]
     return Wheels(*numbers) if len(numbers) == 2 else None
+
+
+def _is_address(text: str) -> bool:
+    """Whether it is the address of an HTTP server."""
+    try:
+        where = urllib.parse.urlsplit(text)
+        return where.scheme == "http" and bool(where.hostname) and where.port != 0
+    except ValueError:
+        return False
 
 
 class WaveshareBase:
@@ -215,6 +229,14 @@ class Waveshare(WheeledRobot):
     """Waveshare UGV Rover, Beast and RaspRover over serial or HTTP."""
 
     def __init__(self, settings: RobotSettings) -> None:
-        """Connect to the port or address in the options."""
+        """Connect to the port or address in the options.
+
+        Raises:
+            SettingsError: the address is none.
+        """
         options = build(WaveshareOptions, settings.options, "[robot.options]")
+        if "://" in options.port and not _is_address(options.port):
+            raise SettingsError(
+                f"[robot.options]: port {options.port!r} is neither a serial device nor http://ADDRESS[:PORT]"
+            )
         super().__init__(WaveshareBase(options.port), settings)

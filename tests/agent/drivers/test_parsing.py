@@ -89,7 +89,12 @@ def test_what_a_waveshare_says() -> None:
     [
         ("koala", {"prot": "x"}, r"\[robot.options\]: no setting 'prot'; did you mean 'port'"),
         ("create", {}, r"\[robot.options\]: port is missing"),
-        ("arduino", {"port": "x", "wheel_radius": 0.0, "counts_per_turn": 1}, "must be positive"),
+        ("arduino", {"port": "x", "wheel_radius": 0.0, "counts_per_turn": 1}, "expected float > 0.0"),
+        (
+            "arduino",
+            {"port": "x", "wheel_radius": 1.0, "counts_per_turn": 1, "baud": 0},
+            "baud: expected int",
+        ),
         ("waveshare", {"port": "x"}, r"no \[robot.camera\]"),
     ],
 )

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import threading
+import tty
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,10 +15,12 @@ import pytest
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.drivers.settings import CameraSettings, RobotSettings
-from mapweave.agent.drivers.waveshare import Waveshare
+from mapweave.agent.drivers.waveshare import HttpLine, SerialLine, Waveshare
 from mapweave.agent.observation import Command
+from mapweave.hybridmap.errors import DeviceError, SettingsError
 from tests.agent.drivers.contract import RobotContract, drive, drive_until
 from tests.agent.drivers.waveshare_emulators import UgvHttp, UgvSerial
+from tests.waiting import free_port
 
 
 class TestUgvSerial(RobotContract):
@@ -53,6 +59,44 @@ def test_odometers_go_before_speeds(tmp_path: Path, video: Path) -> None:
     assert sum(o.odometry.turn for o in seen) == pytest.approx((right - left) / 0.172, abs=0.06)
     robot.close()
     ugv.close()
+
+
+def test_a_base_that_streams_something_else_is_named(tmp_path: Path) -> None:
+    """Before, its lines were read for ever, and no command went out."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    done = threading.Event()
+
+    def chatter() -> None:
+        while not done.wait(0.02):
+            os.write(master, b'{"T":1003,"mac":"x"}\n')
+
+    thread = threading.Thread(target=chatter)
+    thread.start()
+    line = SerialLine(os.ttyname(slave))
+    try:
+        with pytest.raises(DeviceError, match="is not what a UGV's base streams"):
+            line.feedback()
+    finally:
+        done.set()
+        thread.join()
+        line.close()
+        os.close(master)
+        os.close(slave)
+
+
+@pytest.mark.parametrize("port", ["http://", "http://127.0.0.1:abc", "https://192.168.4.1", "http://h:99999"])
+def test_an_address_that_is_none(port: str) -> None:
+    with pytest.raises(SettingsError, match="neither a serial device nor http://ADDRESS"):
+        Waveshare(RobotSettings(options={"port": port}))
+
+
+def test_an_address_where_no_robot_is() -> None:
+    address = f"http://127.0.0.1:{free_port()}"
+    with pytest.raises(
+        DeviceError, match=f"^{address}: Connection refused; is the robot switched on, and this"
+    ):
+        HttpLine(address).feedback()
 
 
 class TestUgvHttp(RobotContract):
