@@ -22,7 +22,7 @@ def eventually(condition: Callable[[], object], seconds: float = PATIENCE) -> No
             return
         now = time.monotonic()
         assert now < end, f"did not happen in {seconds:.0f} s"
-        time.sleep(min(max(0.005, now - began), 0.1))
+        time.sleep(min(max(0.01, 3 * (now - began)), 0.1))
 
 
 def free_port() -> int:
