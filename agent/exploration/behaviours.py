@@ -139,7 +139,7 @@ class ExplorationBehaviours:
         return turned
 
     def _stand_stuck(self) -> Iterator[Move]:
-        """Stand still for a while, or until a person has moved the robot. Motors that go on to push get hot."""
+        """Stand still for a while, or until a person has moved it. Motors that go on to push get hot."""
         self.phase = Phase.STUCK
         self.detail = (
             f"{self._without_motion} turns in a row had no effect: check motor power, emergency stop and "
