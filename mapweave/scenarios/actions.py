@@ -9,6 +9,7 @@ from typing import Any
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import NodeId, check_name
+from mapweave.scenarios.liar.lies import EVERY
 from mapweave.sim import events
 from mapweave.sim.robots import camera_from_table
 from mapweave.storage.settings_file import build
@@ -111,6 +112,29 @@ class TakeThrough:
 
 
 @dataclass(frozen=True)
+class Lie:
+    """It is tried what would become of the others if a robot had lied about its map.
+
+    Attributes:
+        robot: name.
+        ways: in which it lies, see mapweave.scenarios.liar.lies; all if not given.
+        queries: views of lost robots that are asked.
+    """
+
+    robot: str
+    ways: tuple[str, ...] = ()
+    queries: int = 12
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown way (InvalidValue)."""
+        for way in self.ways:
+            if way not in EVERY:
+                raise InvalidValue(f"lie: no way {way!r}; known are {', '.join(EVERY)}")
+        if not 1 <= self.queries <= 1000:
+            raise InvalidValue(f"lie: queries must be 1 to 1000, not {self.queries}")
+
+
+@dataclass(frozen=True)
 class KillAgent:
     """An agent's process dies at once, without a word."""
 
@@ -178,6 +202,7 @@ Action = (
     | Photograph
     | Floors
     | TakeThrough
+    | Lie
     | KillAgent
     | StartAgent
     | KillServer
@@ -196,6 +221,7 @@ KINDS: dict[str, type[Any]] = {
     "photograph": Photograph,
     "floors": Floors,
     "take_through": TakeThrough,
+    "lie": Lie,
     "kill_agent": KillAgent,
     "start_agent": StartAgent,
     "kill_server": KillServer,

@@ -86,6 +86,12 @@ class Figures:
         goal_error_m: of the worst such robot, where it arrived or was given up, m.
         goal_error_deg: likewise, degrees.
         goal_s: from the kidnapping to the arrival, the worst, simulated s.
+        lies: ways in which a robot has lied; of the ways that cannot be found out none counts. None: no robot
+            has lied.
+        lies_not_contained: of these, those by which the others ended with other links, answers or poses.
+        lies_not_named: of these, those of which neither page nor status says who lied.
+        lies_moved_m: how far a node of the others moved at most, m.
+        lies_answers_changed: answers to lost robots that became less, other or false, over all ways.
         troubles: how often the scenario did not go as it was meant to: something had not come true in time,
             or could not happen.
         unsaved_changes: changes in journals of robots that the server does not have.
@@ -131,6 +137,11 @@ class Figures:
     goal_error_m: float | None = None
     goal_error_deg: float | None = None
     goal_s: float | None = None
+    lies: int | None = None
+    lies_not_contained: int | None = None
+    lies_not_named: int | None = None
+    lies_moved_m: float | None = None
+    lies_answers_changed: int | None = None
     recovery_s: float | None = None
     bytes_per_node: float | None = None
     map_bytes_per_robot_minute: float | None = None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.scenarios.lying import Lies
 from mapweave.sim.floorplan import FloorPlan
 from mapweave.storage.map_file import MapFile
 
@@ -125,6 +126,7 @@ class Recording:
         wall_s: how long that took.
         wall: s by part, where known.
         photographed: where photographs that are nodes were really taken: `world_from_robot`.
+        lies: what came of the lies of a robot, if one has lied.
     """
 
     scenario: str
@@ -139,3 +141,4 @@ class Recording:
     wall_s: float = 0.0
     wall: Mapping[str, float] = field(default_factory=dict)
     photographed: Mapping[NodeId, Pose2] = field(default_factory=dict)
+    lies: Lies | None = None

@@ -20,6 +20,9 @@ GROUPS = {
         "collisions", "found", "found_error_m", "found_error_deg", "found_s", "reached", "goal_error_m",
         "goal_error_deg", "goal_s",
     ),
+    "Lies of a robot": (
+        "lies", "lies_not_contained", "lies_not_named", "lies_moved_m", "lies_answers_changed",
+    ),
     "Network and disks": (
         "troubles", "unsaved_changes", "recovery_s", "bytes_per_node", "map_bytes_per_robot_minute",
         "wire_bytes_per_robot_minute", "map_hash",

@@ -151,6 +151,7 @@ def _record(stage: Stage, options: TrialOptions, show: TerminalProgress) -> Reco
         merged=merged,
         lost=tuple(runner.lost),
         photographed=runner.photographed,
+        lies=runner.lies,
         moments=tuple(runner.moments),
         recoveries_s=tuple(runner.recoveries_s),
         sim_s=status.stamp_ns / 1e9,

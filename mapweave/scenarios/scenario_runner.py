@@ -18,6 +18,7 @@ from mapweave.scenarios import actions
 from mapweave.scenarios.actions import MISSION_KINDS
 from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, Fleet, Stage
 from mapweave.scenarios.kidnap_events import KidnapEvents
+from mapweave.scenarios.lying import Lies, lie
 from mapweave.scenarios.photographing import beside, photograph
 from mapweave.scenarios.portal_events import PortalEvents
 from mapweave.scenarios.recording import Lost, Moment
@@ -51,6 +52,7 @@ class ScenarioRunner:
         done: how many events have happened.
         doing: what is waited for, or done.
         agents: last status of those in reach.
+        lies: what came of a robot's lies, if one has lied.
         photographed: where photographs that are nodes were really taken: `world_from_robot`.
     """
 
@@ -85,6 +87,7 @@ class ScenarioRunner:
         self.photographed: dict[NodeId, Pose2] = {}
         self._losing = KidnapEvents(stage, fleet, self._command, self.note)
         self._portals = PortalEvents(stage, fleet, self.note)
+        self.lies: Lies | None = None
         self._grown: tuple[str, int] = ("", 0)
 
     def run(self) -> None:
@@ -195,6 +198,9 @@ class ScenarioRunner:
                 self.note(f"{action.count} photographs become map {action.name}")
                 fleet.control.kidnap(robot, beside(first, self._stage.seed))
                 self._losing.mark(robot)
+            case actions.Lie(robot):
+                self._recover(time.monotonic())
+                self.lies = lie(self._stage, fleet, action, self.merged(), self.note)
             case actions.Floors():
                 self._portals.label(self.merged())
             case actions.TakeThrough():

@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -78,6 +79,7 @@ def score(recording: Recording) -> Figures:
         goal_error_deg=_worst(fall.goal_error_deg for fall in goals),
         goal_s=_worst(fall.goal_s for fall in goals),
         unsaved_changes=sum(r.unsaved_changes for r in robots.values()),
+        **_lies(recording),
         troubles=sum(moment.trouble for moment in recording.moments),
         recovery_s=max(recording.recoveries_s, default=None),
         bytes_per_node=map_bytes / len(truth) if truth else None,
@@ -89,6 +91,11 @@ def score(recording: Recording) -> Figures:
         real_time_factor=recording.sim_s / recording.wall_s if recording.wall_s else None,
         robots=robots,
     )  # fmt: skip
+
+
+def _lies(recording: Recording) -> dict[str, Any]:
+    """The figures of lies, if a robot has lied."""
+    return {} if recording.lies is None else recording.lies.figures()
 
 
 def node_truth(recording: Recording) -> dict[NodeId, Pose2]:

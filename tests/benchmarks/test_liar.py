@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.liar.benchmark import Trial
-from benchmarks.liar.lies import WAYS
+from benchmarks.liar.benchmark import drawn_trial
+from mapweave.scenarios.liar.lies import WAYS
 
 pytestmark = pytest.mark.slow
 
 
 def test_lies_are_contained_and_named(tmp_path: Path) -> None:
-    trial = Trial(3, 6, tmp_path)
+    trial = drawn_trial(3, 6, tmp_path)
     beside = trial.beside
     assert not beside.named and not beside.links_changed and beside.answers_changed <= 1
     for name in ("edges of 1e5 m", "covariance of zero", "copied places", "half copied landmarks"):

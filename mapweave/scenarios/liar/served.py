@@ -10,18 +10,18 @@ from types import TracebackType
 
 import numpy as np
 
+from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.verdict import FLOOR_HEADING, FLOOR_XY, GATE
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.bus import Request, Sample
+from mapweave.wire.bus import Closing, Request, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode_view
-from synthetic.wrong_geometry import RIGHT_M
 
 KEYS = Keys("liars")
 LOG_ID = 7
@@ -29,6 +29,8 @@ LIMIT = 240.0
 """For a log to be taken and merged, s."""
 AT_ONCE = 64
 """Changes in one answer for a part of a log."""
+RIGHT_M = 0.35
+"""An answered position nearer to the truth than this is right."""
 
 
 NOWHERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
@@ -85,6 +87,7 @@ class Served:
         self._server = MapServer(self._buses[0], KEYS, path, "s0")
         self._bus = self._buses[1]
         self._acks: dict[MapId, int] = {}
+        self._tokens: list[Closing] = []
 
     def __enter__(self) -> Served:
         """Begin to serve."""
@@ -111,6 +114,7 @@ class Served:
         """
         closing = [self._bus.serve(KEYS.log(map_id), _teller(log)) for map_id, log in logs.items()]
         closing += [self._bus.subscribe(KEYS.acks(agent), self._hear) for agent in {m.agent for m in logs}]
+        self._tokens += [self._bus.announce(KEYS.agent_alive(min(logs)))]
         for map_id, log in logs.items():
             for k, message in enumerate(log, start=1):
                 self._bus.publish(KEYS.change(map_id), message, Mark(k, LOG_ID).encode())
@@ -130,10 +134,16 @@ class Served:
         return bool(replies) and not replies[0].error and bool(decode_record(replies[0].payload))
 
     def named(self, agent: str) -> str:
-        """What the page says against a robot, by name; empty if it says nothing."""
+        """What the page's timeline says against a robot, by name; empty if it says nothing."""
         accused = f"map {agent}."
         words = (event.words for event in self._server.history())
         return next((one for one in words if one.startswith(accused)), "")
+
+    def in_status(self, agent: str) -> bool:
+        """Whether the status of the robots says something against one that is there."""
+        replies = self._bus.ask(KEYS.robots("s0"), b"", 20.0)
+        entries = decode(replies[0].payload, FleetStatus).robots if replies else ()
+        return any(entry.robot == agent and entry.accusation for entry in entries)
 
     def seen(
         self, maps: Collection[MapId], lost: Sequence[tuple[View, Pose2]], truth: Mapping[NodeId, Pose2]

@@ -14,13 +14,13 @@ import numpy as np
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.descriptor import decode, quantise
+from mapweave.hybridmap.landmark_tables import DIMENSIONS
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.matching import match
 from mapweave.wire.codec import encode_body, encode_change, wrap_body
 from mapweave.wire.pose_codec import MAX_MEASURED, MAX_VARIANCE, POSTURE, UPPER
-from synthetic.world import Sensing, random_vectors
 
 Map = tuple[list[Node], list[Edge]]
 Logs = dict[MapId, list[bytes]]
@@ -29,6 +29,11 @@ SURE = np.diag([0.015, 0.015, 0.008]) ** 2
 OFF_M = 2.0
 """By which copied places are torn apart."""
 EPOCHS = 40
+ALTERED_PIXEL, ALTERED_CODE, ALTERED_DEPTH = 0.7, 0.04, 0.03
+"""By how much two views of a landmark differ: standard deviations, px, of a decoded descriptor's coordinates,
+and of the depth as a share of it."""
+CODE_SIGMA = 0.12
+"""Of the coordinates of decoded descriptors that belong to nothing: norms are then those of real ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +79,13 @@ class Setting:
 def bodies(content: Map) -> list[ChangeBody]:
     """The changes of a map, in the order of a drive."""
     nodes, edges = content
-    out: list[ChangeBody] = [NodePut(nodes[0])]
-    for node, edge in zip(nodes[1:], edges, strict=True):
-        out += [NodePut(node), EdgePut(edge)]
+    place = {node.id: k for k, node in enumerate(nodes)}
+    after: dict[int, list[Edge]] = {}
+    for edge in edges:
+        after.setdefault(max(place.get(edge.a, 0), place.get(edge.b, 0)), []).append(edge)
+    out: list[ChangeBody] = []
+    for k, node in enumerate(nodes):
+        out += [NodePut(node), *map(EdgePut, after.get(k, ()))]
     return out
 
 
@@ -247,17 +256,19 @@ def mixed_landmarks(s: Setting) -> Lie:
         other = theirs[(k * 3) % len(theirs)]
         some = [half.landmarks.take(np.arange(0, len(half.landmarks), 2)) for half in (node, other)]
         nodes.append(replace(node, landmarks=joined(some)))
-    return Lie({s.map: messages(s.map, bodies((nodes, s.own[1])))})
+    # What landmarks an edge's ends share would give it away.
+    edges = [replace(edge, shared=edge.shared[:0]) for edge in s.own[1]]
+    return Lie({s.map: messages(s.map, bodies((nodes, edges)))})
 
 
 def altered(node: Node, rng: np.random.Generator) -> Node:
     """A node as another view from the same place would be."""
-    sensing, marks = Sensing(), node.landmarks
-    pixels = marks.pixels + rng.normal(0.0, sensing.pixel_sigma, marks.pixels.shape)
+    marks = node.landmarks
+    pixels = marks.pixels + rng.normal(0.0, ALTERED_PIXEL, marks.pixels.shape)
     pixels = np.clip(pixels, 0.0, [node.camera.width - 1.0, node.camera.height - 1.0])
     vectors = decode(marks.codes)
-    codes = quantise(vectors + rng.normal(0.0, sensing.code_sigma, vectors.shape))
-    depths = marks.depths * (1.0 + rng.normal(0.0, sensing.depth_share, len(marks)))
+    codes = quantise(vectors + rng.normal(0.0, ALTERED_CODE, vectors.shape))
+    depths = marks.depths * (1.0 + rng.normal(0.0, ALTERED_DEPTH, len(marks)))
     return replace(
         node, landmarks=Landmarks(
             pixels.astype(np.float32), codes, depths.astype(np.float32), marks.depth_sigmas
@@ -281,7 +292,9 @@ def _filled(node: Node, rng: np.random.Generator) -> Landmarks:
     count = MAX_LANDMARKS - len(node.landmarks)
     pixels = rng.uniform(0.0, [node.camera.width, node.camera.height], (count, 2)).astype(np.float32)
     depths = rng.uniform(0.5, 6.0, count).astype(np.float32)
-    more = Landmarks(pixels, quantise(random_vectors(count, rng)), depths, 0.05 * depths)
+    more = Landmarks(
+        pixels, quantise(rng.normal(0.0, CODE_SIGMA, (count, DIMENSIONS))), depths, 0.05 * depths
+    )
     return joined([more, node.landmarks])
 
 
@@ -338,3 +351,4 @@ UNDECIDABLE: dict[str, Callable[[Setting], Lie]] = {
 }
 """Maps that are right in themselves and could be of a second building that looks the same: nothing that a
 server knows tells which of the two robots lies. Links and poses shall stay; answers may become ambiguous."""
+EVERY: Mapping[str, Callable[[Setting], Lie]] = {**WAYS, **UNDECIDABLE}
