@@ -1,11 +1,13 @@
-"""Draws `edit.png`: the page while a floor plan is laid under the map of three robots, in a real browser.
+"""Draws the page in a real browser: `page.png` with the recorded fleet, `edit.png` while a plan is laid under.
 
 A picture that is there stays, since a browser draws each a little differently.
-`python docs/site/page_picture.py` draws another one.
+`python docs/site/page_picture.py` draws other ones.
 """
 
 from __future__ import annotations
 
+import socket
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -27,13 +29,14 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.building import Building
 from tests.browser import Browser, there_is_none
-from tests.waiting import eventually
+from tests.waiting import eventually, free_port
 
-PICTURE = Path(__file__).with_name("edit.png")
+FLEET, EDIT = (Path(__file__).with_name(f"{name}.png") for name in ("page", "edit"))
 ROOMS = (0, 2, 4, 6, 8)
 """With a pair in each: the four corners and the middle of the building."""
 CLICKS = 2.0
 """How far a person clicks beside a place, px."""
+SHARP = "return mapweave.painter.drawn?.scale === mapweave.viewport.scale && !mapweave.painter.waiting"
 MERGED = 240.0
 """Longest wait for the merge, s."""
 
@@ -89,15 +92,57 @@ def lay_plan(page: Browser, building: Building, image_path: Path) -> None:
     page.run("document.activeElement.blur()")
 
 
-def main() -> None:
-    """Draw."""
-    if there_is_none():
-        print("there is no Chromium: edit.png stays as it is", file=sys.stderr)
-        return
+def draw_fleet() -> None:
+    """The page of `mapweave server --demo`, once its maps are merged."""
+    http = free_port()
+    command = [sys.executable, "-m", "mapweave", "server", "--demo", "--http", str(http)]
+    server = subprocess.Popen([*command, "--listen", f"tcp/127.0.0.1:{free_port()}"])
+    try:
+        with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as page:
+            eventually(lambda: listens(http), MERGED)
+            page.look(1280, 800)
+            page.open(f"http://127.0.0.1:{http}/")
+            # Two of the four maps that it shows at once are joined to a third.
+            eventually(lambda: page.run("return window.mapweave?.model.components.length") == 2, MERGED)
+            eventually(lambda: page.run("return mapweave.painter.robots.length") == 4)
+            eventually(lambda: page.run(SHARP))
+            page.screenshot(FLEET)
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def listens(port: int) -> bool:
+    """Whether a program takes connections at a port of loopback."""
+    try:
+        with socket.create_connection(("127.0.0.1", port), 1.0):
+            return True
+    except OSError:
+        return False
+
+
+def draw_edit() -> None:
+    """The page while a plan is laid under the map of three robots."""
     building = Building.draw(3, 48, seed=2)
     with tempfile.TemporaryDirectory() as folder, page_of(building, Path(folder)) as page:
         lay_plan(page, building, Path(folder) / "office.png")
-        page.screenshot(PICTURE)
+        page.screenshot(EDIT)
+
+
+def main(again: bool = True) -> None:
+    """Draw.
+
+    Args:
+        again: also what is there already.
+    """
+    wanted = [
+        (path, draw) for path, draw in ((FLEET, draw_fleet), (EDIT, draw_edit)) if again or not path.exists()
+    ]
+    if wanted and there_is_none():
+        print("there is no Chromium: the pictures of the page stay as they are", file=sys.stderr)
+        return
+    for _, draw in wanted:
+        draw()
 
 
 if __name__ == "__main__":
