@@ -1,4 +1,4 @@
-"""Draws the page in a real browser: `page.png` with the recorded fleet, `edit.png` while a plan is laid under.
+"""Draws the page in a real browser: `page.png` with the recorded fleet, `edit.png` with a plan being laid.
 
 A picture that is there stays, since a browser draws each a little differently.
 `python docs/site/page_picture.py` draws other ones.
