@@ -43,7 +43,7 @@ slow: setup
 	@$(COMPILE)
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
 
-# About half an hour on two cores: every scenario, in real processes, and the longest tests.
+# About three quarters of an hour on two cores: every scenario, in real processes, and the longest tests.
 scenarios: setup
 	$(BIN)/python -m pytest -m scenario -rA --durations=0
 

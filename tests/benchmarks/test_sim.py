@@ -12,7 +12,7 @@ import pytest
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_its_last_line_is_one_object():
-    command = [sys.executable, "-m", "benchmarks.sim", "--robots", "1", "2", "--seconds", "4", "--json"]
+    command = [sys.executable, "-m", "benchmarks.sim", "--robots", "1", "2", "--seconds", "2", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     values = json.loads(done.stdout.strip().splitlines()[-1])
     assert set(values["real_time_factor"]) == set(values["share"]) == {"1", "2"}
