@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -28,22 +29,31 @@ STEPS = 40
 GROUPS = (("r0", "r1"), ("s0", "s1"), ("z0", "z1"))
 
 
-@pytest.fixture
-def fleet(tmp_path: Path) -> tuple[list[Change], Journal, SqliteStore]:
-    """A robot's log, its journal, and a store that has it all."""
-    script = ScriptedRobot(0, 5)
-    journal, store = Journal(tmp_path / "r0.sqlite", "r0"), SqliteStore(tmp_path / "s0.sqlite")
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a robot's log, its journal, and a store that has it all."""
+    folder, script = tmp_path_factory.mktemp("written"), ScriptedRobot(0, 5)
+    journal, store = Journal(folder / "r0.sqlite", "r0"), SqliteStore(folder / "s0.sqlite")
     journal.open_map(1)
     lines, head = [], 0
     for step in range(1, STEPS + 1):
         bodies = script.step()
         head += len(journal.append(script.map, bodies, step * STAMP))
         lines += [f"T {step} {len(bodies)} {digest(bodies)}", f"C {step} {head} {step / 10}"]
-    (tmp_path / "r0.truth").write_text("\n".join(lines))
-    sent = sent_changes(tmp_path, 0, 5)
-    entries = [Entry.read(script.map, one.sequence, encode_change(one)) for one in sent]
+    (folder / "r0.truth").write_text("\n".join(lines))
+    entries = [Entry.read(script.map, one.sequence, encode_change(one)) for one in sent_changes(folder, 0, 5)]
     store.apply(script.map, journal.log_id(script.map), entries)
-    return sent, journal, store
+    journal.close()
+    store.close()
+    return folder
+
+
+@pytest.fixture
+def fleet(written: Path, tmp_path: Path) -> tuple[list[Change], Journal, SqliteStore]:
+    """A copy of it, open: what was sent, the journal and the store."""
+    shutil.copytree(written, tmp_path, dirs_exist_ok=True)
+    sent = sent_changes(tmp_path, 0, 5)
+    return sent, Journal(tmp_path / "r0.sqlite", "r0"), SqliteStore(tmp_path / "s0.sqlite")
 
 
 def changed(store: SqliteStore, path: Path, sql: str) -> SqliteStore:
