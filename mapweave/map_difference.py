@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from mapweave.evaluation.map_score import align
+from mapweave.hybridmap.manual_constraint import event_words
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import wrap_angle
 from mapweave.mapserver.map_history import between
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.storage.map_file import MapFile
 
 Pair = tuple[NodeId, NodeId]
 NAMED = 8
@@ -110,6 +112,18 @@ class MapDifference:
             if m.largest >= 0.001 or m.turn >= 0.001
         ]
         return lines
+
+
+def decided(before: MapFile, after: MapFile) -> list[str]:
+    """What people decided and said about one map and not about the other, as lines for people."""
+    old, new = (
+        [(one, event_words(one)) for one in content.constraints]
+        + [(one, one.words) for one in content.annotations]
+        for content in (before, after)
+    )
+    lines = [f"new: {words}" for one, words in new if (one, words) not in old]
+    lines += [f"not in the record: {words}" for one, words in old if (one, words) not in new]
+    return lines
 
 
 def difference(before: MergedMap, after: MergedMap) -> MapDifference:

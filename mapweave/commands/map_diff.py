@@ -16,7 +16,8 @@ def add_to(actions: Any) -> None:
         "diff",
         help="what is different between two maps",
         description="Say what changed from one map to another, as by a merge: nodes added, removed and "
-        "superseded, how far the others moved, links, and which maps became one or came apart: "
+        "superseded, how far the others moved, links, which maps became one or came apart, "
+        "and what people decided and said: "
         "`mapweave map diff monday.mapweave tuesday.mapweave`. "
         "Exit status 0: they are the same; 4: they differ; 1: one cannot be read.",
     )
@@ -28,7 +29,7 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare and print."""
-    from mapweave.map_difference import difference
+    from mapweave.map_difference import decided, difference
     from mapweave.mapserver.content_hash import content_hash
 
     files, maps = [], []
@@ -38,11 +39,12 @@ def run(arguments: argparse.Namespace) -> int:
         files.append(one.file(maps[-1]))
     same = content_hash(files[0]) == content_hash(files[1])
     found = difference(*maps)
-    lines = found.words()
+    said = decided(*files)
+    lines = [*found.words(), *said]
     if arguments.json:
-        print(json.dumps({"same": same, **found.values()}))
+        print(json.dumps({"same": same, **found.values(), "decided": said}))
     elif same:
         print("the maps are the same")
     else:
-        print("\n".join(lines or ["landmarks, edges or people's decisions differ, and nothing that follows"]))
+        print("\n".join(lines or ["landmarks or edges differ, and nothing that follows"]))
     return DONE if same else NO

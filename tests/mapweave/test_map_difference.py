@@ -84,4 +84,17 @@ def test_what_a_merge_changed_is_said(tmp_path: Path, capfd: pytest.CaptureFixtu
     assert main(["map", "merge", *map(str, paths), "-o", str(merged)]) == 0
     capfd.readouterr()
     assert main(["map", "diff", str(merged), str(both)]) == NO
-    assert capfd.readouterr().out.startswith("landmarks, edges or people's decisions differ")
+    assert capfd.readouterr().out.startswith("landmarks or edges differ")
+
+
+def test_what_people_said_is_a_difference(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path, named = tmp_path / "r0.mapweave", tmp_path / "named.mapweave"
+    write_map_file(path, MapFile("agent", "r0.1", tuple(LOGS[R0])))
+    words = ["place", "add", "kitchen", "r0.1.1", "--by", "anna", "--map", str(path), "-o", str(named)]
+    assert main(words) == 0
+    capfd.readouterr()
+    assert main(["map", "diff", str(path), str(named)]) == NO
+    assert capfd.readouterr().out == "new: place kitchen is node r0.1.1, by anna\n"
+    assert main(["map", "diff", str(named), str(path), "--json"]) == NO
+    decided = json.loads(capfd.readouterr().out)["decided"]
+    assert decided == ["not in the record: place kitchen is node r0.1.1, by anna"]
