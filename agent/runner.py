@@ -46,6 +46,7 @@ class Runner:
         on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
         print_line: Callable[[str], None] = lambda line: None,
         clock: Callable[[], float] = time.monotonic,
+        recorded: bool = False,
     ) -> None:
         """Put the parts together.
 
@@ -59,11 +60,12 @@ class Runner:
             on_step: called after each tick, for progress.
             print_line: takes lines for people.
             clock: s, only grows.
+            recorded: whether the driver is a recording, which waits for the loop: it skips nothing.
         """
         self.skipped, self.busy = 0, 0.0
         self._monitor = monitor
         self._print = print_line
-        self._clock = clock
+        self._clock, self._recorded = clock, recorded
         self._previous: tuple[int, float] | None = None
         self._faulty = ""
         self._pipeline = pipeline
@@ -164,10 +166,10 @@ class Runner:
 
         Images that a recording lacks, or that a camera has dropped, came while the loop was waiting.
         """
-        if self._previous is None:
+        if self._previous is None or self._recorded:
             return
         before_ns, busy = self._previous
-        missed = round((stamp_ns - before_ns) * 1e-9 / tick) - 1
+        missed = min(round((stamp_ns - before_ns) * 1e-9 / tick) - 1, int(busy / tick))
         if busy <= tick or missed <= 0:
             return
         self.skipped += missed

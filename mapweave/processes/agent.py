@@ -243,7 +243,7 @@ class Agent:
         self._trajectory = TrajectoryFile(path) if options.recorded else None
         self.runner = Runner(
             pipeline, self._fleet, self.replicator, self.missions, MappingMonitor(self._description),
-            options.synchronization, self._stepped, self._say,
+            options.synchronization, self._stepped, self._say, recorded=options.recorded,
         )  # fmt: skip
 
     def _released(self, node: NodeId, successor: NodeId) -> bool:
