@@ -118,7 +118,10 @@ REMOTE_PATIENCE = 5.0
 
 
 def _ask(words: str) -> bool:
-    return input(f"{words}. Enter begins, s skips: ").strip().lower() != "s"
+    try:
+        return input(f"{words}. Enter begins, s skips: ").strip().lower() != "s"
+    except EOFError:
+        return False  # the terminal's end: there is no person
 
 
 def _print(findings: Sequence[Finding]) -> None:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 SECONDS = 2.0
 """Of observations while the robot stands."""
+FEWEST_IMAGES = 0.7
+"""Share of the observations that should have an image."""
 MOTION_SECONDS = 10.0
 """Longest motion."""
 PUSH = "Push the robot forward by about 30 cm and turn it by about 45 degrees within 10 s"
@@ -96,6 +98,8 @@ def _judge(description: RobotDescription, seen: list[Observation]) -> Iterator[F
     )
     if not images:
         yield wrong("driver", f"{words}: no image", "connect the camera")
+    elif images < FEWEST_IMAGES * len(seen):
+        yield warning("driver", words, "the agent takes an image a tick: more light, or a smaller image")
     elif promised and not any(len(one.proximity) for one in seen):
         yield wrong(
             "driver",
@@ -145,6 +149,10 @@ def _advice(error: str) -> str:
     """What to do about an error of a driver, most of which say it themselves."""
     if "mapweave sim serve" in error:
         return "start it, and the router between (mapweave server), or give --robot robot.toml"
+    if "in use" in error:
+        return "stop the program that uses it, for example a running agent"
+    if "may not be opened" in error:
+        return "sudo usermod -aG dialout $USER, then log in again"
     if "port" in error or "/dev/" in error or "no answer" in error:
         ports = ", ".join(port.path for port in serial_ports())
         there = f"there are {ports}" if ports else "there is no serial port at all"

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from mapweave.agent.drivers import wheeled
-from mapweave.agent.observation import Odometry, RobotDescription
+from mapweave.agent.drivers.serial_port import SerialPort
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.cli import main
 from mapweave.commands import doctor as doctor_command
 from mapweave.doctor import camera, camera_model, driver, machine
@@ -230,6 +231,34 @@ def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd) -> N
     assert (status, first) == (NO, "image") and "dark" in findings["image"].detail
     assert findings["driver"].verdict is Verdict.WRONG and "no such port" in findings["driver"].detail
     assert "mapweave find-port" in findings["driver"].advice
+
+
+def test_a_port_that_another_program_uses(walls, sketch, tmp_path, capfd) -> None:
+    settings = robot_toml(tmp_path, film(tmp_path / "film.avi", walls), sketch.path)
+    port = SerialPort(str(sketch.path), 115200)
+    _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    port.close()
+    assert first == "driver" and "in use by another process" in findings["driver"].detail
+    assert "a running agent" in findings["driver"].advice
+
+
+def test_a_driver_with_few_images(walls) -> None:
+    image = walls.render(Pose2())
+    seen = [
+        Observation(k * 10**8, Odometry(0.0, 0.0), image if k % 4 == 0 else None, np.full(3, 1.0))
+        for k in range(20)
+    ]
+    description = replace(DESCRIPTION, ranger_bearings=(0.5, 0.0, -0.5), ranger_reach=1.5)
+    (finding,) = driver._judge(description, seen)
+    assert finding.verdict is Verdict.WARNING and "5 with an image" in finding.detail
+
+
+def test_the_end_of_the_terminal_is_no_person(monkeypatch: pytest.MonkeyPatch) -> None:
+    def end(words: str) -> str:
+        raise EOFError
+
+    monkeypatch.setattr("builtins.input", end)
+    assert not doctor_command._ask("Push the robot")
 
 
 def test_no_camera_and_wrong_settings(tmp_path, capfd) -> None:
