@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 def test_the_sbom_lists_every_pinned_package_and_is_the_same_each_time(tmp_path: Path) -> None:
     tools = Path(sys.executable).parent
     if shutil.which("make") is None or not (tools / "cyclonedx-py").exists():

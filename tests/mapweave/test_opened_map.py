@@ -268,7 +268,7 @@ WHOLE = MapFile(
 )  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.randoms(use_true_random=False), st.integers(0, len(NODES) - 1))
 def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Random, gone: int) -> None:
     edges = [body for body in WHOLE.changes if isinstance(body, EdgePut)]

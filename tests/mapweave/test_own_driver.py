@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.quick import first_quick
 from tests.waiting import eventually, free_port
 
 DRIVER = """
@@ -105,9 +104,10 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path:
             item.process.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stamp", "words"),
-    first_quick([("time.time()", "stamp_ns .* whole nanoseconds"), ("7", "stamp_ns stands still at 7")], 1),
+    [("time.time()", "stamp_ns .* whole nanoseconds"), ("7", "stamp_ns stands still at 7")],
 )
 def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: Path, closed: str) -> None:
     driver = tmp_path / "still.py"

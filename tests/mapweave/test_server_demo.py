@@ -161,6 +161,7 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
         assert all("WebSocket" in words for words in refused), refused
 
 
+@pytest.mark.slow
 def test_the_demo_keeps_nothing(tmp_path: Path) -> None:
     begin = time.monotonic()
     command = [sys.executable, "-m", "mapweave", "server", "--demo", "--data", str(tmp_path)]

@@ -89,6 +89,7 @@ def test_standing_decisions_agree_with_deciding_everything(seed: int, false_shar
         check(daily.live(1), daily.rebuilt())
 
 
+@pytest.mark.slow
 def test_constraints_apply_to_standing_decisions() -> None:
     daily = Daily(5)
     merged = daily.live(6)

@@ -197,6 +197,7 @@ def test_two_servers_share_a_store(postgres: PostgresServer) -> None:
         store.close()
 
 
+@pytest.mark.slow
 def test_it_goes_on_when_postgresql_is_back(caplog: pytest.LogCaptureFixture) -> None:
     servers = started()
     server = next(servers)

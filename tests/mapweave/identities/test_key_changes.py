@@ -70,6 +70,7 @@ def test_changes_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
     assert {path.name.partition(".")[0] for path in folder.path.glob("*.key.toml")} == good
 
 
+@pytest.mark.slow
 def test_tokens_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
     folder.token("r1", 1.0)
     tokens = [f"[folder.token('{name}', 1.0) for _ in range(10)]" for name in ("r0", "r2", "s0")]
