@@ -10,9 +10,11 @@ from collections import Counter
 from collections.abc import Collection, Container, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
+from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
 def implausible(hybrid_map: HybridMap) -> str:
@@ -25,6 +27,19 @@ def implausible(hybrid_map: HybridMap) -> str:
         if runs_backwards([node for node in nodes if node.clock == clock]):
             return f"its clock {clock} runs backwards: nothing is concluded from its times"
     return ""
+
+
+def rightly_superseded(merged: MergedMap) -> dict[NodeId, Superseded]:
+    """Superseded nodes of a merged map, without those that nodes of other robots' implausible maps supersede.
+
+    A superseded node answers no more and is deleted in the end: no robot takes others' nodes away by a map
+    that cannot be true.
+    """
+    return {
+        node: fate
+        for node, fate in merged.superseded.items()
+        if fate.by.agent == node.agent or fate.by.map not in merged.implausible
+    }
 
 
 LEAST_NODES = 4

@@ -20,7 +20,7 @@ from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, NodeComparisons, compare
 from mapweave.mapserver.merging.pruning import PrunePlan, Pruning
 from mapweave.mapserver.merging.verification_cache import VerificationCache
-from mapweave.mapserver.plausibility import implausible, scattered
+from mapweave.mapserver.plausibility import implausible, rightly_superseded, scattered
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
@@ -267,6 +267,7 @@ class Merger:
             wrong=self._wrong,
             pruned=self.pruning.pruned,
         )
+        merged = replace(merged, superseded=rightly_superseded(merged))
         if use is not None:
             use(merged)
         return merged
