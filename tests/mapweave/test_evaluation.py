@@ -173,6 +173,7 @@ def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, c
     assert values["ate_m"] < 0.02
 
 
+@pytest.mark.slow
 def test_a_drives_error_is_measured_against_its_truth(drive: Path, capfd, tmp_path: Path) -> None:
     """The asking robot's truth is moved by 7 m: so are all errors, and nothing is right any more."""
     folder = Path(shutil.copytree(drive, tmp_path / "moved"))

@@ -136,6 +136,7 @@ def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path: Path) -
     assert first[-1].stamp_ns < 2.5e9 <= second[0].stamp_ns
 
 
+@pytest.mark.slow
 def test_a_folder_of_images_without_odometry_is_mapped_as_the_video_is(made, video, tmp_path: Path) -> None:
     path, _ = video
     folder = tmp_path / "walk"

@@ -62,6 +62,7 @@ def drive(env: MapweaveEnv, info: dict) -> tuple[float, dict, bool]:
     return total, info, success
 
 
+@pytest.mark.slow
 def test_parking_succeeds_and_pays() -> None:
     """A driver who knows the truth parks, in other worlds for other seeds; who stands still is truncated."""
     env = MapweaveEnv()

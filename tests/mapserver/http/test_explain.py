@@ -135,6 +135,7 @@ def test_the_page_leads_from_maps_to_landmarks(served: Web, browser: Browser) ->
     assert browser.run("return document.querySelectorAll('b').length") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_the_page_shows_the_route_of_its_form_and_of_its_address(served: Web, browser: Browser) -> None:
     start, goal = NodeId("r0", 1, 1), NodeId("r1", 1, 7)
