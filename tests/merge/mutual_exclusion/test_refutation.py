@@ -251,8 +251,8 @@ def test_looking_at_a_thousand_nodes_takes_no_time() -> None:
     assert len(solved) == 1 and len(solved[0].nodes) == 1000
     took = []
     for _ in range(5):
-        start = time.process_time()
+        start = time.thread_time()
         refutation = Refutation(maps, fragments, ExclusionSettings())
         assert refutation.impossible(solved, joining) == ({}, {})
-        took.append(time.process_time() - start)
+        took.append(time.thread_time() - start)
     assert min(took) < 0.02
