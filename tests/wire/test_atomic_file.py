@@ -7,6 +7,7 @@ import resource
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,22 +16,26 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.atomic_file import check_place, write_whole
 
 
-@pytest.fixture
-def small_files(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A disk that takes 1000 bytes a file; Python would keep bytecode that is cut off there."""
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+@contextmanager
+def small_files() -> Iterator[None]:
+    """A disk that takes 1000 bytes a file. Keep it short: what pytest prints may go to a file, too."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    signal.signal(signal.SIGXFSZ, handler)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path, small_files: None) -> None:
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Python would keep bytecode that is cut off.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     path = tmp_path / "x"
     write_whole(path, b"old")
-    with pytest.raises(InvalidFile, match=r"x: cannot be written \(File too large\)"):
+    refused = pytest.raises(InvalidFile, match=r"x: cannot be written \(File too large\)")
+    with refused, small_files():
         write_whole(path, b"new" * 1000)
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
