@@ -54,12 +54,12 @@ NEGATIVE = re.compile(r"-[0-9.][0-9.,=e+-]*$")
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose arguments name the command that was given, as `command`."""
+    """A parser whose arguments name the command that was given, as `command`, and its parser, as `parser`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         """Make a parser; those of its commands are of this class, too."""
         super().__init__(*args, **kwargs)
-        self.set_defaults(command=self.prog)
+        self.set_defaults(command=self.prog, parser=self)
         # Positions begin with a minus as well, and are no options: -3.1,2 and -3.1,2=40,50.
         self._negative_number_matcher = NEGATIVE
 
@@ -112,7 +112,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         import argcomplete
 
         argcomplete.autocomplete(commands)
-    arguments = commands.parse_args(argv)
+    arguments, unknown = commands.parse_known_args(argv)
+    if unknown:
+        # The usage of the command that was given says more than that of `mapweave`.
+        arguments.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     try:
         return int(arguments.run(arguments))
     except MissingExtra as error:

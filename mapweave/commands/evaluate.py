@@ -44,7 +44,9 @@ def add_to(commands: Any) -> None:
     relocalize.add_argument(
         "--robot", metavar="NAME", help="with --map: one of the robots in the recording's splits.toml asks"
     )
-    relocalize.add_argument("--out", type=Path, metavar="DIR", help="write each answer to a table there")
+    relocalize.add_argument(
+        "-o", "--out", type=Path, metavar="DIR", help="write each answer to a table there"
+    )
     relocalize.add_argument("--json", action="store_true", help="print one JSON object at the end")
     relocalize.add_argument(
         "--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline"
@@ -65,7 +67,11 @@ def add_to(commands: Any) -> None:
         help="cut it into N consecutive pieces instead, which overlap by 30 %% (even images, odd images)",
     )  # fmt: skip
     merge.add_argument(
-        "--out", type=Path, metavar="DIR", help="map, links and picture (default: out/eval-merge/FOLDER)"
+        "-o",
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="map, links and picture (default: out/eval-merge/FOLDER)",
     )
     merge.add_argument("--json", action="store_true", help="print one JSON object at the end")
     merge.add_argument(
@@ -87,7 +93,7 @@ def add_to(commands: Any) -> None:
         help="truth.csv, or poses as TUM has them (default: truth.csv beside it)",
     )
     replay.add_argument("--robot", metavar="NAME", help="one of the robots in the recording's splits.toml")
-    replay.add_argument("--out", type=Path, metavar="DIR", help="default: out/eval-replay/RECORDING")
+    replay.add_argument("-o", "--out", type=Path, metavar="DIR", help="default: out/eval-replay/RECORDING")
     replay.add_argument("--json", action="store_true", help="print one JSON object at the end")
     replay.add_argument("--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline")
     replay.set_defaults(run=run_replay)

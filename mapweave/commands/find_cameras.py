@@ -18,7 +18,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "source", nargs="*", help="further video files or streams, as [robot.camera] source takes them"
     )
-    parser.add_argument("--out", type=Path, default=Path("out/cameras"), help="folder for the frames")
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/cameras"), help="folder for the frames")
     parser.add_argument("--width", type=int, default=640, help="asked of devices, px (default: 640)")
     parser.add_argument("--height", type=int, default=480, help="asked of devices, px (default: 480)")
     parser.set_defaults(run=run)

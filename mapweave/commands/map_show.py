@@ -28,7 +28,9 @@ def add_to(actions: Any) -> None:
         "closures applied; a store, and a journal of several maps, is merged first.",
     )
     show.add_argument("file", type=map_source, help=SOURCES)
-    show.add_argument("--out", type=Path, metavar="PNG", help="picture (default: next to the file, as .png)")
+    show.add_argument(
+        "-o", "--out", type=Path, metavar="PNG", help="picture (default: next to the file, as .png)"
+    )
     show.add_argument(
         "--component", type=int, default=0, metavar="N",
         help="which part that is one is drawn (default: 0, the largest)",

@@ -69,7 +69,7 @@ def _add_run(kinds: Any) -> None:
     )
     _add_scenario(parser)
     parser.add_argument("--seed", type=int, help="other seeds, other worlds (default: the scenario's)")
-    parser.add_argument("--out", type=Path, help="folder for the report (default: out/sim/NAME-SEED)")
+    parser.add_argument("-o", "--out", type=Path, help="folder for the report (default: out/sim/NAME-SEED)")
     parser.add_argument("--no-film", action="store_true", help="make no film: a little quicker")
     parser.add_argument(
         "--view", type=int, nargs="?", const=8090, metavar="PORT",
@@ -93,7 +93,7 @@ def _add_batch(kinds: Any) -> None:
     _add_scenario(parser)
     parser.add_argument("--seeds", type=int, default=10, metavar="N", help="how many (default: 10)")
     parser.add_argument("--first", type=int, help="the first seed (default: the scenario's)")
-    parser.add_argument("--out", type=Path, help="folder for the reports (default: out/sim/NAME)")
+    parser.add_argument("-o", "--out", type=Path, help="folder for the reports (default: out/sim/NAME)")
     parser.add_argument("--film", action="store_true", help="make a film of each trial")
     _add_fleet(parser)
     parser.set_defaults(run=run_batch)

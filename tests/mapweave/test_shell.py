@@ -19,6 +19,7 @@ from mapweave.cheat_sheet import as_markdown
 from mapweave.cli import main, parser
 from mapweave.commands.completion import SHELLS
 from mapweave.commands.examples import EXAMPLES
+from mapweave.exit_status import USAGE
 from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, tracked
 from tests.mapweave.command_line import parsers
 
@@ -142,3 +143,12 @@ def test_warnings_of_any_part_have_the_time(words: str, monkeypatch: pytest.Monk
     monkeypatch.setattr("logging.basicConfig", asked)
     with pytest.raises(Asked, match=f"^{STAMP}"):
         main(words.split())
+
+
+def test_an_option_that_is_none_shows_the_usage_of_its_command(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["map", "show", "office.mapweave", "--colour"])
+    assert ended.value.code == USAGE
+    complaint = capfd.readouterr().err
+    assert complaint.startswith("usage: mapweave map show ")
+    assert complaint.endswith("mapweave map show: error: unrecognized arguments: --colour\n")
