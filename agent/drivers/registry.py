@@ -13,6 +13,7 @@ import difflib
 import importlib
 import importlib.util
 import inspect
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -87,7 +88,7 @@ def find_driver(name: str) -> Driver:
     Raises:
         SettingsError: no driver has this name.
         DeviceError: the file or the class is not usable.
-        ModuleNotFoundError: a library of the driver is not installed.
+        ModuleNotFoundError: a library of a driver of this package is not installed.
     """
     path, colon, class_name = name.rpartition(":")
     if colon and path.endswith(".py"):
@@ -101,7 +102,17 @@ def find_driver(name: str) -> Driver:
         close = difflib.get_close_matches(name, known, 1)
         hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}."
         raise SettingsError(f"no driver {name!r}; {hint} Your own is FILE.py:CLASS")
-    return _driver(_imported(known[name]), name)
+    try:
+        return _driver(_imported(known[name]), name)
+    except ModuleNotFoundError as error:
+        if name in SHIPPED:
+            raise
+        raise DeviceError(f"driver {name}: needs the library {error.name}, which is not installed") from error
+    except MapweaveError:
+        raise
+    except Exception as error:
+        words = " ".join(str(error).split())
+        raise DeviceError(f"driver {name} cannot be loaded: {type(error).__name__}: {words}") from error
 
 
 def _imported(target: str) -> object:
@@ -116,6 +127,8 @@ def _of_file(path: Path, name: str) -> object:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    # Where dataclasses, and those that read type hints, look for the module of a class.
+    sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
     except MapweaveError:

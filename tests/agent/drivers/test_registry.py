@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from mapweave.agent.drivers import registry
 from mapweave.agent.drivers.registry import SHIPPED, drivers, find_driver, listing
 from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
 from mapweave.hybridmap.errors import DeviceError, SettingsError
@@ -63,6 +64,43 @@ def test_a_class_in_a_file(tmp_path: Path) -> None:
     settings = RobotSettings(options={"port": "x"})
     robot = find_driver(f"{path}:Rover")(settings)
     assert robot.settings is settings  # type: ignore[attr-defined]
+
+
+def test_a_class_in_a_file_with_a_dataclass_for_its_options(tmp_path: Path) -> None:
+    """Written as the drivers of this package are. Before, it ended in an error from within `dataclasses`."""
+    path = tmp_path / "rover.py"
+    path.write_text(
+        "from __future__ import annotations\n"
+        "from dataclasses import dataclass\n"
+        "from mapweave.storage.settings_file import build\n"
+        "@dataclass(frozen=True)\nclass Options:\n    port: str\n"
+        + CLASS.replace("self.settings = settings", "self.o = build(Options, settings.options, 'options')")
+    )
+    robot = find_driver(f"{path}:Rover")(RobotSettings(options={"port": "x"}))
+    assert robot.o.port == "x"  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "import a_library_that_is_not_there\n",
+            "needs the library a_library_that_is_not_there, which is not",
+        ),
+        ("1 / 0\n", "cannot be loaded: ZeroDivisionError: division by zero"),
+        ("", "cannot be loaded: AttributeError: .* has no attribute 'Rover'"),
+    ],
+)
+def test_a_driver_of_another_package_that_cannot_be_loaded(
+    text: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before, an agent with it ended in a traceback."""
+    (tmp_path / "a_rover.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "a_rover", raising=False)
+    monkeypatch.setattr(registry, "drivers", lambda: {**SHIPPED, "rover": "a_rover:Rover"})
+    with pytest.raises(DeviceError, match=f"^driver rover:? {words}"):
+        find_driver("rover")
 
 
 def test_a_class_that_tells_no_signature(tmp_path: Path) -> None:
