@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.area import Area as Area
     from mapweave.hybridmap.camera import Camera as Camera
     from mapweave.hybridmap.errors import MapweaveError as MapweaveError
+    from mapweave.hybridmap.errors import NotConnected as NotConnected
+    from mapweave.hybridmap.errors import Refused as Refused
     from mapweave.hybridmap.explanation import MapsExplanation as MapsExplanation
     from mapweave.hybridmap.explanation import PairExplanation as PairExplanation
     from mapweave.hybridmap.explanation import RouteExplanation as RouteExplanation
@@ -75,7 +77,7 @@ else:
         "mapweave.hybridmap.agent_status": ("AgentStatus", "FleetStatus", "RobotEntry"),
         "mapweave.hybridmap.area": ("Area",),
         "mapweave.hybridmap.camera": ("Camera",),
-        "mapweave.hybridmap.errors": ("MapweaveError",),
+        "mapweave.hybridmap.errors": ("MapweaveError", "NotConnected", "Refused"),
         "mapweave.hybridmap.explanation": ("MapsExplanation", "PairExplanation", "RouteExplanation"),
         "mapweave.hybridmap.hybrid_map": ("HybridMap",),
         "mapweave.hybridmap.manual_constraint": ("ManualConstraint",),

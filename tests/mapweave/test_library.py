@@ -26,8 +26,8 @@ TOUR = [mapweave.Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
 PUBLIC = """
     AgentStatus Area Camera Certainty Command Edge EdgeKind FileMap Fleet FleetEvent FleetStatus
     HybridMap Landmarks ManualConstraint Map MapChanged MapEvent MapEventKind MapFile MapId
-    MapsExplanation MapweaveError MissionKind MissionReport MissionState Node NodeId NodeTable
-    Observation Odometry PairExplanation Pose2 PoseGaussian RelocalizeAnswer Relocalizer Robot
+    MapsExplanation MapweaveError MissionKind MissionReport MissionState Node NodeId NodeTable NotConnected
+    Observation Odometry PairExplanation Pose2 PoseGaussian Refused RelocalizeAnswer Relocalizer Robot
     RobotDescription RobotEntry RouteExplanation View connect maps_of merge_map_files open read_camera
     read_grey read_map_file relocalizer_of view_of write_map_file
 """
