@@ -115,12 +115,17 @@ class Capture:
     # In the camera's thread.
 
     def _serve(self) -> None:
+        reported: Frame | None = None
+        said = False
         while not self._closing:
-            self._take_all()
+            reason = self._take_all()
             self._capture.release()
             if self._is_file or self._closing:
                 return
-            log.warning("camera %s delivers no images; opening it again", self._settings.source)
+            # A camera that opens and delivers nothing is reported once, not with each attempt.
+            if not said or self._newest is not reported:
+                log.warning("camera %s delivers no images%s; opening it again", self._settings.source, reason)
+                reported, said = self._newest, True
             while not self._closing:
                 time.sleep(RETRY)
                 try:
@@ -129,8 +134,20 @@ class Capture:
                 except DeviceError:
                     continue
 
-    def _take_all(self) -> None:
-        """Capture until the source ends."""
+    def _take_all(self) -> str:
+        """Capture until the source ends; returns why it did, if OpenCV says."""
+        try:
+            self._take_each()
+        except cv2.error as error:
+            return f" ({' '.join(str(error.err or error).split())})"
+        return ""
+
+    def _take_each(self) -> None:
+        """Capture until the source ends.
+
+        Raises:
+            cv2.error: an image is in no format that can be used.
+        """
         capture, settings = self._capture, self._settings
         begin, locked = time.monotonic(), not (settings.lock_exposure and self._is_device)
         while not self._closing and capture.grab():

@@ -56,5 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
             recorded.close()
     finally:
         bus.close()
-    print(f"{name}: {recorded.written} observations in {arguments.out}")
+    # What came in the last seconds before a disk was full is there in part.
+    most = "at most " if recorded.failed else ""
+    print(f"{name}: {most}{recorded.written} observations in {arguments.out}")
     return 1 if recorded.failed else 0

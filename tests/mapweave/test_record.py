@@ -81,4 +81,6 @@ def test_a_full_disk_ends_the_command(
     monkeypatch.setattr("mapweave.agent.recordings.mcap_writer._Part.write", full)
     out = str(tmp_path / "drive")
     assert main(["record", "r0", "--out", out, "--robot", driver, "--connect", "tcp/127.0.0.1:1"]) == 1
-    assert capfd.readouterr().err.count("the recording ends here, No space left on device") == 1
+    output = capfd.readouterr()
+    assert output.err.count("the recording ends here, No space left on device") == 1
+    assert "r0: at most 0 observations in" in output.out

@@ -15,6 +15,7 @@ from mapweave.agent.drivers.camera import Capture
 from mapweave.agent.drivers.settings import CameraSettings
 from mapweave.hybridmap.errors import DeviceError
 from tests.mjpeg_stream import MjpegStream
+from tests.waiting import eventually
 
 WIDTH, HEIGHT = 64, 48
 RATE = 20.0
@@ -172,6 +173,27 @@ class Device:
 
     def release(self) -> None:
         self.released = True
+
+
+class Unusable(Device):
+    """It opens each time, and its images are in another format."""
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.zeros((HEIGHT, WIDTH, 2), np.uint8)
+
+
+def test_a_device_with_images_of_another_format_is_reported_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Before, its thread ended with a traceback, and a camera without images was logged each second."""
+    opened: list[object] = []
+    monkeypatch.setattr("cv2.VideoCapture", lambda *arguments: opened.append(arguments) or Unusable(True))
+    monkeypatch.setattr("mapweave.agent.drivers.camera.RETRY", 0.05)
+    camera = Capture(settings("/dev/video2"))
+    eventually(lambda: len(opened) >= 4)
+    camera.close()
+    (line,) = caplog.messages
+    assert line.startswith("camera /dev/video2 delivers no images (") and line.endswith("; opening it again")
 
 
 @pytest.mark.parametrize("locks", [True, False])
