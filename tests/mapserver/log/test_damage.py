@@ -50,7 +50,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ROBOTS:
         journal = Journal(fleet.folder / name, name)
         map_id = journal.open_map(None)
-        journal.write(map_id, [Draft.of(body, k) for k, body in enumerate(life(map_id, rng, 40))])
+        journal.write(map_id, [Draft.of(body, k) for k, body in enumerate(life(map_id, rng, 25))])
         journal.close()
     fleet.start_server()
     fleet.start_robots()
