@@ -16,6 +16,7 @@ from mapweave.agent.pipeline import Step
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.settings import AgentSettings
 from mapweave.extras import need
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_progress import AgentProgress
 from mapweave.processes.ros2_publisher import Ros2Publisher
@@ -91,6 +92,9 @@ def run_agent(
                 # The journal is complete also where a full disk takes no map file.
                 _hand_over(say, agent.replicator, bus, options)
                 agent.close()
+        status = agent.replicator.status()
+        if status.waiting:
+            raise InvalidFile(f"{options.name}: {status.waiting} changes are lost: {status.failure}")
 
 
 def rerun_log(target: str, robot: str) -> RerunLog:

@@ -18,6 +18,7 @@ from mapweave.agent.observation import Command, Observation, Odometry, RobotDesc
 from mapweave.agent.pipeline import Step
 from mapweave.agent.replication import salvage
 from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.exit_status import USAGE
@@ -436,6 +437,23 @@ def test_a_process_that_ends_after_an_episode_keeps_what_follows_from_it(tmp_pat
     bus.close()
     file = read_map_file(tmp_path / "process" / "r0.1.mapweave")
     assert HybridMap(file.changes).edges.keys() == edges
+
+
+def test_changes_that_no_disk_took_are_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, a line of the log said so, and the exit status was that of success."""
+
+    def full(*_: object) -> int:
+        raise InvalidFile("the disk is full")
+
+    monkeypatch.setattr(Journal, "write", full)
+    monkeypatch.setattr(Replicator, "flush", lambda *_: False)
+    bus = MemoryBus(MemoryHub())
+    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.0)
+    # Until a first node.
+    robot = Carried(60)
+    with pytest.raises(InvalidFile, match=r"^r0: \d+ changes are lost: the disk is full$"):
+        run_agent(robot, bus, KEYS, AgentSettings(), options, threading.Event())
+    bus.close()
 
 
 class Ended:
