@@ -315,7 +315,8 @@ def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
 @pytest.mark.parametrize("with_server", [True, False])
 def test_a_person_whose_clock_is_behind_can_still_stop_a_robot(house: House, with_server: bool) -> None:
     link, control = house.robot()
-    ahead = MissionOrder("late", "r0", MissionKind.EXPLORE, 2**62, "bob")
+    # By an hour: what is a day ahead no server hands on.
+    ahead = MissionOrder("late", "r0", MissionKind.EXPLORE, time.time_ns() + 3_600_000_000_000, "bob")
     control.take(ahead)
     if not with_server:
         house.stop_server()
