@@ -32,6 +32,8 @@ ASK_TIMEOUT = 2.0
 PATIENCE = 90.0
 """Longest silence of a base, s. A simulated base is silent while it waits for the agents of other robots."""
 
+START = "start the robot's base (for a simulated one: mapweave sim serve) with the same fleet and endpoint"
+WAITS = "a simulated base (mapweave sim serve) waits for the agents of all its robots: start these as well"
 PAUSE = 0.05
 """Between two questions while there is no answer, s."""
 
@@ -174,10 +176,7 @@ class RemoteRobot:
                     raise DeviceError(f"{key}: refused: {reason}")
             now = time.monotonic()
             if now >= end:
-                raise DeviceError(
-                    f"{key}: {reason} for {self._patience:g} s; start the robot's base (for a simulated one: "
-                    "mapweave sim serve) with the same fleet and endpoint"
-                )
+                raise DeviceError(f"{key}: {reason} for {self._patience:g} s; {START if gone else WAITS}")
             if now - begin >= ASK_TIMEOUT and self._description is not None:
                 if not reported:
                     log.warning("%s: %s; the agent waits up to %g s", key, _cause(gone), self._patience)

@@ -147,6 +147,8 @@ def _motion(
 
 def _advice(error: str) -> str:
     """What to do about an error of a driver, most of which say it themselves."""
+    if "waits for the agents" in error:
+        return "start the agents of its other robots, or a simulation of this robot alone: --set robots=1"
     if "mapweave sim serve" in error:
         return "start it, and the router between (mapweave server), or give --robot robot.toml"
     if "in use" in error:

@@ -362,6 +362,15 @@ def test_an_impossible_observation_is_retried_once_then_refused_in_one_line(
     assert [step.sequence for step in body.steps] == [1, 1, 2, 2]
 
 
+def test_a_base_that_is_there_and_silent_is_not_said_to_be_missing(body: Body, bus: MemoryBus) -> None:
+    """A simulated one waits for the agents of its other robots. Before, a person was sent to start it."""
+    robot = RemoteRobot(bus, "test", "r0", patience=0.2)
+    robot.describe()
+    body.answers = [silence] * 9
+    with pytest.raises(DeviceError, match=r"robot/r0/step: no answer for .*waits for the agents of all its"):
+        robot.sense()
+
+
 def test_a_missing_base_is_reported_in_one_line(bus: MemoryBus) -> None:
     begin = time.monotonic()
     with pytest.raises(DeviceError, match=r"robot/r0/describe: no answer .*mapweave sim") as error:
