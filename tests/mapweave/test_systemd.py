@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from mapweave.cli import main, parser
+from mapweave.doctor.ports import PATTERNS
 from mapweave.scenarios.children import free_port
 
 UNITS = sorted((Path(__file__).parents[2] / "examples" / "systemd").glob("*.service"))
@@ -87,6 +88,14 @@ def manager(tmp_path: Path) -> Iterator[socket.socket]:
         listening.bind(str(tmp_path / "notify"))
         listening.settimeout(30.0)
         yield listening
+
+
+def test_an_agent_may_open_every_port_that_find_port_finds() -> None:
+    """The UART of a Raspberry Pi with Bluetooth is /dev/ttyS0, that of a Jetson /dev/ttyTHS1."""
+    (unit,) = [unit for unit in UNITS if "agent" in unit.name]
+    allowed = directives(unit)["DeviceAllow"]
+    for name in ("ttyS", *(pattern.removesuffix("*") for pattern in PATTERNS if "cu." not in pattern)):
+        assert f"char-{name} rw" in allowed
 
 
 def test_an_agent_is_ready_and_alive(manager, recording, monkeypatch, tmp_path) -> None:
