@@ -96,8 +96,7 @@ def test_a_place_that_was_replaced_is_restored(person: Person, server: MapServer
     page = person.page
     name_place(person, "kitchen", str(FIRST))
     name_place(person, "kitchen", str(LAST))
-    person.page.run("document.querySelector('#corrections li button').click()")
-    eventually(lambda: len(server.annotations().made) == 3)
+    person.take_back(server)
     person.press("tab-events")
     eventually(lambda: len(page.run(CORRECTIONS)) == 3)
     _, second, first = page.run(CORRECTIONS)
