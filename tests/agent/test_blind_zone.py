@@ -85,7 +85,7 @@ def test_where_the_robot_has_just_been_there_is_nothing() -> None:
 
     _, _, filled = drive(zone, Pose2(), [(0.01, 0.0)] * 11, always)
     assert filled[BEHIND] == pytest.approx(0.1, abs=0.011)
-    # It has been all over the zone: somebody has stepped up behind it.
+    # It has been all over the zone: a person has stepped up behind it.
     _, _, filled = drive(zone, Pose2(), [(0.01, 0.0)] * 40, always)
     assert filled[BEHIND] == 0.0
 
