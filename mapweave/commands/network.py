@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -214,11 +215,22 @@ def warn_without_router(bus: ZenohBus, name: str) -> None:
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGTERM, Ctrl-C and a parent's end set, so that a process can end in order."""
+    """An event that SIGTERM, Ctrl-C, the end of the terminal or of a parent set: a process can end in order.
+
+    A process that `nohup` has started outlasts its terminal.
+    """
     from mapweave.processes import parent_watchdog
 
     stop, came = threading.Event(), SimpleQueue[int]()
     parent_watchdog.hold(stop)
+    terminals = [number for number in (1, 2) if os.isatty(number)]
+
+    def hang_up(signum: int, _: object) -> None:
+        # To write to a terminal that is gone is an error, and what ends in order says so.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for number in terminals:
+            os.dup2(nowhere, number)
+        came.put(signum)
 
     def wait() -> None:
         came.get()
@@ -229,4 +241,6 @@ def stop_on_signals() -> threading.Event:
     threading.Thread(target=wait, name="signals", daemon=True).start()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda signum, _: came.put(signum))
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, hang_up)
     return stop

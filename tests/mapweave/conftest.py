@@ -19,7 +19,7 @@ from tests.waiting import free_port
 @pytest.fixture
 def signals() -> Iterator[None]:
     """Commands take signals for themselves."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     yield
     for number, handler in before.items():
         signal.signal(number, handler)

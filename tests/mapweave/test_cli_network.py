@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import signal
 import subprocess
 import sys
@@ -148,3 +150,41 @@ print(stop.wait(30))
     run = [sys.executable, "-c", program]
     done = subprocess.run(run, capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "True\n"
+
+
+def test_a_process_ends_in_order_with_its_terminal(tmp_path):
+    """As when the connection to a robot breaks. Before, it ended at once, and what waited was not written."""
+    program = f"""
+import fcntl, pathlib, sys, termios
+from mapweave.commands.network import stop_on_signals
+fcntl.ioctl(0, termios.TIOCSCTTY)
+stop = stop_on_signals()
+print("ready", flush=True)
+came = stop.wait(30)
+print("ends", flush=True)
+pathlib.Path({str(tmp_path / "written")!r}).write_text(str(came))
+"""
+    master, slave = pty.openpty()
+    run = [sys.executable, "-c", program]
+    with subprocess.Popen(run, stdin=slave, stdout=slave, stderr=slave, start_new_session=True) as process:
+        os.close(slave)
+        output = b""
+        while b"ready" not in output:
+            output += os.read(master, 100)
+        os.close(master)
+        assert process.wait(60) == 0
+    assert (tmp_path / "written").read_text() == "True"
+
+
+def test_nohup_keeps_a_process():
+    program = """
+import signal
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+from mapweave.commands.network import stop_on_signals
+stop = stop_on_signals()
+signal.raise_signal(signal.SIGHUP)
+print(stop.wait(0.3))
+"""
+    run = [sys.executable, "-c", program]
+    done = subprocess.run(run, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "False\n"
