@@ -52,7 +52,6 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
     """
     from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.area import FARTHEST, LEAST_CORNERS, MOST_CORNERS
-    from mapweave.mapserver.places import position_of
 
     fields: dict[str, object] = {}
     if arguments.radius is not None:
@@ -61,7 +60,7 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
             raise UsageError(f"--radius {arguments.radius:g}: give metres, at most {FARTHEST:g}")
         fields["radius"] = arguments.radius
     if arguments.corners:
-        corners = [position_of(word) for word in arguments.corners]
+        corners = [two_numbers(word) for word in arguments.corners]
         if None in corners or not LEAST_CORNERS <= len(corners) <= MOST_CORNERS:
             many = f"{LEAST_CORNERS} to {MOST_CORNERS}"
             raise UsageError(f"--corners: give {many} positions, as 3.1,-2.0 4,-2 4,1.5")
@@ -69,6 +68,17 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
     if arguments.near:
         fields["near"] = arguments.near
     return fields
+
+
+def two_numbers(word: str) -> tuple[float, float] | None:
+    """A position or a pixel; None for what is neither."""
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.places import position_of
+
+    try:
+        return position_of(word)
+    except InvalidValue:
+        return None
 
 
 @contextmanager

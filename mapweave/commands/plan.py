@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands.annotating import add_record_options, record_of
+from mapweave.commands.annotating import add_record_options, record_of, two_numbers
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -204,10 +204,9 @@ def _pair(word: str) -> dict[str, Any]:
         UsageError: it is none.
     """
     from mapweave.commands.usage import UsageError
-    from mapweave.mapserver.places import position_of
 
     place, equals, pixel = word.rpartition("=")
-    position = position_of(pixel) if equals and place.strip() else None
+    position = two_numbers(pixel) if equals and place.strip() else None
     if position is None:
         raise UsageError(f"--pair {word}: write {PAIR}")
     return {"at": place.strip(), "u": position[0], "v": position[1]}

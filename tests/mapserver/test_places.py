@@ -283,6 +283,7 @@ def test_places_of_a_map_file_from_the_shell(
     )  # fmt: skip
     for wrong in (["add", "x"], ["add", "x", "r0.1.3", "--corners", "0,0"], ["add", "r0.1", "r0.1.3"],
                   ["add", "x", "r0.1.3", "--radius", "-1"], ["add", "x", "--corners", "0,0", "1,0"],
+                  ["add", "x", "--corners", "0,0", "1,0", "nan,1"],
                   ["add", "x", "r0.1.3", "--radius", "nan"]):  # fmt: skip
         status, _, err = run("place", *wrong)
         assert status == USAGE and err.count("\n") == 1, wrong

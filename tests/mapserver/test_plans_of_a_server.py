@@ -274,6 +274,7 @@ def test_plans_and_pins_of_a_map_file_from_the_shell(
         (["plan", "add", "none.png", "--pair", "r0.1.3=1,2"], "cannot be read", FAILED),
         (["plan", "add", "none.yaml", "--pair", "r0.1.3=1,2"], "cannot be read", FAILED),
         (["plan", "add", "none.png", "--pair", "r0.1.3"], "write r0.1.17=412,230", USAGE),
+        (["plan", "add", "none.png", "--pair", "r0.1.3=1,nan"], "write r0.1.17=412,230", USAGE),
         (["plan", "add", "none.png", "--pair", "=1,2"], "write r0.1.17=412,230", USAGE),
         (
             ["plan", "add", "none.yaml", "--pair", "r0.1.3=1,2", "--metres-per-pixel", "0.1"],
