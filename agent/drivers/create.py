@@ -18,6 +18,8 @@ from mapweave.storage.settings_file import build
 START, SAFE, DRIVE_DIRECT, QUERY_LIST = 128, 131, 145, 149
 BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS = 7, 25, 26, 35, 43, 44
 """Sensor packets; their sizes are 1, 2, 2, 1, 2 and 2 bytes. Charge and capacity are in mAh."""
+WHEEL_DROPS = 0b1100
+"""Bits of both wheels in the packet of the bumper."""
 PASSIVE = 1
 """Mode without wheel control; a cliff, a wheel drop or the charger ends the Safe mode."""
 METRES_PER_COUNT = math.pi * 72e-3 / 508.8
@@ -83,7 +85,9 @@ class CreateBase(GuardedBase):
         now = time.monotonic()
         way = Wheels(self._counters[0].update(left, now), self._counters[1].update(right, now))
         battery = min(charge / capacity, 1.0) if capacity else None
-        return BaseReading(way, bumped=bool(bumps & 0b11), battery=battery)
+        # One wheel drops at a threshold, too.
+        lifted = bumps & WHEEL_DROPS == WHEEL_DROPS
+        return BaseReading(way, bumped=bool(bumps & 0b11), battery=battery, kidnapped=lifted)
 
 
 def _millimetres(speeds: Wheels) -> tuple[int, int]:

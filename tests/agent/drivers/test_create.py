@@ -38,6 +38,13 @@ class TestCreate(RobotContract):
             seen = drive(robot, Command(), 0.3)
             assert seen[-1].bumped is bumped
 
+    def test_both_wheels_drop_when_it_is_lifted(self, robot: Robot, emulator: Any) -> None:
+        """Before, it did not say so, and the agent mapped on from where it had been."""
+        for drops, lifted in ((0b0000, False), (0b0100, False), (0b1000, False), (0b1100, True), (0, False)):
+            emulator.bumps = drops
+            seen = drive(robot, Command(), 0.3)
+            assert seen[-1].kidnapped is lifted
+
     def test_the_battery_is_a_share_of_its_capacity(self, robot: Robot, emulator: Any) -> None:
         assert drive(robot, Command(), 0.3)[-1].battery == pytest.approx(0.75)
         emulator.charge = 2700  # a new battery holds a little more than it says
