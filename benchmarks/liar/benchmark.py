@@ -8,7 +8,7 @@ log, with one lie in it. When all is merged, and once more after the server was 
 compared with what they have without the fourth robot: the links among their maps, the poses of their nodes,
 and the answers to lost robots; views to which an honest fourth robot changes the answer are left out. A lie
 is contained if links and answers are the same and no node has moved by more than 5 cm: an honest fourth one
-moves them by 2 to 3 cm. It is named if the history that the page shows holds it against the robot. Two ways
+moves them by 2 to 3 cm. It is named if the history that the page shows holds it against the robot. Some ways
 cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
 """
 

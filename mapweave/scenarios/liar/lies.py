@@ -32,6 +32,9 @@ EPOCHS = 40
 ALTERED_PIXEL, ALTERED_CODE, ALTERED_DEPTH = 0.7, 0.04, 0.03
 """By how much two views of a landmark differ: standard deviations, px, of a decoded descriptor's coordinates,
 and of the depth as a share of it."""
+ASIDE, MISSED, NEAREST = (0.15, 0.15, 0.1), 0.3, 0.3
+"""How far aside, standard deviations in m, m and rad; which share of the landmarks is missed; nearer than this
+none is seen, m."""
 CODE_SIGMA = 0.12
 """Of the coordinates of decoded descriptors that belong to nothing: norms are then those of real ones."""
 
@@ -249,6 +252,12 @@ def altered_places(s: Setting) -> Lie:
     return Lie({s.map: messages(s.map, bodies(_captured(s, [altered(node, s.rng) for node in s.theirs()])))})
 
 
+def places_from_aside(s: Setting) -> Lie:
+    """The same, each copy as it would look from a little aside, with some of its landmarks."""
+    seen = [seen_from_aside(node, s.rng) for node in s.theirs()]
+    return Lie({s.map: messages(s.map, bodies(_captured(s, seen)))})
+
+
 def mixed_landmarks(s: Setting) -> Lie:
     """The own map, with half of each node's landmarks taken from others' nodes."""
     theirs, nodes = s.theirs(), []
@@ -274,6 +283,27 @@ def altered(node: Node, rng: np.random.Generator) -> Node:
             pixels.astype(np.float32), codes, depths.astype(np.float32), marks.depth_sigmas
         )
     )  # fmt: skip
+
+
+def seen_from_aside(node: Node, rng: np.random.Generator) -> Node:
+    """A node as a view from a little aside would be, by the depths of its landmarks; some are missed."""
+    marks, camera = node.landmarks, node.camera
+    x, y, heading = rng.normal(0.0, ASIDE)
+    slope = (marks.pixels[:, 0] - camera.cx) / camera.fx
+    ahead, left = marks.depths + camera.mount_forward - x, -slope * marks.depths - y
+    cos, sin = np.cos(heading), np.sin(heading)
+    depths = cos * ahead + sin * left - camera.mount_forward
+    with np.errstate(divide="ignore", invalid="ignore"):
+        columns = camera.cx + camera.fx * (sin * ahead - cos * left) / depths
+        rows = camera.cy + (marks.pixels[:, 1] - camera.cy) * marks.depths / depths
+    inside = (columns >= 0.0) & (columns < camera.width) & (rows >= 0.0) & (rows < camera.height)
+    kept = np.flatnonzero(inside & (depths > NEAREST) & (rng.random(len(marks)) > MISSED))
+    pixels = np.stack([columns, rows], axis=1)[kept].astype(np.float32)
+    sigmas = marks.depth_sigmas[kept]
+    seen = Landmarks(pixels, marks.codes[kept], depths[kept].astype(np.float32), sigmas)
+    return altered(replace(
+        node, landmarks=seen, map_from_robot=node.map_from_robot @ PoseGaussian(Pose2(x, y, heading), SURE)
+    ), rng)  # fmt: skip
 
 
 def alike(a: Node, b: Node) -> int:
@@ -348,6 +378,7 @@ WAYS: dict[str, Callable[[Setting], Lie]] = {
 UNDECIDABLE: dict[str, Callable[[Setting], Lie]] = {
     "another's times": same_times,
     "altered copied places": altered_places,
+    "places seen from aside": places_from_aside,
 }
 """Maps that are right in themselves and could be of a second building that looks the same: nothing that a
 server knows tells which of the two robots lies. Links and poses shall stay; answers may become ambiguous."""
