@@ -33,8 +33,8 @@ ALTERED_PIXEL, ALTERED_CODE, ALTERED_DEPTH = 0.7, 0.04, 0.03
 """By how much two views of a landmark differ: standard deviations, px, of a decoded descriptor's coordinates,
 and of the depth as a share of it."""
 ASIDE, MISSED, NEAREST = (0.15, 0.15, 0.1), 0.3, 0.3
-"""How far aside, standard deviations in m, m and rad; which share of the landmarks is missed; from which depth
-on they are seen, m."""
+"""How far aside, standard deviations in m, m and rad; which share of the landmarks is missed; from which
+depth on they are seen, m."""
 CODE_SIGMA = 0.12
 """Of the coordinates of decoded descriptors that belong to nothing: norms are then those of real ones."""
 
