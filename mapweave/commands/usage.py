@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue, Refused
 
 
 class UsageError(InvalidValue):
@@ -14,12 +14,15 @@ class UsageError(InvalidValue):
 
 @contextmanager
 def arguments_read() -> Iterator[None]:
-    """Within it words of the command line are read, and nothing is asked yet.
+    """Within it words of the command line are read; a name among them may be looked up in a map.
 
     Raises:
-        UsageError: instead of InvalidValue.
+        Refused: the map does not have the name.
+        UsageError: instead of any other InvalidValue.
     """
     try:
         yield
+    except Refused:
+        raise
     except InvalidValue as error:
         raise UsageError(str(error)) from error

@@ -277,6 +277,14 @@ def test_places_of_a_map_file_from_the_shell(
     status, out, _ = run("map", "route", "kitchen", "r0.1.9", "--json")
     assert status == 0 and json.loads(out)["start"] == "r0.1.3"
     assert "r0.1.3" in run("map", "explain", "kitchen", "r0.1.9")[1]
+    for where, what in (
+        ("kitchen", "node r0.1.3 is retired"),
+        ("hall", "the area of 16 corners at r0.1.3"),
+    ):
+        status, out, _ = run("map", "retire", where, "--check")
+        assert status == 0 and out.startswith(f"only checked, nothing is changed: {what}"), out
+    assert run("map", "retire", "hall", "kitchen", "--check")[0] == USAGE
+    assert run("map", "retire", "attic", "--check")[0] == NO
     assert run("map", "route", "kitschen", "r0.1.9") == (
         NO, "", "mapweave: 'kitschen' is no place of this map (is it kitchen?): give a node (r0.1.17), the "
         "name of a place, or a position in the merged map (3.1,-2.0)\n",
