@@ -19,11 +19,12 @@ def add_to(actions: Any) -> None:
         help="retire a map, nodes, an area or a time window: they take no part in anything",
         description="Retire a map (r0.1), some nodes (r0.1.17 r0.1.18), an area (its name, or --area), or "
         "what a map has of a time (r0.1 --from --to): it takes no part in the merge any more, no route leads "
-        "through it, and no view is recognised by it. Nothing is deleted: it is retired until that is taken back with "
-        "--undo or `mapweave map undo`, also when robots map on and the server starts again; nodes that come "
-        "into an area or a time window later are retired too. A robot's own way keeps tying what lies before "
-        "and behind a retired node; --check says beforehand whether a map falls into pieces. What robots map "
-        "again need not be retired: newer nodes replace the older ones by themselves.",
+        "through it, and no view is recognised by it. Nothing is deleted: it is retired until that is "
+        "taken back with --undo or `mapweave map undo`, also when robots map on and the server starts "
+        "again; nodes that come into an area or a time window later are retired too. A robot's own way "
+        "keeps tying what lies before and behind a retired node; --check says beforehand whether a map "
+        "falls into pieces. What robots map again need not be retired: newer nodes replace the older "
+        "ones by themselves.",
     )
     parser.add_argument(
         "which", nargs="*", metavar="MAP|NODE|PLACE",
