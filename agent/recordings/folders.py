@@ -15,7 +15,7 @@ from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven, com
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Images, Recording, Stamps, stamps_of
-from mapweave.agent.recordings.table_file import named_columns
+from mapweave.agent.recordings.table_file import named_columns, read_text
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
@@ -173,12 +173,10 @@ def _camera(image: Path, intrinsics: Intrinsics) -> Camera:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return read_whole(path).decode("utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise DeviceError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise DeviceError(f"{path}: {error}") from None
+    text, damage = read_text(path)
+    if damage:
+        raise DeviceError(damage)
+    return text.splitlines()
 
 
 def _numbers(path: Path, words: Sequence[str]) -> list[float]:

@@ -14,7 +14,6 @@ from mapweave.agent.recordings.table_file import read_text, rows_of
 from mapweave.agent.recordings.toml_file import number
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.limits import MAX_STAMP_NS
-from mapweave.storage.atomic_file import read_whole
 
 INCREMENT_COLUMNS = ("forward_m", "turn_rad")
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
@@ -53,9 +52,12 @@ def read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     """
     if not path.exists():
         return np.linspace(0.0, 0.1 * (count - 1), count)
+    text, damage = read_text(path)
+    if damage:
+        raise DeviceError(damage)
     try:
-        times = np.array([float(line) for line in read_whole(path).decode("utf-8-sig").split()])
-    except (OSError, ValueError) as error:
+        times = np.array([float(line) for line in text.split()])
+    except ValueError as error:
         raise DeviceError(f"{path}: {error}") from None
     if len(times) != count:
         raise DeviceError(f"{path}: {len(times)} times for {count} images; there must be one each")

@@ -266,7 +266,7 @@ WRONG = {
     "times go back": (written("times.txt", "\n".join(map(str, [*range(13), 3]))), "line 14: 3.0: times must"),
     "times with text": (written("times.txt", "noon"), "times.txt"),
     "times not finite": (written("times.txt", "nan " * COUNT), "ascend"),
-    "times are no text": (written("times.txt", b"\xff" * 9), "times.txt"),
+    "times are no text": (written("times.txt", b"\xff" * 9), "times.txt: is no text in UTF-8; it must be"),
     "times are a folder": (folder_at("times.txt"), "times.txt"),
     "times before any clock": (written("times.txt", " ".join(str(k - 5) for k in range(COUNT))), "times.txt"),
     "times after all clocks": (written("times.txt", " ".join(f"{k}e200" for k in range(1, 15))), "times.txt"),
