@@ -44,7 +44,6 @@ def run(arguments: argparse.Namespace) -> int:
         robots=arguments.robots,
         rooms=arguments.rooms,
         out=arguments.out,
-        quiet=arguments.json,
     )
     report = run_demo(options)
     if arguments.json:

@@ -163,7 +163,6 @@ def run_one(arguments: argparse.Namespace) -> int:
             settings_file=arguments.settings,
             film_every=0.0 if arguments.no_film else 1.0,
             view=arguments.view,
-            quiet=arguments.json,
             rerun=arguments.rerun,
         ),
     )

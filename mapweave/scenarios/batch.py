@@ -52,7 +52,7 @@ def run_batch_of_trials(scenario: Scenario, options: BatchOptions) -> bool:
     Returns:
         Whether every trial ran to its end and met its expectations.
     """
-    console = plain_or_terminal(quiet=options.json)
+    console = plain_or_terminal()
     attempts: list[Attempt] = []
     with Bar(console, scenario.name, options.seeds) as bar:
         for seed in range(options.first, options.first + options.seeds):

@@ -118,7 +118,9 @@ def test_a_trial_prints_one_json_object(capfd, tmp_path):
         "9",
     ]
     assert main(arguments) == 0
-    printed = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
+    output = capfd.readouterr()
+    assert "wait" in output.err, "its progress, beside what a script reads"
+    printed = json.loads(output.out.strip().splitlines()[-1])
     assert (printed["passed"], printed["seed"], printed["scenario"]) == (True, 9, "one")
     assert printed["figures"]["sim_s"] == 1.0
     assert json.loads((tmp_path / "out" / "figures.json").read_text())["figures"] == printed["figures"]
