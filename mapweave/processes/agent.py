@@ -278,6 +278,11 @@ class Agent:
             self._causes += 1
 
     @property
+    def server_in_reach(self) -> bool:
+        """Whether any map server is known to be reachable."""
+        return self._fleet.server_in_reach()
+
+    @property
     def map_id(self) -> MapId:
         """The map that it makes."""
         return self.replicator.map_id

@@ -13,7 +13,6 @@ import cv2
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Step
-from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.settings import AgentSettings
 from mapweave.extras import need
 from mapweave.hybridmap.errors import InvalidFile
@@ -90,7 +89,7 @@ def run_agent(
                 say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
             finally:
                 # The journal is complete also where a full disk takes no map file.
-                _hand_over(say, agent.replicator, bus, options)
+                _hand_over(say, agent, bus, options)
                 agent.close()
         status = agent.replicator.status()
         if status.waiting:
@@ -135,8 +134,9 @@ def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> Rob
 
 
 def _hand_over(
-    say: Callable[[str], None], replicator: Replicator, bus: ZenohBus | MemoryBus, options: AgentOptions
+    say: Callable[[str], None], agent: Agent, bus: ZenohBus | MemoryBus, options: AgentOptions
 ) -> None:
+    replicator = agent.replicator
     if not replicator.flush(10.0):
         return  # closing it says what is lost
     status = replicator.status()
@@ -148,6 +148,8 @@ def _hand_over(
         line = "no server in reach: the map stays in the journal and is sent when one can be reached"
     elif replicator.wait_acknowledged(options.patience):
         line = f"server {options.server} has it all"
+    elif not agent.server_in_reach:
+        line = f"no map server {options.server} in reach: the map stays in the journal until it can be sent"
     else:
         line = f"server {options.server} has not acknowledged everything: the rest stays in the journal"
     say(f"{options.name}: {line}")

@@ -488,6 +488,16 @@ def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_pat
     journal.close()
 
 
+def test_an_agent_that_ends_without_a_map_server_says_so(tmp_path: Path, capfd) -> None:
+    """There is a router. Before, it said that the server has not acknowledged everything."""
+    bus = ZenohBus(BusSettings(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",)))
+    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.3)
+    run_agent(Carried(60), bus, KEYS, AgentSettings(), options, threading.Event())
+    bus.close()
+    output = capfd.readouterr()
+    assert "r0: no map server s0 in reach: the map stays in the journal" in output.out + output.err
+
+
 def test_an_agent_that_has_mapped_nothing_says_of_no_server_that_it_has_it_all(tmp_path, capfd):
     """There is a router, and no map server."""
     bus = ZenohBus(BusSettings(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",)))
