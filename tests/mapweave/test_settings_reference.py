@@ -52,6 +52,7 @@ def test_what_has_no_default_is_printed_as_a_comment() -> None:
     text = re.sub(r"^#(\[|\w+ =)", r"\1", as_toml(), flags=re.MULTILINE)
     text = text.replace("ranger_bearings_deg =", "ranger_bearings_deg = [1]")
     text = text.replace("wheel_noise =", "wheel_noise = 0.1")
+    text = text.replace("height_m =", "height_m = 0.2")
     text = re.sub(r"= *$", "= 64", text, flags=re.MULTILINE)
     settings = build(Settings, tomllib.loads(text), "filled in")
     assert settings.robot.camera is not None and settings.robot.geometry.axle == 64.0
