@@ -11,7 +11,7 @@ import numpy as np
 from mapweave.hybridmap.constraint_subject import RetiredWindow
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.plausibility import fragments, unreliable_robots
+from mapweave.mapserver.plausibility import LEAST_NODES, fragments, unreliable_robots
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.retrieval.ranking import Ranked
 from mapweave.mapserver.wire_limits import FARTHEST
@@ -101,10 +101,13 @@ def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
 
 
 def _adrift(merged: MergedMap) -> Iterator[NodeId]:
-    """Nodes of fragments that nothing joins with a larger map: an answer from there would be of no use."""
-    small = set(fragments(merged.maps, merged.pruned.maps))
-    for graph in merged.graphs if small else ():
-        if graph.maps <= small:
+    """Nodes of fragments, and of small pieces of implausible maps, that nothing joins with a larger map.
+
+    An answer from there would be of no use.
+    """
+    small, odd = set(fragments(merged.maps, merged.pruned.maps)), merged.implausible.keys()
+    for graph in merged.graphs if small or odd else ():
+        if graph.maps <= small or (graph.maps <= odd and len(graph.nodes) < LEAST_NODES):
             yield from graph.nodes
 
 

@@ -15,6 +15,7 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.hybridmap.superseded import Superseded
+from mapweave.mapserver import active_nodes
 from mapweave.mapserver.active_nodes import ActiveNodes, without_faded
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
@@ -147,3 +148,15 @@ def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
     assert ActiveNodes(two.merger.places, two.merger.node, merged).node(node_id) is node
     fresh = replace(node, landmarks=node.landmarks.take(np.arange(len(gone) - 1)))
     assert without_faded(fresh, faded) is fresh, "it is known better than what was found out"
+
+
+def test_small_pieces_of_implausible_maps_answer_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot of which all edges are refused leaves as many pieces as nodes, each a place of its own."""
+    two = Two()
+    merged = two.merger.merged()
+    theirs = {node for node in two.truth if node.map == THERE}
+    odd = replace(merged, implausible={THERE: "its clock utc runs backwards"})
+    for which, least, hidden in ((merged, 4, set()), (odd, 4, theirs), (odd, len(theirs), set())):
+        monkeypatch.setattr(active_nodes, "LEAST_NODES", least)
+        active = ActiveNodes(two.merger.places, two.merger.node, which)
+        assert {node for node in two.truth if active.node(node) is None} == hidden
