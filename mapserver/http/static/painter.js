@@ -24,7 +24,7 @@ export class Painter {
       Object.assign(this, { bitmap, drawn: view, waiting: false });
       this.ask();
     };
-    this.worker.onerror = () => { byId("undrawn").hidden = false; };
+    this.worker.onerror = () => { this.waiting = false; byId("undrawn").hidden = false; };
   }
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas, ratio = window.devicePixelRatio || 1;
@@ -79,7 +79,8 @@ export class Painter {
   // Ask for a bitmap where the last one does not fit the window; one at a time.
   refresh() {
     const { viewport: v, drawn: d, ratio } = this;
-    if (this.waiting || !this.model.members || !this.stale && d?.scale === v.scale && this.covers(d)) return;
+    if (this.waiting || !this.model.members || !v.width || !v.height) return;
+    if (!this.stale && d?.scale === v.scale && this.covers(d)) return;
     const width = v.width * (1 + 2 * BORDER), height = v.height * (1 + 2 * BORDER);
     const wide = width / v.scale, high = height / v.scale;
     this.waiting = true; this.stale = false;

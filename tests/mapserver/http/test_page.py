@@ -181,3 +181,16 @@ def test_fingers_hit_every_button(page: Browser, services: StubServices) -> None
     finally:
         page.look(420, 800)
     assert small == []
+
+
+def test_a_map_without_room_is_drawn_when_it_has_some(page: Browser) -> None:
+    """As on a phone, where the keyboard may leave none."""
+    eventually(lambda: page.run("return mapweave.painter.bitmap !== null"))
+    page.run("document.getElementById('map').style.display = 'none'")
+    eventually(lambda: page.run("return mapweave.viewport.width") == 0)
+    page.run("mapweave.painter.changed()")
+    page.run("document.getElementById('map').style.display = ''")
+    eventually(lambda: page.run("return mapweave.viewport.width") > 0)
+    drawn = "const p = mapweave.painter; return !p.stale && !p.waiting && p.drawn.scale === p.viewport.scale"
+    eventually(lambda: page.run(drawn))
+    assert page.run("return document.getElementById('undrawn').hidden")
