@@ -58,7 +58,7 @@ def read_key_file(path: Path) -> KeyFile:
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
     except OSError as error:
-        raise SettingsError(f"{path}: {error.strerror}") from None
+        raise SettingsError(f"{path}: no key file: {error.strerror}; see `mapweave keys --help`") from None
     try:
         try:
             table = build(_Table, read_toml(path), str(path))

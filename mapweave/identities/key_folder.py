@@ -9,6 +9,7 @@ NAME.key.toml     key file of NAME: copy it there
 
 from __future__ import annotations
 
+import ipaddress
 import re
 import secrets
 import socket
@@ -41,7 +42,7 @@ from mapweave.wire.credentials import Access, Credentials, Member, Role
 CATALOGUE = "fleet.json"
 AUTHORITY, AUTHORITY_KEY, PASSWORDS = "authority.pem", "authority.key", "passwords"
 PORT = 7447
-HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*")
+HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 SERVER_DAYS = 825
 DAYS = 365
 """For which a key holds, unless it is said otherwise."""
@@ -153,8 +154,10 @@ class KeyFolder:
         check_name(fleet)
         check_name(server)
         for host in hosts:
-            if not HOST.fullmatch(host):
-                raise SettingsError(f"--at {host!r}: write a name or an address, such as 192.168.1.10")
+            if not (HOST_NAME.fullmatch(host) or _is_ipv6(host)):
+                raise SettingsError(
+                    f"--at {host!r}: write a name or an address without a port, such as 192.168.1.10"
+                )
         scheme = "tls" if profile is Profile.PRODUCTION else "tcp"
         reached = tuple(hosts) or ("127.0.0.1",)
         known = dict.fromkeys((*reached, "localhost", "127.0.0.1", "::1", socket.gethostname()))
@@ -388,3 +391,11 @@ class KeyFolder:
             return read_whole(self.path / name).decode()
         except (OSError, UnicodeDecodeError) as error:
             raise SettingsError(f"{self.path / name}: {error}") from None
+
+
+def _is_ipv6(host: str) -> bool:
+    try:
+        ipaddress.IPv6Address(host)
+    except ValueError:
+        return False
+    return "%" not in host

@@ -233,3 +233,17 @@ def test_a_disk_that_is_really_full_is_one_line(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and "cannot be written" in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:7447", "10.0.0.5/24", "fe80::1%eth0", "-x", "a b"])
+def test_a_host_is_a_name_or_an_address_without_a_port(
+    host: str, capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    where = tmp_path / "keys"
+    assert "without a port" in complaint(capfd, "keys", "init", f"--at={host}", "--keys", where)
+    assert not where.exists()
+
+
+def test_a_key_that_is_not_there_is_named(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    said = complaint(capfd, "status", "--keys", tmp_path / "r0.key.toml")
+    assert "r0.key.toml: no key file: No such file" in said
