@@ -169,7 +169,8 @@ pathlib.Path({str(tmp_path / "written")!r}).write_text(str(came))
     with subprocess.Popen(run, stdin=slave, stdout=slave, stderr=slave, start_new_session=True) as process:
         os.close(slave)
         output = b""
-        while b"ready" not in output:
+        # With its end of line: a terminal that closes amid a write is an error of that write.
+        while b"ready\r\n" not in output:
             output += os.read(master, 100)
         os.close(master)
         assert process.wait(60) == 0
