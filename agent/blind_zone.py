@@ -19,6 +19,8 @@ from mapweave.hybridmap.pose import Array, Pose2
 
 DEEPEST = 0.3
 """No sensor is blind farther than this from the robot's edge, m: ultrasonic ones are to 0.25 m."""
+SHALLOW = 0.1
+"""A zone that is less deep than this, m, is none: robots keep about as much away from things."""
 CONE = math.radians(20.0)
 """What is this far aside of a bearing is in the beam: half the opening of an ultrasonic sensor."""
 CORE = math.radians(6.0)
@@ -55,6 +57,8 @@ class BlindZone:
 
     def fill(self, observation: Observation) -> Observation:
         """The observation with distances, m, for readings of 0 that are explained by what was seen before."""
+        if self._least < SHALLOW:
+            return observation
         self._odom_from_robot = self._odom_from_robot @ observation.odometry.motion()
         readings = observation.proximity
         if observation.kidnapped:
