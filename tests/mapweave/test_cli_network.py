@@ -155,8 +155,9 @@ print(stop.wait(30))
 def test_a_process_ends_in_order_with_its_terminal(tmp_path):
     """As when the connection to a robot breaks. Before, it ended at once, and what waited was not written."""
     program = f"""
-import fcntl, pathlib, sys, termios
+import fcntl, pathlib, signal, sys, termios
 from mapweave.commands.network import stop_on_signals
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever the tests themselves were started with
 fcntl.ioctl(0, termios.TIOCSCTTY)
 stop = stop_on_signals()
 print("ready", flush=True)
@@ -169,7 +170,6 @@ pathlib.Path({str(tmp_path / "written")!r}).write_text(str(came))
     with subprocess.Popen(run, stdin=slave, stdout=slave, stderr=slave, start_new_session=True) as process:
         os.close(slave)
         output = b""
-        # With its end of line: a terminal that closes amid a write is an error of that write.
         while b"ready\r\n" not in output:
             output += os.read(master, 100)
         os.close(master)
