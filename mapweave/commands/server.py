@@ -81,9 +81,16 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until stopped."""
     from mapweave.hybridmap.errors import SettingsError
+    from mapweave.mapserver.log.opening import is_postgres
+
+    # What is wrong on the command line is said before anything is loaded for a second.
+    if arguments.demo and (arguments.data is not None or arguments.store is not None):
+        raise SettingsError("--demo keeps nothing: leave out --data and --store")
+    if arguments.store is not None and not is_postgres(arguments.store):
+        raise SettingsError("--store is a PostgreSQL address: postgresql://USER@HOST/DATABASE")
+
     from mapweave.hybridmap.node import check_name
     from mapweave.mapserver.base_map import BaseMap
-    from mapweave.mapserver.log.opening import is_postgres
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.processes.service_manager import ServiceManager
@@ -107,10 +114,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise SettingsError("--lockstep is repeatable, and a cluster is not: leave out one of them")
     if cluster.ray:
         need("cluster")
-    if arguments.demo and (arguments.data is not None or arguments.store is not None):
-        raise SettingsError("--demo keeps nothing: leave out --data and --store")
-    if arguments.store is not None and not is_postgres(arguments.store):
-        raise SettingsError("--store is a PostgreSQL address: postgresql://USER@HOST/DATABASE")
     people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
     if http is not None:
         from mapweave.commands.http_access import http_access
