@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import statistics
 from collections.abc import Generator
 from dataclasses import dataclass
 
@@ -87,12 +85,6 @@ class OwnMap:
         self.map = hybrid_map
         self.elsewhere = False
         self._rng = rng
-
-    @property
-    def spacing(self) -> float:
-        """How far nodes that an edge joins are apart, m: the median; 0 without edges."""
-        ways = [math.hypot(e.a_from_b.mean.x, e.a_from_b.mean.y) for e in self.map.edges.values()]
-        return statistics.median(ways) if ways else 0.0
 
     def candidates(self, view: View, image: NDArray[np.uint8], features: Features) -> Candidates:
         """Nodes that a view shows, of an image with these features."""

@@ -22,10 +22,6 @@ from mapweave.vision.sift import Sift
 CARRIED_MOVING_VIEWS = 12
 """A carried robot is lost after so many views without success between which it moves: six seconds of driving.
 A new map can be joined to the old one later, a stretch that is not mapped cannot."""
-GONE = 3.0
-"""Or once it is away from where the search began by so many times what two nodes of its map are apart,"""
-LEAST_GONE = 2.0
-"""and by this, m: a car passes a dozen places in six seconds."""
 MOVED = 0.02
 """m or rad between two views."""
 STILL = 0.2
@@ -140,11 +136,8 @@ class GlobalLocalization:
 
         A drive goes on meanwhile: a few views between which the robot has moved are enough.
         """
-        moving, begin = 0, self._motion.odom_from_robot
-        gone = max(GONE * self._own.spacing, LEAST_GONE)
+        moving = 0
         while self._views < self._policy.carried_views and moving < CARRIED_MOVING_VIEWS:
-            if self._views and self._motion.odom_from_robot.distance(begin) > gone:
-                break
             views, driven = self._views, self._motion.way + self._motion.turned
             candidate = yield from self.look()
             if candidate is not None:
