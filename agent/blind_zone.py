@@ -3,7 +3,8 @@
 An ultrasonic sensor hears no echo from nearer than some 25 cm and reads 0 there. Taken for a touch, that
 keeps a robot from every place along a wall, and leaves phantoms at its edge wherever it turns. But the robot
 has come from farther off, where the sensors measured: what they saw then is remembered, and fills in. Where
-nothing is remembered, the thing is not where the robot itself has just been.
+nothing is remembered, the thing is not where the robot itself has just been. A robot that is carried off
+unnoticed believes what it remembers until its sensors look through it.
 """
 
 from __future__ import annotations
