@@ -55,8 +55,6 @@ SETTLED = 0.5
 LASTING = 1.5
 """A parameter is wrong if all solutions say so while the pairs grow by this factor: what a few have in common
 by chance, more do not bear out. Without, one of nine simulated robots got three false names within 23 s."""
-STILL_SIGNIFICANT = 3.0
-"""Sigmas above which a parameter that was found to be wrong still is: near the limit it swings about it."""
 WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
 WORTH[P.WHEEL_SCALE] = 1.0
@@ -230,22 +228,15 @@ class OnlineCalibration:
         )
         self._adopt(estimate, settled & before.shown)
         known = {cause.parameter for cause in self.causes}
-        still = {cause.parameter: cause for cause in causes(estimate, significant=STILL_SIGNIFICANT)}
-        sigmas = np.array([still[p].sigmas if p in still and settled[p] else 0.0 for p in Parameter])
-        lasting = self._lasting(sigmas, self._named_since)
-        found = [cause for p, cause in still.items() if lasting[p] and p not in known]
+        wrong = {cause.parameter: cause for cause in causes(estimate) if settled[cause.parameter]}
+        lasting = self._lasting(np.array([p in wrong for p in Parameter]), self._named_since)
+        found = [cause for p, cause in wrong.items() if lasting[p] and p not in known]
         self.causes += found
         return found
 
-    def _lasting(self, sigmas: Array, since: Array) -> NDArray[np.bool_]:
-        """(10,) which were wrong while the pairs grew; (10,) since how many they are is kept up to date.
-
-        Args:
-            sigmas: (10,) by which parameters are off; 0 for those that do not count now.
-            since: (10,) pairs since when they are wrong.
-        """
-        since[sigmas <= STILL_SIGNIFICANT] = np.inf
-        wrong = sigmas > SIGNIFICANT
+    def _lasting(self, wrong: NDArray[np.bool_], since: Array) -> NDArray[np.bool_]:
+        """(10,) which were wrong while the pairs grew; (10,) since how many they are is kept up to date."""
+        since[~wrong] = np.inf
         since[wrong] = np.minimum(since[wrong], self._taken)
         return np.asarray(self._taken >= LASTING * since)
 
@@ -253,10 +244,15 @@ class OnlineCalibration:
         """Use what the drive shows where it differs enough from what is used."""
         target = self._next.vector
         off = np.abs(estimate.vector - target)
-        change = estimate.shown & settled & (off > WORTH * useful(estimate.declared))
+        change = (
+            estimate.shown
+            & settled
+            & (off > WORTH * useful(estimate.declared))
+            & (off > SIGNIFICANT * estimate.sigmas)
+        )
         named_only = [p for p in NAMED_ONLY if not (p is P.WHEEL_SCALE and estimate.lengths is Lengths.BOTH)]
         change[named_only] = False
-        change &= self._lasting(np.where(change, off / estimate.sigmas, 0.0), self._changed_since)
+        change &= self._lasting(change, self._changed_since)
         if not change.any():
             return
         # What is shown but differs less goes along: the estimates belong together. The wheels' scale brings

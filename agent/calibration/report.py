@@ -92,19 +92,16 @@ def readable_sigmas(estimate: Estimate) -> Array:
     return sigmas
 
 
-def causes(
-    estimate: Estimate, declared: Array | None = None, significant: float = SIGNIFICANT
-) -> list[Cause]:
+def causes(estimate: Estimate, declared: Array | None = None) -> list[Cause]:
     """Which parameters that the drive shows are declared wrongly, the surest first.
 
     Args:
         estimate: of the drive.
         declared: (10,) instead of what the estimate began with.
-        significant: least distance from the declared value, sigmas.
     """
     declared = estimate.declared if declared is None else declared
     off = np.abs(estimate.vector - declared)
-    wrong = estimate.shown & (off > significant * estimate.sigmas) & (off > useful(estimate.declared))
+    wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > useful(estimate.declared))
     value, was, sigma = readable(estimate.vector), readable(declared), readable_sigmas(estimate)
     lengths = estimate.lengths
     found = [

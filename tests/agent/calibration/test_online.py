@@ -11,7 +11,7 @@ import pytest
 
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration
-from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
+from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from synthetic.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
 from tests.quick import first_quick
@@ -165,24 +165,3 @@ def test_no_tick_does_two_of_the_costly_things(monkeypatch: pytest.MonkeyPatch):
     watched(run, TRUE, 1, online=online)
     assert [name for _, name in done].count("solve") >= 3
     assert len({stamp for stamp, _ in done}) == len(done)
-
-
-def test_what_is_wrong_at_the_limit_is_named_in_the_end() -> None:
-    """An estimate 3.5 sigmas off swings about the limit; it is not right because of that."""
-    online, since = OnlineCalibration(RobotDescription(CAMERA)), np.full(COUNT, np.inf)
-
-    def lasting(taken: int, sigmas: float) -> bool:
-        online._taken = taken
-        off = np.zeros(COUNT)
-        off[Parameter.DELAY] = sigmas
-        return bool(online._lasting(off, since)[Parameter.DELAY])
-
-    assert not lasting(60, 3.4), "not sure enough to begin with"
-    assert [lasting(taken, 3.6 - 0.01 * (taken - 64)) for taken in (64, 80, 92, 96)] == [
-        False,
-        False,
-        False,
-        True,
-    ]
-    assert not lasting(100, 2.9)
-    assert not lasting(104, 3.6), "it begins from the start"
