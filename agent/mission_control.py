@@ -1,7 +1,8 @@
 """Which mission holds: orders in, from any sender and in any order; what the pipeline shall do out.
 
-Orders may come twice, late, or never. The same id is the same mission; of two the newer holds; what is over
-stays over. All of it is on the disk before it is acknowledged, so a robot that was switched off goes on.
+Orders may come twice, late, or never. The same id is the same mission; of two the newer holds, unless their
+stamps are too far apart; what is over stays over. All of it is on the disk before it is acknowledged, so a
+robot that was switched off goes on.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ GONE = 10.0
 FIRST = "start"
 """Gives the mission that the agent begins with."""
 MAPPING = (MissionKind.EXPLORE, MissionKind.CARRIED)
+NEVER_HOLDS = (MissionState.REFUSED, MissionState.REPLACED)
+"""States of missions that no longer hold, whatever their stamp."""
 
 Keep = Callable[[Sequence[MissionReport]], None]
 Defer = Callable[[Callable[[], None]], object]
@@ -88,7 +91,7 @@ class MissionControl:
         self._unsaved: list[MissionReport] = []
         self._reports = {report.order.id: report for report in kept}
         ranked = sorted(self._reports.values(), key=lambda report: report.order.rank)
-        held = [report for report in ranked if report.state is not MissionState.REFUSED]
+        held = [report for report in ranked if report.state not in NEVER_HOLDS]
         self._current: str | None = held[-1].order.id if held else None
         if held and held[-1].order.kind in MAPPING:
             # There may be more to map.
@@ -133,17 +136,20 @@ class MissionControl:
         if known is not None:
             return known
         current = None if self._current is None else self._reports[self._current]
-        if current is not None and order.rank < current.order.rank:
+        if current is not None and not order.replaces(current.order):
             newer = f"mission {current.order.id} by {current.order.by} is newer"
             return self._note(MissionReport(order, MissionState.REPLACED, 0.0, newer))
         for node in () if order.node is None else (*order.via, order.node):
             if reason := self.unknown_goal(node):
                 return self._note(MissionReport(order, MissionState.REFUSED, 0.0, reason))
         report = MissionReport(order, MissionState.RUNNING)
-        replaced = []
-        if current is not None and current.open:
-            by = f"by mission {order.id} of {order.by}"
-            replaced = [replace(current, state=MissionState.REPLACED, reason=by)]
+        by = f"by mission {order.id} of {order.by}"
+        replaced = [
+            replace(one, state=MissionState.REPLACED, reason=by)
+            for one in self._reports.values()
+            # What was over is marked as well if its stamp is ahead: it must not hold after a restart.
+            if (one is current and one.open) or (one.order.rank > order.rank and one.state not in NEVER_HOLDS)
+        ]
         self._current = order.id
         return self._note(*replaced, report)
 

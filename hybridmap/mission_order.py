@@ -12,7 +12,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.limits import Name, Share, Stamp, Words
+from mapweave.hybridmap.limits import MAX_STAMP_NS, Name, Share, Stamp, Words
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.portal import PortalWait
 
@@ -21,6 +21,9 @@ MAX_KEPT = 200
 
 MAX_VIA = 16
 """Places that a robot passes on its way to a goal."""
+
+MOST_APART_NS = 86_400_000_000_000
+"""By which the stamps of two orders differ at most if both clocks are right: none is under way for a day."""
 
 Text = Annotated[str, Meta(max_length=64)]
 """A goal as it was written, or a person's name."""
@@ -61,6 +64,17 @@ def new_id() -> str:
     return secrets.token_hex(6)
 
 
+def later_stamp(now_ns: int, than_ns: int) -> int:
+    """Stamp of an order that is given now, and that replaces one with another stamp.
+
+    A stamp of far ahead is not surpassed: there may be no greater one, and what comes later replaces it
+    anyway.
+    """
+    if than_ns - now_ns > MOST_APART_NS:
+        return now_ns
+    return min(max(now_ns, than_ns + 1), MAX_STAMP_NS)
+
+
 @dataclass(frozen=True, slots=True)
 class MissionRequest:
     """A person's wish, as a map server takes it: the goal is in the person's words.
@@ -69,7 +83,8 @@ class MissionRequest:
         id: drawn by who gives it. The same id is the same mission, however often it comes.
         robot: which robot.
         kind: what it shall do.
-        stamp_ns: when it was given; of two missions of a robot the newer one holds.
+        stamp_ns: when it was given; of two missions of a robot the newer one holds, see
+            MissionOrder.replaces.
         by: who gave it.
         goal: where to: a node (`r0.1.17`), a named place, `x,y` in the merged map, m, or `home`; empty
             without one.
@@ -120,13 +135,22 @@ class MissionOrder:
     def new(
         robot: str, kind: MissionKind, by: str, node: NodeId | None = None, after_ns: int = 0
     ) -> MissionOrder:
-        """A mission that is given now, and later than `after_ns`."""
-        return MissionOrder(new_id(), robot, kind, max(time.time_ns(), after_ns + 1), by, node)
+        """A mission that is given now, and replaces one with the stamp `after_ns`."""
+        return MissionOrder(new_id(), robot, kind, later_stamp(time.time_ns(), after_ns), by, node)
 
     @property
     def rank(self) -> tuple[int, str]:
-        """Of two missions of one robot the one of higher rank holds, in whatever order they come."""
+        """Of two missions of one robot the one of higher rank holds; see `replaces`."""
         return self.stamp_ns, self.id
+
+    def replaces(self, holding: MissionOrder) -> bool:
+        """Whether this order, which has just come, replaces the one that holds.
+
+        It does if it is newer, in whatever order the two come. Where their stamps are too far apart, one of
+        the clocks is wrong, and the robot's own may be as well: then the order that comes later holds. So no
+        stamp keeps a robot from later orders.
+        """
+        return self.rank > holding.rank or holding.stamp_ns - self.stamp_ns > MOST_APART_NS
 
     @property
     def words(self) -> str:

@@ -24,6 +24,7 @@ from mapweave.hybridmap.mission_order import (
     MissionRequest,
     Missions,
     MissionState,
+    later_stamp,
     new_id,
 )
 from mapweave.hybridmap.node import MapId, NodeId, check_name
@@ -153,7 +154,7 @@ class MissionRelay:
         """
         status = None if self.roster is None else self.roster.status(robot)
         report = None if status is None else status.mission
-        stamp_ns = max(self._time_ns(), 0 if report is None else report.order.stamp_ns + 1)
+        stamp_ns = later_stamp(self._time_ns(), 0 if report is None else report.order.stamp_ns)
         mission_id = check_name(mission_id) if mission_id else new_id()
         if len(via) > MAX_VIA:
             raise InvalidValue(f"a mission passes at most {MAX_VIA} places, not {len(via)}")
@@ -202,14 +203,14 @@ class MissionRelay:
         return MissionReport(order, MissionState.SENT)
 
     def _replace_older(self, order: MissionOrder, *states: MissionState) -> None:
-        """A robot's newer mission ends its older ones, of these states or of all that are open."""
+        """A robot's mission ends those that it replaces, of these states or of all that are open."""
         with self._turn:
             older = [
                 report
                 for report in self._reports.values()
                 if report.state in (states or OPEN)
                 and report.order.robot == order.robot
-                and report.order.rank < order.rank
+                and order.replaces(report.order)
             ]
         for report in older:
             reason = f"by mission {order.id} of {order.by}"

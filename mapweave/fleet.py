@@ -31,6 +31,7 @@ from mapweave.hybridmap.mission_order import (
     MissionRequest,
     Missions,
     MissionState,
+    later_stamp,
     new_id,
 )
 from mapweave.hybridmap.node import NodeId, check_name
@@ -318,7 +319,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         self._check_role()
         report, after_ns = None, 0
         for _ in range(TRIES):
-            stamp_ns = max(time.time_ns(), after_ns + 1)
+            stamp_ns = later_stamp(time.time_ns(), after_ns)
             request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via)
             key = sent_by(self._keys.any_mission(), self._sender)
             replies = self._bus.ask(key, encode(request), 2.0 * ANSWERED)

@@ -15,12 +15,15 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import WithoutServer
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
+    MOST_APART_NS,
     MissionKind,
     MissionOrder,
     MissionReport,
     MissionState,
+    later_stamp,
 )
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
@@ -96,6 +99,47 @@ def test_the_newest_order_holds_however_they_come(orders: list[MissionOrder], da
             for one in arrived:
                 if one.kind is not MissionKind.EXPLORE and before[one.id].state is not MissionState.RUNNING:
                     assert control.take(one) == before[one.id]
+
+
+FAR_AHEAD = (2 * MOST_APART_NS, MAX_STAMP_NS - 1, MAX_STAMP_NS)
+
+
+@pytest.mark.parametrize("kind", [MissionKind.GO, MissionKind.EXPLORE, MissionKind.STOP])
+@pytest.mark.parametrize("over", [False, True])
+def test_no_stamp_keeps_a_robot_from_later_orders(kind: MissionKind, over: bool) -> None:
+    """One clock is wrong then, and the order that comes later holds, also after a restart."""
+    disk = Disk()
+    control = disk.robot()
+    for stamp_ns in FAR_AHEAD:
+        absurd = order(stamp_ns, kind)
+        assert control.take(absurd).state is MissionState.RUNNING
+        control.next(True, 0.0, HOME)
+        control.follow(status(finished=over))
+    for later in (order(1, MissionKind.STOP, "halt"), order(2, MissionKind.EXPLORE, "on")):
+        assert control.take(later).state is MissionState.RUNNING
+        assert control.take(order(0, MissionKind.EXPLORE, "late")).state is MissionState.REPLACED
+        for robot in (control, disk.robot()):
+            assert robot.report is not None and robot.report.order == later
+            assert not robot.take(absurd).open, "twice is once"
+            assert robot.report.order == later
+            assert robot.next(True, 0.0, HOME) in (as_mission(later), None)
+
+
+def test_the_mission_of_a_start_holds_whatever_was_kept() -> None:
+    disk = Disk()
+    disk.robot().take(order(MAX_STAMP_NS, MissionKind.EXPLORE))
+    control = disk.robot()
+    control.begin(MissionKind.STOP)
+    assert control.report is not None and control.report.order.kind is MissionKind.STOP
+
+
+@given(st.integers(0, MAX_STAMP_NS), st.integers(0, MAX_STAMP_NS))
+def test_an_order_that_is_given_now_replaces_the_one_that_holds(now_ns: int, than_ns: int) -> None:
+    """But for the last stamps that there are."""
+    stamp_ns = later_stamp(now_ns, than_ns)
+    assert 0 <= stamp_ns <= MAX_STAMP_NS
+    if max(now_ns, than_ns) < MAX_STAMP_NS or than_ns - now_ns > MOST_APART_NS:
+        assert order(stamp_ns, name="a").replaces(order(than_ns, name="b"))
 
 
 def test_a_goal_that_is_known_not_to_exist_is_refused_and_the_mission_goes_on() -> None:
