@@ -13,7 +13,8 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodeRetired
 from mapweave.hybridmap.node import NodeId
 from mapweave.mapserver.content_hash import content_hash
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.kept_bytes import LEAST_GROWN
+from mapweave.mapserver.log.store import ROW_BYTES, Store
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.codec import element_of, encode_body, encode_change
 
@@ -25,8 +26,9 @@ class Account:
     Attributes:
         sent: changes that the robot's journal had committed, by the robot's own log.
         stored: of these, those in the store; of several stores the least.
-        undone: of these, those that a store lacks since the robot's journal no longer has them, either: a
-            later change puts the same node or edge again or retires it, or it was a retirement.
+        undone: of these, those that a store lacks since a later change puts the same node or edge again or
+            retires it, or it was a retirement: the robot's journal no longer has them, either, or the store
+            has deleted them itself, as it does in large maps.
         lost: the others.
         duplicated: changes that a store has more than once.
         out_of_order: changes that are not where they were in the robot's log, or were never sent.
@@ -91,7 +93,7 @@ def account(sent: Sequence[Change], journal: Journal, stores: Sequence[Store]) -
     """Compare what a robot has sent with what its journal and the stores have."""
     map_id = sent[0].map
     position = {encode_change(change): change.sequence for change in sent}
-    superfluous = _superfluous(sent)
+    superfluous, deleted = _superfluous(sent), _deleted_by_store(sent)
     kept = {encode_change(c) for c in journal.changes(map_id, 1, len(sent))}
     maps = {_hash([change.body for change in sent]), _hash(list(journal.replay(map_id)))}
     result = Account(sent=len(sent), stored=len(sent))
@@ -99,7 +101,7 @@ def account(sent: Sequence[Change], journal: Journal, stores: Sequence[Store]) -
         rows = list(store.replay(map_id))
         have = [encode_change(row) for row in rows]
         missing = {data: k for data, k in position.items() if data not in set(have)}
-        undone = sum(data not in kept and k in superfluous for data, k in missing.items())
+        undone = sum(k in deleted or (data not in kept and k in superfluous) for data, k in missing.items())
         in_order = [position.get(data) == row.sequence for data, row in zip(have, rows, strict=True)]
         rising = all(a.sequence < b.sequence for a, b in pairwise(rows))
         maps.add(_hash([row.body for row in rows]))
@@ -129,6 +131,24 @@ def _superfluous(sent: Sequence[Change]) -> set[int]:
             case NodeRetired() | EdgeRetired():
                 out.add(change.sequence)
     return out
+
+
+def _deleted_by_store(sent: Sequence[Change]) -> set[int]:
+    """Changes that a store may delete by itself: superseded ones, in a map that is large enough.
+
+    It keeps the last retirement of a node or edge, and all that comes after.
+    """
+    if sum(ROW_BYTES + len(encode_change(change)) for change in sent) < LEAST_GROWN:
+        return set()
+    newest: dict[NodeId, int] = {element_of(change.body): change.sequence for change in sent}
+    retires = {k.sequence for k in sent if isinstance(k.body, NodeRetired | EdgeRetired)}
+    retired = {element_of(k.body): k.sequence for k in sent if k.sequence in retires}
+    return {
+        change.sequence
+        for change in sent
+        if change.sequence < retired.get(element_of(change.body), 0)
+        or (change.sequence < newest[element_of(change.body)] and change.sequence not in retires)
+    }
 
 
 def _hash(bodies: Sequence[object]) -> str:

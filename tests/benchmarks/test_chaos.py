@@ -95,6 +95,23 @@ def test_what_a_robot_has_dropped_since_it_was_undone_is_not_lost(
     assert (found.lost, found.undone, found.maps_equal) == (0, dropped, True)
 
 
+def test_what_a_store_deletes_of_a_large_map_is_not_lost(
+    fleet: tuple[list[Change], Journal, SqliteStore], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The journal may have it still; of a small map a store deletes nothing."""
+    sent, journal, store = fleet
+    superseded = [sequence for sequence, _ in store.superseded(sent[0].map, len(sent))]
+    assert superseded
+    store.drop(sent[0].map, superseded)
+    assert account(sent, journal, [store]).lost == len(superseded)
+    monkeypatch.setattr("benchmarks.chaos.account.LEAST_GROWN", 1000)
+    found = account(sent, journal, [store])
+    assert (found.lost, found.undone, found.maps_equal) == (0, len(superseded), True)
+    final = max(set(range(1, len(sent) + 1)) - set(superseded))
+    store.drop(sent[0].map, [final])
+    assert account(sent, journal, [store]).lost == 1
+
+
 def test_what_is_twice_or_elsewhere_is_counted(
     fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
 ) -> None:
