@@ -10,6 +10,7 @@ import urllib.parse
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+from mapweave.agent.drivers.address_lock import AddressLock
 from mapweave.agent.drivers.base import BaseReading, Wheels
 from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
@@ -108,13 +109,27 @@ class SerialLine:
 
 
 class HttpLine:
-    """Requests to the HTTP server of the base, over one connection."""
+    """Requests to the HTTP server of the base, over one connection. No second driver of this machine may."""
 
     def __init__(self, address: str) -> None:
-        """Create a connection without a request."""
+        """Connect, without a request.
+
+        Raises:
+            DeviceError: no one answers there, or another driver uses the base.
+        """
         where = urllib.parse.urlsplit(address)
         self._address = address
         self._connection = http.client.HTTPConnection(where.hostname or "", where.port or 80, timeout=TIMEOUT)
+        try:
+            self._connection.connect()
+            host, port = self._connection.sock.getpeername()[:2]
+        except OSError as error:
+            raise self._failed(error) from error
+        try:
+            self._lock = AddressLock(host, port)
+        except DeviceError:
+            self._connection.close()
+            raise
 
     def send(self, command: Json) -> None:
         """Send a request and ignore its answer."""
@@ -130,6 +145,7 @@ class HttpLine:
     def close(self) -> None:
         """Close the connection."""
         self._connection.close()
+        self._lock.close()
 
     def _ask(self, command: Json) -> str:
         query = urllib.parse.urlencode({"json": json.dumps(command, separators=(",", ":"))})
@@ -137,11 +153,14 @@ class HttpLine:
             self._connection.request("GET", f"/js?{query}")
             return self._connection.getresponse().read().decode("utf-8", "replace")
         except (OSError, http.client.HTTPException) as error:
-            self._connection.close()
-            reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
-            raise DeviceError(
-                f"{self._address}: {reason}; is the robot switched on, and this computer in its network?"
-            ) from error
+            raise self._failed(error) from error
+
+    def _failed(self, error: Exception) -> DeviceError:
+        self._connection.close()
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        return DeviceError(
+            f"{self._address}: {reason}; is the robot switched on, and this computer in its network?"
+        )
 
 
 def parse_info(text: str) -> BaseInfo | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import pty
+import subprocess
+import sys
 import threading
 import tty
 from collections.abc import Iterator
@@ -13,9 +15,10 @@ from typing import Any
 
 import pytest
 
+from mapweave.agent.drivers.base import Wheels
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.drivers.settings import CameraSettings, RobotSettings
-from mapweave.agent.drivers.waveshare import HttpLine, SerialLine, Waveshare
+from mapweave.agent.drivers.waveshare import HttpLine, SerialLine, Waveshare, WaveshareBase
 from mapweave.agent.observation import Command
 from mapweave.hybridmap.errors import DeviceError, SettingsError
 from tests.agent.drivers.contract import RobotContract, drive, drive_until
@@ -97,6 +100,49 @@ def test_an_address_where_no_robot_is() -> None:
         DeviceError, match=f"^{address}: Connection refused; is the robot switched on, and this"
     ):
         HttpLine(address).feedback()
+
+
+def test_a_second_driver_at_an_address_is_refused_and_leaves_the_wheels_alone(tmp_path: Path) -> None:
+    """By any name that the address has. Agents of other names would each drive the robot."""
+    ugv = UgvHttp(tmp_path)
+    first, second = WaveshareBase(ugv.path), WaveshareBase(ugv.path.replace("127.0.0.1", "localhost"))
+    try:
+        first.open()
+        first.drive(Wheels(0.2, 0.2))
+        with pytest.raises(DeviceError, match=f"^{ugv.path}: is in use by another process$"):
+            second.open()
+        second.close()
+        assert ugv.wheels.speeds == (0.2, 0.2)
+        first.close()
+        second.open()
+    finally:
+        first.close()
+        second.close()
+        ugv.close()
+
+
+def test_a_driver_in_another_process_is_refused_until_the_first_has_ended(tmp_path: Path) -> None:
+    ugv = UgvHttp(tmp_path)
+    holder = subprocess.Popen(
+        [sys.executable, "-c",
+         "import sys, time; from mapweave.agent.drivers.waveshare import WaveshareBase\n"
+         f"base = WaveshareBase({ugv.path!r}); base.open(); print(1, flush=True); time.sleep(60)"],
+        stdout=subprocess.PIPE,
+    )  # fmt: skip
+    base = WaveshareBase(ugv.path)
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.read(1) == b"1"
+        with pytest.raises(DeviceError, match="is in use by another process"):
+            base.open()
+        holder.kill()
+        holder.wait()
+        base.open()
+    finally:
+        holder.kill()
+        holder.communicate()
+        base.close()
+        ugv.close()
 
 
 class TestUgvHttp(RobotContract):
