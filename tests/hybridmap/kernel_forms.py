@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from mapweave.hybridmap.jit import KERNELS
+from mapweave.hybridmap.jit import KERNELS, load
 
 
 @contextmanager
@@ -29,6 +29,7 @@ def form(request: pytest.FixtureRequest) -> Iterator[str]:
     """Either form, for all tests of a module that uses it."""
     if request.param == "numba":
         pytest.importorskip("numba")
+        load()
         yield "numba"
     else:
         with in_numpy():

@@ -79,6 +79,47 @@ def test_without_numba_a_kernel_runs_as_it_is_written(tmp_path: Path, how: str) 
     assert run(tmp_path, how, tmp_path / "cache")["hits"] == -1
 
 
+WHOLE = """
+import sys
+import numpy as np
+from typing import Annotated
+from numpy.typing import NDArray
+from mapweave.hybridmap import jit
+
+Ints = Annotated[NDArray[np.int64], 1]
+
+@jit.compiled
+def doubled(numbers: Ints, more: int) -> Ints:
+    return 2 * numbers + more
+
+@jit.compiled
+def clear(numbers: Ints) -> None:
+    numbers[:] = 0
+
+@jit.compiled
+def halved(numbers: jit.Vector) -> jit.Vector:
+    return 0.5 * numbers
+
+for _ in range(jit.UNCOMPILED):
+    assert doubled(np.arange(3), 1).tolist() == [1, 3, 5]
+clear(np.ones(3, np.int64))
+assert "numba" not in sys.modules, "compiled for a few calls"
+halved(np.zeros(2))
+assert "numba" in sys.modules, "the two forms of real numbers are not the same to the last bit"
+assert doubled(np.arange(3), 1).tolist() == [1, 3, 5]
+"""
+
+
+def test_the_first_calls_with_whole_numbers_do_not_wait_for_numba(tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    (tmp_path / "whole.py").write_text(WHOLE)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, tmp_path / "whole.py"], capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.slow
 def test_a_kernel_is_compiled_once_and_kept(tmp_path: Path) -> None:
     pytest.importorskip("numba")
