@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import MAX_KNOWN, KnownAnswer
@@ -45,6 +44,8 @@ class Coverage:
 
     def _views(self, asking: MapId, component: frozenset[NodeId]) -> list[tuple[float, float, float, float]]:
         """[x m, y m, heading rad, semi-aperture rad], in the asking map, of a component's foreign nodes."""
+        from scipy.spatial import cKDTree
+
         merged = self._merged
         own = sorted(node for node in component if node.map == asking)
         other_nodes = sorted(node for node in component if node.map != asking)

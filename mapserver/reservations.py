@@ -13,10 +13,10 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import NodeId
@@ -26,6 +26,9 @@ from mapweave.mapserver.nearby import StandingRobot
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.wire_limits import LONGEST_LEG
 from mapweave.merge.pose_graph.merged_map import MergedMap
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 LEASE = 5.0
 """A robot that has not asked for so long holds nothing any more, s; it asks every second."""
@@ -259,6 +262,8 @@ def _too_long(stops: Points) -> bool:
 
 def _free(stops: Points, radius: float, others: Mapping[str, _Lease]) -> tuple[int, Points, str]:
     """How many stops of a way may be driven to, the points up to there, and who holds the next part."""
+    from scipy.spatial import cKDTree
+
     held, length = stops[:1], 0.0
     trees = {name: cKDTree(other.held) for name, other in others.items()}
     for number, (a, b) in enumerate(pairwise(stops)):
@@ -289,6 +294,8 @@ def _place_aside(lease: _Lease, others: Sequence[_Lease], router: Router) -> _As
 
     One from which the goal is reached when they are at theirs comes first: behind them it would be boxed in.
     """
+    from scipy.spatial import cKDTree
+
     request, poses = lease.request, router.roads.active_poses
     component = router.merged.component_of(request.start)  # the map may be newer than the lease
     members = [n for n in router.merged.components[component] if n in poses] if component is not None else []

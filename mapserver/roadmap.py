@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mapweave.hybridmap.area import Floats
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -101,6 +100,8 @@ class Roadmap:
         return self._segments[component]
 
     def _join_nearby(self, same_place: float) -> None:
+        from scipy.spatial import cKDTree
+
         for number, members in enumerate(self.merged.components):
             nodes = sorted(node for node in members if node in self.poses)
             if not nodes:

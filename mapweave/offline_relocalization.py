@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faiss  # noqa: F401, where it is missing this says so before a map is read
 import numpy as np
 from numpy.typing import NDArray
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap import jit
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
@@ -45,7 +44,6 @@ class AliasedLandmarks:
     def __init__(self, settings: RecognitionSettings) -> None:
         """Take when a place counts as recognised; a likeness may leave open where exactly it is seen from."""
         self._settings = replace(settings, **VAGUE)
-        jit.load()  # when a server starts: a robot that asks must not wait for a compiler
         self._kept: OrderedDict[tuple[NodeId, NodeId], tuple[Node, Node, Recognition | None]] = OrderedDict()
 
     def compare(self, a: Node, b: Node) -> Recognition | None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import faiss
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,6 +87,8 @@ class CoarseQuantizer:
     @cached_property
     def searched(self) -> Any:
         """A FAISS index that finds the several nearest means of FAMILIES families."""
+        import faiss
+
         heads = faiss.IndexFlatL2(DIMENSIONS)
         heads.add(self.heads)
         index = faiss.IndexIVFFlat(heads, DIMENSIONS, len(self.heads))
@@ -103,6 +104,8 @@ class CoarseQuantizer:
 
 def probing(count: int) -> Any:
     """Search so many lists of an inverted file."""
+    import faiss
+
     parameters: Any = faiss.SearchParametersIVF()
     parameters.nprobe = count
     return parameters
@@ -116,6 +119,8 @@ def widened(codes: Codes) -> Iterator[Vectors]:
 
 def nearest(vectors: Vectors, means: Vectors) -> Ids:
     """(N,) which of (M, 32) means is nearest to each of (N, 32) vectors."""
+    import faiss
+
     if not len(vectors):
         return np.zeros(0, np.int64)
     cells: Ids = faiss.knn(vectors, means, 1)[1][:, 0]
@@ -124,6 +129,8 @@ def nearest(vectors: Vectors, means: Vectors) -> Ids:
 
 def _learned(sample: Vectors, count: int) -> Vectors:
     """(at most count, 32) means of a sample."""
+    import faiss
+
     if len(sample) <= count:
         return sample if len(sample) else np.full((1, DIMENSIONS), FAR, np.float32)
     means = faiss.Kmeans(DIMENSIONS, count, niter=ROUNDS, seed=SEED, min_points_per_centroid=1)

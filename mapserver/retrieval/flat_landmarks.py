@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import faiss
 import numpy as np
 
 from mapweave.hybridmap.descriptor import decode
@@ -59,6 +58,8 @@ class FlatLandmarks:
 
     def nearest(self, codes: Codes, k: int, probes: int = 0) -> tuple[Vectors, Ids]:
         """(N, k) squared distances and ids of the nearest landmarks, nearest first; there are as many."""
+        import faiss
+
         del probes  # There are no cells.
         squared, places = faiss.knn(decode(codes), decode(self.codes), k)
         return squared, self.ids[places]

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import faiss
 import numpy as np
 
 from mapweave.hybridmap.landmark_tables import DIMENSIONS, landmark_tables
@@ -38,6 +37,8 @@ class InvertedFile:
 
     def __init__(self, means: CoarseQuantizer) -> None:
         """Begin with nothing in them."""
+        import faiss
+
         self.means = means
         self._index: Any = faiss.IndexIVFScalarQuantizer(
             means.searched, DIMENSIONS, len(means), faiss.ScalarQuantizer.QT_8bit_direct,
@@ -71,12 +72,16 @@ class InvertedFile:
             codes: (N, 32) of all of them, in any order: gives their cells. Without it, or if it is wrong, the
                 ids in all cells are searched.
         """
+        import faiss
+
         left = None if codes is None else len(codes) - self._taken_out(first, last, codes)
         if left != 0:
             self._index.remove_ids(faiss.IDSelectorRange(first, last))
 
     def _taken_out(self, first: int, last: int, codes: Codes) -> int:
         """Forget those that lie where they should; how many they were."""
+        import faiss
+
         lists: Any = self._index.invlists
         count = 0
         for cell in np.unique(self.means.nearest(codes.astype(np.float32))).tolist():
@@ -111,6 +116,8 @@ class InvertedFile:
 
     def blocks(self, size: int) -> Iterator[Block]:
         """All landmarks, cell by cell, about `size` at once: a copy of all would take the memory twice."""
+        import faiss
+
         lists: Any = self._index.invlists
         cell = 0
         while cell < self._index.nlist:
@@ -128,6 +135,8 @@ class InvertedFile:
             yield Block(np.concatenate(codes), np.concatenate(ids), np.repeat(np.arange(first, cell), counts))
 
     def _put(self, vectors: Vectors, ids: Ids, cells: Ids) -> None:
+        import faiss
+
         ids, cells = np.ascontiguousarray(ids), np.ascontiguousarray(cells)
         self._index.add_core(
             len(vectors), faiss.swig_ptr(vectors), faiss.swig_ptr(ids), faiss.swig_ptr(cells), None

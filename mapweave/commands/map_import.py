@@ -29,6 +29,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Read, optimise, write, print the improvement."""
     from dataclasses import replace
 
+    import gtsam  # noqa: F401, where it is missing this says so before a file is read
+
     from mapweave.formats.g2o import read_g2o, write_g2o
     from mapweave.formats.g2o_optimum import optimum_of
     from mapweave.hybridmap.errors import InvalidValue

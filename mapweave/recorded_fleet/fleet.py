@@ -38,9 +38,9 @@ def prepare(folder: Path, store: Path) -> None:
         for map_id, changes in recorded_maps().items():
             with closing(Journal(_journal(folder, map_id), map_id.agent)) as journal:
                 journal.open_map(map_id.epoch)
-                journal.append(map_id, _split(map_id, changes)[0], time.time_ns())
+                written = journal.append(map_id, _split(map_id, changes)[0], time.time_ns())
                 rows = journal.rows(map_id, 1, journal.head(map_id))
-                entries = [Entry.read(map_id, sequence, message) for sequence, message in rows]
+                entries = [Entry(*row, change) for row, change in zip(rows, written, strict=True)]
                 filled.apply(map_id, journal.log_id(map_id), entries)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 from mapweave.hybridmap.change import ChangeBody
@@ -13,6 +14,7 @@ RECORDING = Path(__file__).with_name("fleet.mapweave")
 """Made by `python -m synthetic.recorded_fleet`."""
 
 
+@cache
 def recorded_maps() -> dict[MapId, list[ChangeBody]]:
     """Each robot's changes, in the order in which it made them.
 

@@ -21,11 +21,10 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
@@ -36,6 +35,9 @@ from mapweave.merge.map_maintenance.node_age import is_older
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 MOVED = 0.05
 """Two nodes may move relative to each other by this before their views are compared again, m."""
@@ -94,6 +96,8 @@ class LandmarkRemover:
         return replace(merged, faded=active)
 
     def _fade(self, merged: MergedMap, graph: PoseGraph) -> None:
+        from scipy.spatial import cKDTree
+
         nodes = [merged.maps[node.map].nodes[node] for node in graph.nodes]
         tree = cKDTree(graph.means[:, :2])
         for row in self._affected(graph, nodes, tree, merged.superseded):
@@ -202,6 +206,8 @@ def things(node: Node, size: float) -> NDArray[np.bool_]:
         node: has N landmarks.
         size: m, what is nearer to each other may be.
     """
+    from scipy.spatial.distance import cdist
+
     points = node.points_in_robot
     together: NDArray[np.bool_] = (cdist(points, points) < size) | np.eye(len(points), dtype=np.bool_)
     return together

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, MapId, NodeId
@@ -17,6 +17,9 @@ from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.pose_arrays import compose_poses, inverse_poses
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 
 class Traversability:
@@ -75,6 +78,8 @@ class Traversability:
             reach: m.
             with_removed: those that were left out too.
         """
+        from scipy.spatial import cKDTree
+
         graph = self._graph(node)
         if graph.anchor not in self._trees:
             self._trees[graph.anchor] = cKDTree(graph.means[:, :2])

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array
@@ -95,6 +94,8 @@ class Encounter:
         Over all ways in which poses may be wrong, each as probable as it is: the later windows meet those
         that the earlier ones have left.
         """
+        import scipy.special
+
         by_way = np.cumsum(self.by_footprints(clear) + self.by_visibility(odds), axis=1)
         total: Array = -scipy.special.logsumexp(-by_way, axis=0, b=weights[:, None])
         added: Array = np.diff(total, prepend=0.0)

@@ -32,8 +32,6 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-import scipy.linalg
-import scipy.special
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array
@@ -83,6 +81,8 @@ def errors_in_common(graph: PoseGraph, intervals: VisibilityInterval, floor_xy: 
     Returns:
         Shifts of SIGMAS standard deviations along each component and between them.
     """
+    import scipy.linalg
+
     rows = np.unique(np.concatenate([intervals.observers, intervals.others]))
     joint = graph.covariance([graph.nodes[k] for k in rows]).reshape(3 * len(rows), -1)
     headings = graph.means[:, 2]
@@ -117,6 +117,8 @@ def errors_in_common(graph: PoseGraph, intervals: VisibilityInterval, floor_xy: 
 
 def _shells(count: int, radii: Array) -> tuple[Array, Array]:
     """(S, count) points of a normal distribution, on shells of ascending radii, and (S,) their weights."""
+    import scipy.special
+
     ways = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=count) if any(way)])
     ways /= np.linalg.norm(ways, axis=1)[:, None]
     edges = np.concatenate([[0.0], (radii[:-1] + radii[1:]) / 2.0, [np.inf]])

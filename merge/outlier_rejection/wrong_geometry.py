@@ -27,7 +27,6 @@ from dataclasses import dataclass
 
 import networkx as nx
 import numpy as np
-from scipy.special import bdtrc
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, Node, NodeId
@@ -303,6 +302,8 @@ def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
 
 def _more(shares: Array, usual: Array) -> bool:
     """Whether more nodes than by chance are seen through more than usual."""
+    from scipy.special import bdtrc
+
     if min(len(shares), len(usual)) < LEAST_NODES:
         return False
     many = int((shares > np.quantile(usual, 1.0 - RARE)).sum())

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import networkx as nx
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
@@ -17,6 +16,9 @@ from mapweave.merge.pose_graph.factors import Factors, Measurement, Rows
 from mapweave.merge.pose_graph.optimization import ANCHOR_SIGMA, optimized
 from mapweave.merge.pose_graph.solved_graph import PoseGraph, factorized
 from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 EXACT = 1000
 """Up to as many nodes a covariance is that of all measurements ..."""
@@ -71,6 +73,8 @@ class Component(PoseGraph):
     @cached_property
     def information(self) -> sparse.csc_matrix:
         """(3N, 3N) sparse, of the right perturbations of all nodes, anchor held."""
+        from scipy import sparse
+
         held = np.zeros((len(self.nodes), 3))
         held[self.rows[self.anchor]] = ANCHOR_SIGMA**-2
         whole = self.factors.information(self.means)
@@ -119,6 +123,8 @@ class Component(PoseGraph):
         Returns:
             (K, 3, 3); and (K,) whether what is around joins a pair: else its covariance means nothing.
         """
+        from scipy import sparse
+
         seats, which = np.unique(np.concatenate([i, j]), return_inverse=True)
         rows = self.factors.around(seats, max(least, AROUND * len(seats)), len(self.nodes))
         order = np.full(len(self.nodes), len(rows))
@@ -167,6 +173,9 @@ def _shares(pairs: Rows, i: Rows, j: Rows) -> list[Rows]:
 
 def _pieces(part: Factors, count: int) -> Rows:
     """(count,) which connected piece each row is in."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
     links = sparse.coo_matrix((np.ones(len(part)), (part.a, part.b)), shape=(count, count))
     out: Rows = connected_components(links, directed=False)[1]
     return out

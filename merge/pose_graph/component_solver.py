@@ -10,9 +10,7 @@ from collections.abc import Iterable, Sequence
 
 import networkx as nx
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
@@ -154,6 +152,9 @@ class ComponentSolver:
 
     def _move_on(self, index: Rows, whole: bool) -> None:
         """Let other links hold, and optimise what that changes."""
+        from scipy import sparse
+        from scipy.sparse.csgraph import connected_components
+
         difference = np.setxor1d(index, self._active, assume_unique=True)
         settled = not len(difference) and self._settled
         if settled and not (whole and any(map(_unsettled, self._graphs.values()))):

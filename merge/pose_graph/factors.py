@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.registration.pose_arrays import adjoints, compose_poses, inverse_poses
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 Rows = NDArray[np.int64]
 LEAST_SIGMAS = np.array([1e-3, 1e-3, 2e-4])
@@ -148,6 +151,8 @@ class Factors:
         Args:
             means: (N, 3) where the nodes are.
         """
+        from scipy import sparse
+
         by_a = -adjoints(compose_poses(inverse_poses(means[self.b]), means[self.a]))
         transposed = by_a.transpose(0, 2, 1)
         weights = self.weights

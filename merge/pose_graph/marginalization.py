@@ -28,9 +28,6 @@ from collections.abc import Collection, Iterable, Set
 
 import networkx as nx
 import numpy as np
-import scipy.sparse as sparse
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.node import NodeId
@@ -76,6 +73,9 @@ def marginal_links(
         Those of them at which nothing changes, as they are, and new ones: at most one between two nodes,
         smaller id first, in the order of ids.
     """
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
     earlier = tuple(earlier)
     factors = _about(graph, removed, earlier)
     if not len(factors):
@@ -194,6 +194,10 @@ def _near(means: Array, barred: Collection[tuple[int, int]]) -> Rows:
         means: (N, 3) m, m, rad.
         barred: pairs that are left out, unless nothing else connects all.
     """
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
     codes = np.array([a * len(means) + b for a, b in barred], np.int64)
     headings = means[:, 2:]
     places = np.hstack([means[:, :2], TURN * np.cos(headings), TURN * np.sin(headings)])

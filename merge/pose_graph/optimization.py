@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from mapweave.hybridmap.pose import Array
@@ -28,6 +27,8 @@ def optimized(factors: Factors, means: Array, free: Rows, held: Rows) -> Array:
     Returns:
         (N, 3) where they are then.
     """
+    import gtsam
+
     inside = np.zeros(len(means), np.bool_)
     inside[free] = True
     inside[held] = False
@@ -62,6 +63,8 @@ def add_measurements(graph: Any, part: Factors) -> None:
         part: the measurements.
     """
     # W = R' R
+    import gtsam
+
     roots = np.linalg.cholesky(part.weights).transpose(0, 2, 1)
     for a, b, mean, root in zip(part.a.tolist(), part.b.tolist(), part.means.tolist(), roots, strict=True):
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)

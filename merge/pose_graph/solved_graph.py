@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.sparse.linalg import splu
 
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
 from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 AT_ONCE = 256
 """Nodes whose marginal covariances are solved for together: all at once would take memory by the square."""
@@ -113,6 +114,9 @@ class PoseGraph:
 
 def factorized(information: sparse.spmatrix) -> Any:
     """Sparse factor of a symmetric positive definite matrix, which needs no pivots."""
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
     return splu(
         sparse.csc_matrix(information),
         permc_spec="MMD_AT_PLUS_A",
