@@ -14,7 +14,12 @@ import numpy as np
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.recorded_fleet.recording import RECORDING
+from mapweave.mapserver.http.live_map import LiveMap
+from mapweave.mapserver.http.loading import write_shown
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.outlier_rejection.link_probability import link_probabilities
+from mapweave.recorded_fleet.fleet import split
+from mapweave.recorded_fleet.recording import DEMO_PAGE, RECORDING, recorded_maps
 from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.world import Sensing, World, room, take_map
 
@@ -79,8 +84,20 @@ def recorded_fleet() -> list[ChangeBody]:
     return changes
 
 
+def page() -> str:
+    """What a map server shows of the recording once it has merged it: the message `map` of the page."""
+    merger = Merger()
+    for map_id, changes in recorded_maps().items():
+        merger.read((map_id, change) for change in split(map_id, changes)[0])
+    merged, shown = merger.merged(), LiveMap()
+    shown.show(merged, link_probabilities(merged), {})
+    return shown.message(0)
+
+
 if __name__ == "__main__":
     write_map_file(
         RECORDING, MapFile("agent", "the fleet of mapweave server --demo", tuple(recorded_fleet()))
     )
-    print(f"{RECORDING}: {RECORDING.stat().st_size} bytes")
+    write_shown(DEMO_PAGE, page())
+    for path in (RECORDING, DEMO_PAGE):
+        print(f"{path}: {path.stat().st_size} bytes")

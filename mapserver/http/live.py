@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections.abc import Mapping
@@ -44,7 +45,11 @@ MOST_RATED = 5000
 with the square. An explanation of a link has it in any case."""
 MOST_VIEWERS = 64
 """More are refused."""
-SERVER_FIELDS = ("summary", "settled", "event")
+LONGEST_HOLD = 10.0
+"""s for which the map of before is shown at most once the server is there, while it merges its own."""
+HELD = "loading; the map is that of before"
+"""What is said of the fleet meanwhile."""
+SERVER_FIELDS = ("summary", "settled", "event", "loading")
 """Of the server's status, which are sent along."""
 
 
@@ -74,14 +79,16 @@ class Shown(Protocol):
 class Live:
     """Looks at the server as long as there are viewers."""
 
-    def __init__(self, server: Shown, access: Access) -> None:
+    def __init__(self, server: Shown, access: Access, before: str = "") -> None:
         """Begin with no viewer.
 
         Args:
             server: what viewers see.
             access: who may see it.
+            before: the message with the map that is shown until the server has merged its own; see `message`.
         """
         self._server, self._access = server, access
+        self._before, self._hold_until = before, math.inf
         self._turn = threading.Lock()
         self._map = LiveMap()
         self._shown: MergedMap | None = None
@@ -125,6 +132,8 @@ class Live:
         hello = {"kind": "hello", **self._access.described(person, self._server.read_only)}
         await viewer.send_text(json_bytes(hello).decode())
         version, events, state = 0, 0, ""
+        if before := self._before:
+            await viewer.send_text(before)
         while True:
             looked = self._looked
             if not self._access.holds(person):
@@ -167,13 +176,21 @@ class Live:
 
     def _look(self) -> bool:
         """Take over what is new; returns whether the links' probabilities are due."""
+        status = self._server.status()
+        if self._holds(status):
+            content = {
+                "kind": "state",
+                "server": {"summary": HELD, "loading": True},
+                **json_values(FleetStatus()),
+            }
+            self._state = json_bytes(content).decode()
+            return False
         merged, floors = self._server.merged(), self._server.annotations().floors
         with self._turn:
             if merged is not self._shown or floors != self._floors:
                 self._shown, self._floors = merged, floors
                 self._map.show(merged, self._probabilities, floors)
         self._count(dict.fromkeys(self._server.history()))
-        status = self._server.status()
         content = {
             "kind": "state",
             "server": {name: status[name] for name in SERVER_FIELDS if name in status},
@@ -181,6 +198,24 @@ class Live:
         }
         self._state = json_bytes(content).decode()
         return merged is not self._rated and time.monotonic() >= self._rest_until
+
+    def _holds(self, status: Mapping[str, Scalar]) -> bool:
+        """Whether the map of before is shown still: maps that are not merged yet lie apart."""
+        if status.get("loading"):
+            return bool(self._before)
+        self._hold_until = min(self._hold_until, time.monotonic() + LONGEST_HOLD)
+        if status.get("settled") or time.monotonic() >= self._hold_until:
+            self._before = ""
+        return bool(self._before)
+
+    def message(self) -> str:
+        """The message with the newest merged map, whole; empty if it is not shown yet. From any thread."""
+        merged = self._server.merged()
+        if self._before or not merged.maps:
+            return ""
+        with self._turn:
+            self._map.show(merged, self._probabilities, self._server.annotations().floors)
+            return self._map.message(0)
 
     def _count(self, history: Mapping[MapEvent, None]) -> None:
         """Number what is new. What the server keeps no longer is not kept here either."""

@@ -84,22 +84,9 @@ MOST_AT_ONCE = 32
 MISSION = "/robots/ROBOT/go?goal=GOAL"
 OF_ROBOTS = tuple(f"/robots/ROBOT/{word}" for word in ("explore", "stop", "portal-done"))
 METHODS = {
-    **dict.fromkeys(
-        (
-            *PAGES,
-            "/session",
-            "/status",
-            "/history",
-            "/explain",
-            "/route",
-            "/robots",
-            "/missions",
-            "/map",
-            "/metrics",
-        ),
-        "GET",
-    ),
-    **dict.fromkeys(("/nodes/NODE", "/nodes/NODE/view", "/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
+    **dict.fromkeys((*PAGES, "/session", "/status", "/history", "/explain", "/route", "/robots"), "GET"),
+    **dict.fromkeys(("/missions", "/map", "/metrics", "/nodes/NODE", "/nodes/NODE/view"), "GET"),
+    **dict.fromkeys(("/plans/NAME.png", "/plan-images/SHA256.png"), "GET"),
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
     **dict.fromkeys(("/relocalize", MISSION, *OF_ROBOTS, "/stop", "/login", "/logout"), "POST"),
 }
@@ -126,7 +113,11 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 class Web(HttpThread):
-    """The map server for people. Listens from the start until closed."""
+    """The map server for people. Listens from the start until closed.
+
+    Attributes:
+        shown: gives the message with the map that the page shows; see `Live.message`.
+    """
 
     def __init__(
         self,
@@ -136,6 +127,7 @@ class Web(HttpThread):
         limits: Limits | None = None,
         logins: Logins | None = None,
         tls: ssl.SSLContext | None = None,
+        before: str = "",
     ) -> None:
         """Open the port and serve on a thread of its own.
 
@@ -146,6 +138,7 @@ class Web(HttpThread):
             limits: of connections.
             logins: of the fleet's members; None: this machine alone is served.
             tls: serves HTTPS.
+            before: what the page shows until the server has merged; see `Live`.
 
         Raises:
             SettingsError: other machines would be served without a login, or unencrypted.
@@ -153,7 +146,9 @@ class Web(HttpThread):
         """
         check_reach(address, logins is not None, tls is not None)
         hosts = () if logins is None else logins.hosts
-        app = SameSite(Questions(server, patience, logins).app, address[0], hosts)
+        questions = Questions(server, patience, logins, before=before)
+        self.shown = questions.live.message
+        app = SameSite(questions.app, address[0], hosts)
         try:
             super().__init__(app, address, limits, tls=tls)
         except NotConnected as error:
@@ -186,10 +181,16 @@ class Questions:
 
     Attributes:
         app: the application.
+        live: what viewers see.
     """
 
     def __init__(
-        self, server: Answering, patience: float, logins: Logins | None = None, rates: Rates | None = None
+        self,
+        server: Answering,
+        patience: float,
+        logins: Logins | None = None,
+        rates: Rates | None = None,
+        before: str = "",
     ) -> None:
         """Make the application.
 
@@ -198,9 +199,11 @@ class Questions:
             patience: time limit for a body, and for an answer, s.
             logins: of the fleet's members; None on a fleet without keys.
             rates: of people's questions; the usual ones by default.
+            before: see `Live`.
         """
         self._server = server
         self._access = access = Access(logins, patience)
+        self.live = Live(server, access, before)
         self._patience = patience
         self._open, self._rates = 0, rates or Rates()
         # The question is the router's word for it, by which roles decide.
@@ -226,7 +229,7 @@ class Questions:
         routes = [
             *(Route(path, _page("index.html")) for path in PAGES),
             *access.routes(lambda: server.read_only, self._answering),
-            WebSocketRoute("/live", Live(server, access).serve),
+            WebSocketRoute("/live", self.live.serve),
             *(
                 Route(path, self._answering(answer, question), methods=[method])
                 for method, path, question, answer in answering

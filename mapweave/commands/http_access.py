@@ -35,11 +35,16 @@ class HttpAccess:
         scheme = "http" if self.tls is None else "https"
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
 
-    def serve(self, server: Answering) -> Web:
-        """Open the port."""
+    def serve(self, server: Answering, before: str = "") -> Web:
+        """Open the port.
+
+        Args:
+            server: answers.
+            before: what the page shows until the server has merged; see `mapserver.http.live.Live`.
+        """
         from mapweave.mapserver.http.web import Web
 
-        return Web(self.address, server, logins=self.logins, tls=self.tls)
+        return Web(self.address, server, logins=self.logins, tls=self.tls, before=before)
 
     def renew(self, own: Credentials) -> None:
         """Go on with another certificate."""

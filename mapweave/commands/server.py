@@ -82,29 +82,22 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until stopped."""
     from mapweave.hybridmap.errors import SettingsError
-    from mapweave.mapserver.log.opening import is_postgres
 
     # What is wrong on the command line is said before anything is loaded for a second.
     if arguments.demo and (arguments.data is not None or arguments.store is not None):
         raise SettingsError("--demo keeps nothing: leave out --data and --store")
-    if arguments.store is not None and not is_postgres(arguments.store):
-        raise SettingsError("--store is a PostgreSQL address: postgresql://USER@HOST/DATABASE")
+    if arguments.store is not None:
+        from mapweave.mapserver.log.opening import is_postgres
 
+        if not is_postgres(arguments.store):
+            raise SettingsError("--store is a PostgreSQL address: postgresql://USER@HOST/DATABASE")
     need("server")
+
     # Modules stay: looking among them for garbage took a sixth of the start.
     gc.disable()
     from mapweave.hybridmap.node import check_name
-    from mapweave.mapserver.base_map import BaseMap
-    from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
-    from mapweave.mapserver.server import MapServer, ServerSettings
-    from mapweave.processes.service_manager import ServiceManager
     from mapweave.terminal import log_with_time, stamped
-    from mapweave.wire.keys import Keys
-    from mapweave.wire.zenoh_bus import ZenohBus
-    from mapweave.wire.zenoh_log import show_refusals
 
-    gc.freeze()
-    gc.enable()
     # Lines have dates, so that a log shows when two maps came apart.
     log_with_time(arguments.log_format)
     sys.setswitchinterval(TURN)
@@ -114,64 +107,82 @@ def run(arguments: argparse.Namespace) -> int:
     network = network_of(arguments, settings)
     name = check_name(arguments.name or network.server)
     router, folder = server_settings(network, name)
-    keys = Keys(router.fleet)
     cluster = replace(settings.cluster, ray=arguments.ray or settings.cluster.ray)
     if cluster.ray and arguments.lockstep:
         raise SettingsError("--lockstep is repeatable, and a cluster is not: leave out one of them")
     if cluster.ray:
         need("cluster")
-    people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
-    if http is not None:
-        from mapweave.commands.http_access import http_access
-
-        people = http_access(http, folder, name)
     stop = stop_on_signals()
-    if folder is not None:
-        show_refusals(arguments.log_format)
-    bus = ZenohBus(router)
-    try:
+    with ExitStack() as stack:
+        data, web = arguments.data or DATA, None
+        if arguments.demo:
+            data = Path(stack.enter_context(TemporaryDirectory()))
+        path = data / f"{name}.sqlite"
+        people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
+        if http is not None:
+            from mapweave.commands.http_access import http_access
+            from mapweave.mapserver.http.loading import SUFFIX, LoadingServer, read_shown, write_shown
+            from mapweave.recorded_fleet.recording import DEMO_PAGE
+
+            people, loading = http_access(http, folder, name), LoadingServer()
+            shown = path.with_name(path.name + SUFFIX)
+            web = people.serve(loading, read_shown(DEMO_PAGE if arguments.demo else shown))
+            stack.enter_context(web)
+            print(stamped(f"for people: {people.url}"), flush=True)
+
+        # The page is there: a browser can open it while all else is loaded.
+        from mapweave.mapserver.base_map import BaseMap
+        from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
+        from mapweave.mapserver.server import MapServer, ServerSettings
+        from mapweave.processes.service_manager import ServiceManager
+        from mapweave.wire.keys import Keys
+        from mapweave.wire.zenoh_bus import ZenohBus
+        from mapweave.wire.zenoh_log import show_refusals
+
+        gc.freeze()
+        gc.enable()
+        if folder is not None:
+            show_refusals(arguments.log_format)
+        keys, bus = Keys(router.fleet), ZenohBus(router)
+        stack.callback(bus.close)
         how = ServerSettings(settings.admission_control, settings.merge, settings.quotas, cluster)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
-        with ExitStack() as stack:
-            data = arguments.data or DATA
-            if arguments.demo:
-                from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
+        if arguments.demo:
+            from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
 
-                data = Path(stack.enter_context(TemporaryDirectory()))
-                prepare(data, data / f"{name}.sqlite")
-            path = data / f"{name}.sqlite"
-            if arguments.store is None and path.exists() and path.stat().st_size > LARGE:
-                print(stamped(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ..."), flush=True)
-            base = None
-            if arguments.map is not None:
-                given = opened(arguments.map)
-                base = BaseMap.of(str(given.path), given.content)
-            server = MapServer(bus, keys, arguments.store or path, name, how, schedule, base, data)
-            if base is not None:
-                print(stamped(f"with {base}"), flush=True)
-            stack.enter_context(server)
-            where = "listens at " + ", ".join(router.listen)
-            if router.mode == "client":
-                where = "is at the routers " + ", ".join(router.endpoints)
-                warn_without_router(bus, name)
-            print(stamped(f"map server {name} of fleet {keys.fleet} {where}"), flush=True)
-            if people is not None:
-                stack.enter_context(people.serve(server))
-                print(stamped(f"for people: {people.url}"), flush=True)
-            if arguments.demo:
-                stack.enter_context(RecordedFleet(bus, keys, name, data))
-            renewed = people.renew if people is not None else lambda own: None
-            renewal = key_renewal(bus, folder, name, router, renewed)
-            last_line, manager = "", ServiceManager()
-            manager.ready()
-            while not stop.wait(1.0):
-                manager.alive()
-                if renewal is not None:
-                    renewal.check()
-                now = server.summary()
-                if now != last_line:
-                    print(stamped(now), flush=True)
-                    last_line = now
-    finally:
-        bus.close()
+            prepare(data, path)
+        if arguments.store is None and path.exists() and path.stat().st_size > LARGE:
+            print(stamped(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ..."), flush=True)
+        base = None
+        if arguments.map is not None:
+            given = opened(arguments.map)
+            base = BaseMap.of(str(given.path), given.content)
+        server = MapServer(bus, keys, arguments.store or path, name, how, schedule, base, data)
+        if base is not None:
+            print(stamped(f"with {base}"), flush=True)
+        stack.enter_context(server)
+        if web is not None:
+            loading.take(server)
+            stack.callback(lambda: write_shown(shown, web.shown()))
+            # The page ends first: it asks the server.
+            stack.callback(web.close)
+        where = "listens at " + ", ".join(router.listen)
+        if router.mode == "client":
+            where = "is at the routers " + ", ".join(router.endpoints)
+            warn_without_router(bus, name)
+        print(stamped(f"map server {name} of fleet {keys.fleet} {where}"), flush=True)
+        if arguments.demo:
+            stack.enter_context(RecordedFleet(bus, keys, name, data))
+        renewed = people.renew if people is not None else lambda own: None
+        renewal = key_renewal(bus, folder, name, router, renewed)
+        last_line, manager = "", ServiceManager()
+        manager.ready()
+        while not stop.wait(1.0):
+            manager.alive()
+            if renewal is not None:
+                renewal.check()
+            now = server.summary()
+            if now != last_line:
+                print(stamped(now), flush=True)
+                last_line = now
     return 0

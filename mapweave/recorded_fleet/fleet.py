@@ -38,7 +38,7 @@ def prepare(folder: Path, store: Path) -> None:
         for map_id, changes in recorded_maps().items():
             with closing(Journal(_journal(folder, map_id), map_id.agent)) as journal:
                 journal.open_map(map_id.epoch)
-                written = journal.append(map_id, _split(map_id, changes)[0], time.time_ns())
+                written = journal.append(map_id, split(map_id, changes)[0], time.time_ns())
                 rows = journal.rows(map_id, 1, journal.head(map_id))
                 entries = [Entry(*row, change) for row, change in zip(rows, written, strict=True)]
                 filled.apply(map_id, journal.log_id(map_id), entries)
@@ -58,7 +58,7 @@ class RecordedFleet:
         """
         self._stop = threading.Event()
         self._robots = [
-            RecordedRobot(bus, keys, server, map_id, *_split(map_id, changes), _journal(folder, map_id))
+            RecordedRobot(bus, keys, server, map_id, *split(map_id, changes), _journal(folder, map_id))
             for map_id, changes in recorded_maps().items()
         ]
         self._thread = threading.Thread(target=self._move, name="recorded fleet", daemon=True)
@@ -89,7 +89,7 @@ def _journal(folder: Path, map_id: MapId) -> Path:
     return folder / f"journal-{map_id.agent}.sqlite"
 
 
-def _split(map_id: MapId, changes: list[ChangeBody]) -> tuple[list[ChangeBody], list[ChangeBody]]:
-    """What is mapped already, and what is still to be mapped."""
+def split(map_id: MapId, changes: list[ChangeBody]) -> tuple[list[ChangeBody], list[ChangeBody]]:
+    """What of a recorded map is mapped already, and what is still to be mapped."""
     known = len(changes) - (2 * STILL if map_id.agent == MAPPING else 0)
     return changes[:known], changes[known:]

@@ -11,7 +11,11 @@ from mapweave.storage.map_file import read_map_file
 from mapweave.wire.codec import element_of
 
 RECORDING = Path(__file__).with_name("fleet.mapweave")
-"""Made by `python -m synthetic.recorded_fleet`."""
+DEMO_PAGE = Path(__file__).with_name("page.shown")
+"""What the page shows of them at once; see `mapserver.http.loading`.
+
+`python -m synthetic.recorded_fleet` makes both.
+"""
 
 
 @cache

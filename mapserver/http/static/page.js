@@ -218,7 +218,8 @@ watch({
     listRobots(robots, name => selectRobot(name));
     updateRobot(robots);
     // Lists are shown once they are filled, so that nothing jumps.
-    byId("fleet").classList.remove("waiting");
+    if (!server.loading) byId("fleet").classList.remove("waiting");
+    if (!page.readOnly) byId("connection").textContent = server.loading ? server.summary : "live";
     painter.ask();
   },
   events({ history }) {

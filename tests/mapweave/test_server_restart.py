@@ -1,0 +1,88 @@
+"""A map server that starts again: its page has the map of before at once."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from websockets.sync.client import connect
+
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.http.live import HELD
+from mapweave.storage.map_file import MapFile, write_map_file
+from synthetic.maps import looking_around, map_tours
+from synthetic.world import room
+from tests.waiting import eventually, free_port
+
+
+@contextmanager
+def server(http: int, *arguments: str) -> Iterator[None]:
+    command = [
+        sys.executable, "-m", "mapweave", "server", "--http", str(http), "--listen",
+        f"tcp/127.0.0.1:{free_port()}", *arguments,
+    ]  # fmt: skip
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=dict(os.environ))
+    try:
+        yield
+    finally:
+        running.send_signal(signal.SIGINT)
+        assert running.wait(30) == 0
+
+
+def first_messages(http: int) -> dict[str, dict]:
+    """The first message of each kind of the page's WebSocket, once the port is open."""
+    messages: dict[str, dict] = {}
+
+    def ask() -> bool:
+        try:
+            with connect(f"ws://127.0.0.1:{http}/live", proxy=None) as socket:
+                while not {"map", "state"} <= messages.keys():
+                    message = json.loads(socket.recv(timeout=20))
+                    messages.setdefault(message["kind"], message)
+        except OSError:
+            return False
+        return True
+
+    eventually(ask, 60)
+    return messages
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_map_of_before_while_the_server_loads(tmp_path: Path) -> None:
+    rng, http = np.random.default_rng(4), free_port()
+    tours = {MapId(name, 1): looking_around(4) for name in ("r0", "r1")}
+    logs = map_tours(room(0, 0, 5, 4, 700, rng), tours, rng)
+    for map_id, log in logs.items():
+        write_map_file(tmp_path / f"{map_id}.mapweave", MapFile("agent", str(map_id), tuple(log)))
+    data = ["--data", str(tmp_path / "data"), "--map", str(tmp_path / "r0.1.mapweave")]
+
+    def settled() -> bool:
+        try:
+            with urlopen(f"http://127.0.0.1:{http}/status", timeout=10) as reply:
+                return bool(json.load(reply)["settled"])
+        except OSError:
+            return False
+
+    with server(http, *data):
+        begun = first_messages(http)
+        assert not begun["map"]["components"] and begun["state"]["server"]["summary"] == "loading"
+        eventually(settled, 60)
+    with server(http, *data):
+        again = first_messages(http)
+        assert again["state"]["server"] == {"summary": HELD, "loading": True}
+        (component,) = again["map"]["components"]
+        assert component["maps"] == ["r0.1"]
+        eventually(settled, 60)
+    kept = tmp_path / "data" / "s0.sqlite.shown"
+    kept.write_bytes(kept.read_bytes()[:-5])
+    with server(http, *data):
+        assert not first_messages(http)["map"]["components"], "it is damaged"
