@@ -94,7 +94,7 @@ class Mapper:
     @property
     def doubtful(self) -> bool:
         """Whether the last image shows nothing of what it should, or none comes: no time to map."""
-        return self._tracking.acceptance.doubtful
+        return self._tracking.acceptance.doubtful or self._tracking.contradicted
 
     @property
     def doubt(self) -> str:
@@ -104,7 +104,9 @@ class Mapper:
             return "the image shows something else than a moment ago"
         if images.blank:
             return "the image shows nothing: is it dark, or the lens covered?"
-        return "the camera gives no new image" if self.doubtful else ""
+        if images.doubtful:
+            return "the camera gives no new image"
+        return "the image shows another motion than the wheels" if self._tracking.contradicted else ""
 
     @property
     def health(self) -> str:

@@ -179,9 +179,14 @@ class Tracking:
         return Health.FEW, f"{unused} landmarks in view are too few or too near to each other to go by"
 
     @property
+    def contradicted(self) -> bool:
+        """Whether the last image contradicts the wheels: the next ones will show which is true."""
+        return self._dispute.contradicting > 0
+
+    @property
     def disputed(self) -> bool:
-        """Whether wheels and images have contradicted each other since the anchor."""
-        return self._dispute.with_filter(self._filter.pose.mean)
+        """Whether wheels and images contradict each other for so long that the pose is lost."""
+        return self._dispute.disputed
 
     @property
     def converged_share(self) -> float:
@@ -210,6 +215,7 @@ class Tracking:
         alive = self._seek_hidden(followed)
         held = self._hold(alive)
         self._correction = self._correct(held)
+        self._dispute.compare(self._filter.pose.mean)
         self._refill()
         self._note_unheld(self._correction)
         self.remember()
