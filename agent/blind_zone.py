@@ -4,7 +4,7 @@ An ultrasonic sensor hears no echo from nearer than some 25 cm and reads 0 there
 keeps a robot from every place along a wall, and leaves phantoms at its edge wherever it turns. But the robot
 has come from farther off, where the sensors measured: what they saw then is remembered, and fills in. Where
 nothing is remembered, the thing is not where the robot itself has just been. A robot that is carried off
-unnoticed believes what it remembers until its sensors look through it.
+believes what it remembers until its sensors look through it, or until it is noticed: see `forget`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class BlindZone:
         self._odom_from_robot = self._odom_from_robot @ observation.odometry.motion()
         readings = observation.proximity
         if observation.kidnapped:
-            self._points, self._stood = self._points[:0], self._stood[:0]
+            self.forget()
         if not len(readings) or len(readings) != len(self._bearings):
             return observation
         remembered = self._odom_from_robot.inverse().apply(self._points)
@@ -86,6 +86,10 @@ class BlindZone:
             for f, b in zip(free[blind], self._bearings[blind], strict=True)
         ]
         return replace(observation, proximity=np.where(blind, free, readings))
+
+    def forget(self) -> None:
+        """Remember nothing: the robot may be elsewhere than the wheels say. The zone's depth stays known."""
+        self._points, self._stood = self._points[:0], self._stood[:0]
 
     def _driven(self, bearing: float) -> float:
         """How far from its edge along a bearing the robot has just been, m.

@@ -41,6 +41,7 @@ class MapMaking:
         mapper: makes nodes and edges.
         floor: around the robot.
         sift: features of its images.
+        losses: how often it was noticed that the robot is not where it took itself to be.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class MapMaking:
         self._carried = CarriedMapping(self.mapper)
         self._resumption: Resumption | None = None
         self._episodes = 0
+        self.losses = 0
 
     @property
     def description(self) -> RobotDescription:
@@ -135,6 +137,7 @@ class MapMaking:
         started = self.mapper.started
         self.mapper.step(observation)
         if started and not self.mapper.started:
+            self.losses += 1
             self.restart()
 
     def step(

@@ -243,6 +243,7 @@ class Pipeline:
         if self._sensors.clock_jumped:
             self.mapper.forget_clock()
         if self._sensors.pose_lost:
+            self._blind_zone.forget()
             self._lose_pose()
         self._take_over(driven)
         self._feel(observation)
@@ -250,6 +251,7 @@ class Pipeline:
         stands_elsewhere = self._in_the_air(observation) or self._put_elsewhere
         if not stands_elsewhere:
             self._make_room()
+        lost = self._times_lost
         match self._mission:
             case _ if stands_elsewhere:
                 pass
@@ -266,6 +268,9 @@ class Pipeline:
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers, self._held)
                 self.mapper.drove(self._navigator.traverse, self._navigator.refined)
+        if self._times_lost > lost:
+            # It may have been carried: what the wheels say of things around it is void.
+            self._blind_zone.forget()
         questions = [*questions, *self._who_is_near()]
         if self._blind and not self._lifted:
             command = self._sensors.trial
@@ -315,6 +320,11 @@ class Pipeline:
                 starts = ((fix.node, fix.node_from_robot.mean),)
                 return [self._others.question(starts, fix.node_from_robot)]
         return []
+
+    @property
+    def _times_lost(self) -> int:
+        """How often what it sees has shown that it is not where it took itself to be."""
+        return self._map_making.losses + (0 if self._navigator is None else self._navigator.losses)
 
     @property
     def _exploring(self) -> bool:

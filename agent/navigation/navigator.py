@@ -62,6 +62,7 @@ class Navigator:
         legs: nodes on the first route that was given.
         progress: share of the present route that is driven.
         tally: statistics of the drive so far.
+        losses: how often it did not see where it is for so long that it took itself for lost.
         traverse: from one node to another, if the last step has ended one.
         refined: a node of the own map that was refined by the last step, if any.
     """
@@ -96,6 +97,7 @@ class Navigator:
         self.legs = 0
         self.progress = 0.0
         self.tally = DriveStatistics()
+        self.losses = 0
         self.traverse: Traverse | None = None
         self.refined: Node | None = None
         self._description = description
@@ -424,5 +426,6 @@ class Navigator:
             self.fix = fix
             return
         if fix is None:
+            self.losses += 1
             self._expected = self._positioning.on_own_map(before)
         self._start_from(fix)

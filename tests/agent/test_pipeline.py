@@ -10,7 +10,7 @@ import pytest
 
 from mapweave.agent.global_localization import pose_consistency
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.mission import Carried, Explore, GoTo, Idle, WhereAmI, WhoIsNear
+from mapweave.agent.mission import Carried, Driven, Explore, GoTo, Idle, WhereAmI, WhoIsNear
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
@@ -260,6 +260,27 @@ def test_a_robot_carried_off_before_the_first_node_restarts(walls):
         image = still(walls).image if tick < 3 else elsewhere
         status = pipeline.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), image)).status
     assert status.doing == "mapping while carried" and status.tracked > 20
+
+
+@pytest.mark.parametrize("start", [-0.3, 1.2], ids=["with nodes", "before the first node"])
+def test_a_robot_carried_off_forgets_what_its_rangers_have_seen(walls, start):
+    """Ultrasonic sensors, blind within 0.25 m: what reads 0 then may touch, wherever it was before."""
+    pipeline, before, forward = on(Carried()), Pose2(start), Driven(Command(0.05))
+    for tick, x in enumerate(np.arange(start, ROOM[1] - BODY.radius - 0.2, 0.025)):
+        pose = Pose2(float(x))
+        observation = walls.observe(before, pose, tick)
+        sonar = np.where(rangers(pose) < 0.25, 0.0, rangers(pose))
+        step = pipeline.step(replace(observation, proximity=sonar))
+        before = pose
+    assert sonar.min() == 0.0
+    assert bool(step.status.nodes) == (start < 0.0)
+    elsewhere = np.rot90(observation.image, 2)
+    commands = []
+    for k in range(40):
+        still_there = Observation((tick + 1 + k) * 100_000_000, Odometry(0.0, 0.0), elsewhere, sonar)
+        commands.append(pipeline.step(still_there, driven=forward).command.forward)
+    assert commands[0] > 0.0, "the wall is known from farther off"
+    assert commands[-1] == 0.0, "the robot knows nothing of where it is now"
 
 
 def lift(walls, pipeline: Pipeline, tick: int) -> list[Step]:
