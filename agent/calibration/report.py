@@ -57,15 +57,16 @@ class Cause:
             "wheel sizes",
             P.DRIFT: f"driving ahead, the image turns by {e - d:+.2f} deg/m that the wheels do not report: "
             "one wheel is larger",
-            P.FORWARD: f"in turns the image moves as if the camera were {e:.2f} m ahead of the axle; "
-            f"declared {d:.2f}",
-            P.LEFT: f"in turns the image moves as if the camera were {e:.2f} m left of the axle's middle; "
-            f"declared {d:.2f}",
-            P.HEADING: f"driving ahead, the image moves as if the camera looked {e:.1f} deg to the left; "
-            f"declared {d:.1f}",
-            P.PITCH: f"driving ahead, the image moves as if the camera looked {e:.1f} deg down; "
-            f"declared {d:.1f}",
-            P.ROLL: f"in turns the image moves as if the camera were rolled by {e:.1f} deg; declared {d:.1f}",
+            P.FORWARD: f"in turns the image moves as if the camera were {e:z.2f} m ahead of the axle; "
+            f"declared {d:z.2f}",
+            P.LEFT: f"in turns the image moves as if the camera were {e:z.2f} m left of the axle's middle; "
+            f"declared {d:z.2f}",
+            P.HEADING: f"driving ahead, the image moves as if the camera looked {e:z.1f} deg to the left; "
+            f"declared {d:z.1f}",
+            P.PITCH: f"driving ahead, the image moves as if the camera looked {e:z.1f} deg down; "
+            f"declared {d:z.1f}",
+            P.ROLL: f"in turns the image moves as if the camera were rolled by {e:z.1f} deg; "
+            f"declared {d:z.1f}",
             P.HEIGHT: f"the floor moves as if the camera were {e:.2f} m high; declared {d:.2f}",
             P.DELAY: f"where turns begin and end the wheels are {1e3 * (e - d):+.0f} ms late to the images",
         }

@@ -100,9 +100,15 @@ def _recorded(
 def _live(
     arguments: argparse.Namespace, name: str, console: Any
 ) -> tuple[RobotDescription, Iterator[Observation]]:
-    """What a robot senses from now on, for some seconds."""
+    """What a robot senses from now on, for some seconds.
+
+    The iterator raises DeviceError when a sensor fails: a base that does not answer would count as one that
+    stands.
+    """
     import threading
 
+    from mapweave.agent.sensor_health.sensor_monitor import SensorMonitor
+    from mapweave.hybridmap.errors import DeviceError
     from mapweave.terminal import Bar
 
     settings = settings_of(arguments)
@@ -112,11 +118,14 @@ def _live(
     robot, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
     threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
 
-    def observations() -> Iterator[Observation]:
+    def observations(sensors: SensorMonitor) -> Iterator[Observation]:
         began = 0
         try:
             with Bar(console, f"{name}: drive it, with turns to both sides (s)", arguments.seconds) as bar:
                 while (observation := robot.sense()) is not None and not stop.is_set():
+                    sensors.see(observation, None)
+                    if sensors.fault is not None:
+                        raise DeviceError(f"{name}: {sensors.fault.words}; nothing is written")
                     began = began or observation.stamp_ns
                     passed = 1e-9 * (observation.stamp_ns - began)
                     bar.update(round(passed))
@@ -127,7 +136,13 @@ def _live(
             robot.close()
             bus.close()
 
-    return robot.describe(), observations()
+    try:
+        description = robot.describe()
+    except BaseException:
+        robot.close()
+        bus.close()
+        raise
+    return description, observations(SensorMonitor(description))
 
 
 def _print(console: Any, found: DriveCalibration) -> dict[str, str]:

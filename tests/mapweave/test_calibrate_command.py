@@ -113,3 +113,46 @@ def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.Captu
     (folder / "splits.toml").write_text('[[robot]]\nname = "a"\nfirst = 0\nlast = 40\n')
     assert "too short" in complaint(capfd, *command, "--robot", "a")
     assert not list(tmp_path.glob("*.toml"))
+
+
+LIVE = """
+from dataclasses import dataclass
+from pathlib import Path
+import numpy as np
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError
+
+class Live:
+    def __init__(self, settings):
+        self.ticks = 0
+
+    def describe(self):
+        if SILENT:
+            raise DeviceError("no answer")
+        return RobotDescription(Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3))
+
+    def sense(self):
+        self.ticks += 1
+        image = np.full((48, 64), self.ticks, np.uint8) if self.ticks < 5 else None
+        return Observation(self.ticks * 100_000_000, Odometry(0.01, 0.0), image)
+
+    def act(self, command):
+        return command
+
+    def close(self):
+        Path("closed").touch()
+"""
+
+
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_robot_that_fails_while_it_is_calibrated_is_closed_and_named(
+    silent: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A camera left open ended the process with a signal; a silent base counted as one that stands."""
+    monkeypatch.chdir(tmp_path)
+    Path("live.py").write_text(f"SILENT = {silent}\n{LIVE}")
+    said = complaint(capfd, "calibrate", "drive", "--robot", "live.py:Live", "--name", "r0")
+    assert ("no answer" if silent else "the camera gives no image") in said
+    assert Path("closed").exists()
+    assert not Path("out").exists()
