@@ -63,6 +63,15 @@ class CommandParser(argparse.ArgumentParser):
         # Positions begin with a minus as well, and are no options: -3.1,2 and -3.1,2=40,50.
         self._negative_number_matcher = NEGATIVE
 
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        """Read a value; if it is none, say of which argument."""
+        try:
+            return super()._get_value(action, arg_string)
+        except UsageError as error:
+            option = action.option_strings[-1:]
+            which = f"{option[0]} {arg_string}" if option else f"{action.dest} {arg_string!r}"
+            raise UsageError(f"{which}: {error}") from None
+
 
 class PrintVersion(argparse.Action):
     """Print the version and exit; it is looked up only when it is asked for."""
@@ -112,7 +121,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         import argcomplete
 
         argcomplete.autocomplete(commands)
-    arguments, unknown = commands.parse_known_args(argv)
+    try:
+        arguments, unknown = commands.parse_known_args(argv)
+    except UsageError as error:
+        _complain(str(error))
+        return USAGE
     if unknown:
         # The usage of the command that was given says more than that of `mapweave`.
         arguments.parser.error(f"unrecognized arguments: {' '.join(unknown)}")

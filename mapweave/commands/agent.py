@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.network import (
     add_log_format,
     add_network,
@@ -42,7 +43,7 @@ def add_to(commands: Any) -> None:
         description="Run one robot: its whole pipeline, its own map on its own disk, its link to the fleet. "
         "Without a network it goes on mapping; what it mapped is sent when a server can be reached.",
     )
-    parser.add_argument("name", help="the robot's name in the fleet, for example r0")
+    parser.add_argument("name", type=values.name, help="the robot's name in the fleet, for example r0")
     add_robot(parser)
     parser.add_argument(
         "--mission", choices=["idle", "explore", "carried"],
@@ -70,11 +71,11 @@ def add_to(commands: Any) -> None:
     )  # fmt: skip
     add_rerun(parser)
     parser.add_argument(
-        "--metrics", type=int, metavar="PORT",
+        "--metrics", type=values.port, metavar="PORT",
         help="tell Prometheus about the robot at http://127.0.0.1:PORT/metrics, on this machine alone "
         "(docs/monitoring.md; default: off)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
+    parser.add_argument("--seed", type=values.seed, default=0, help="of the random choices in exploration")
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
     )
@@ -100,7 +101,10 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
         "driver of the settings, else remote, a base behind Zenoh keys such as the simulator's)",
     )  # fmt: skip
     parser.add_argument(
-        "--body", metavar="ENDPOINT", help="Zenoh endpoint of the robot's body (default: the fleet's)"
+        "--body",
+        type=values.endpoint,
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of the robot's body (default: the fleet's)",
     )
 
 
@@ -109,23 +113,24 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.drivers.claim import Claim
     from mapweave.agent.drivers.recorded import RecordedRobot
     from mapweave.commands.map_ends import map_of
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.commands.usage import arguments_read
+    from mapweave.hybridmap.errors import Refused
     from mapweave.hybridmap.mission_order import MissionKind
-    from mapweave.hybridmap.node import check_name
     from mapweave.processes.agent import AgentOptions
     from mapweave.processes.agent_process import run_agent
     from mapweave.terminal import log_with_time
     from mapweave.wire.keys import check_epoch
 
-    name = check_name(arguments.name)
+    name: str = arguments.name
     log_with_time(arguments.log_format, robot=name)
     if arguments.metrics is not None:
         need("metrics")  # before the robot is waited for
     if arguments.epoch is not None:
-        check_epoch(arguments.epoch)
+        with arguments_read():
+            check_epoch(arguments.epoch)
     resume = None if arguments.resume is None else map_of(arguments.resume)
     if resume is not None and not (arguments.data / f"{name}.sqlite").exists():
-        raise InvalidValue(f"{arguments.data}: there is no journal of {name} with a map to resume")
+        raise Refused(f"{arguments.data}: there is no journal of {name} with a map to resume")
     settings = settings_of(arguments)
     network = network_of(arguments, settings, name)
     stop = stop_on_signals()
@@ -227,6 +232,7 @@ def open_robot(
     from mapweave.agent.drivers.remote import RemoteRobot
     from mapweave.agent.drivers.settings import REMOTE
     from mapweave.agent.synchronization import FreeRunning, Lockstep
+    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.errors import SettingsError
 
     driver = arguments.robot or settings.driver
@@ -238,8 +244,12 @@ def open_robot(
         robot = LockstepRobot(bus, fleet, name)
         return CheckedRobot(robot), Lockstep(robot.rendezvous)
     if lockstep or arguments.body:
-        raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
-    return CheckedRobot(find_driver(driver)(settings)), FreeRunning()
+        raise UsageError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
+    try:
+        make = find_driver(driver)
+    except SettingsError as error:
+        raise (UsageError(str(error)) if arguments.robot else error) from None
+    return CheckedRobot(make(settings)), FreeRunning()
 
 
 def bus_of(arguments: argparse.Namespace, settings: RobotSettings, network: NetworkSettings) -> ZenohBus:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.calibrate_target import add_target, size_of, target_of
 from mapweave.exit_status import DONE, NO
 
@@ -32,7 +33,7 @@ def add_to(actions: Any) -> None:
         "images", type=Path, nargs="?", help="folder of images or video (default: live from the camera)"
     )
     parser.add_argument(
-        "--robot", type=Path, metavar="FILE",
+        "--settings", type=Path, metavar="FILE",
         help="the robot's settings file, for example r0.toml: its [robot.camera] says which camera it is, "
         "and gets the result; made if it is not there",
     )  # fmt: skip
@@ -51,7 +52,7 @@ def add_to(actions: Any) -> None:
     )
     parser.add_argument("--forward", type=float, metavar="M", help="of the lens ahead of the axle, likewise")
     parser.add_argument(
-        "--http", type=int, nargs="?", const=8090, metavar="PORT",
+        "--http", type=values.port, nargs="?", const=8090, metavar="PORT",
         help="show camera and guidance on a page of this machine, port 8090 by default",
     )  # fmt: skip
     add_target(parser)
@@ -63,7 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Collect views, calibrate, print, write."""
     from mapweave.agent.drive_geometry import check_mount
     from mapweave.agent.drivers.settings_writer import camera_table, write_camera
-    from mapweave.hybridmap.errors import InvalidValue, SettingsError
+    from mapweave.commands.usage import UsageError, arguments_read
+    from mapweave.hybridmap.errors import Refused
     from mapweave.terminal import plain_or_terminal
     from mapweave.vision.calibration.camera_calibration import calibrate_camera
     from mapweave.vision.calibration.collection import ViewCollection
@@ -71,11 +73,12 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.vision.lens import LensModel
 
     a = arguments
-    check_mount(a.height or 0.0, a.forward or 0.0)
-    known = {} if a.robot is None else camera_table(a.robot)
-    if a.robot is not None and a.height is None and "height_m" not in known:
-        raise SettingsError(
-            f"{a.robot}: [robot.camera] has no height_m; give --height, the lens above the floor in m"
+    with arguments_read():
+        check_mount(a.height or 0.0, a.forward or 0.0)
+    known = {} if a.settings is None else camera_table(a.settings)
+    if a.settings is not None and a.height is None and "height_m" not in known:
+        raise UsageError(
+            f"{a.settings}: [robot.camera] has no height_m; give --height, the lens above the floor in m"
         )
     model = None if a.lens is None else LensModel(a.lens)
     collection = ViewCollection(BoardDetector(target_of(a)), model)
@@ -86,23 +89,23 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         _recorded(collection, a.images, console)
     if not collection.views:
-        raise InvalidValue(
+        raise Refused(
             f"{a.images or f'camera {source}'}: no view shows the target ({collection.detector.target}); "
             "is it this one?"
         )
     found = collection.done or calibrate_camera(collection.views, model)
     _print(found, console)
-    written = a.robot is not None and not found.problems
+    written = a.settings is not None and not found.problems
     if written:
         values = _values(found)
         values |= {} if a.images is not None else {"source": source}
         values |= {} if a.height is None else {"height_m": a.height}
         values |= {} if a.forward is None else {"forward_m": a.forward}
-        write_camera(a.robot, values)
-        console.print(f"[robot.camera] written to {a.robot}", markup=False)
+        write_camera(a.settings, values)
+        console.print(f"[robot.camera] written to {a.settings}", markup=False)
     elif not found.problems:
         console.print(
-            "no --robot FILE: nothing is written. For [robot.camera], or a recording's camera.toml:"
+            "no --settings FILE: nothing is written. For [robot.camera], or a recording's camera.toml:"
         )
         for key, value in _values(found).items():
             console.print(f"{key} = {json.dumps(value)}", markup=False, highlight=False)

@@ -8,9 +8,11 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.agent import add_calibration, bus_of, calibration_of, close_on, open_robot
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 from mapweave.commands.replay import add_recording, name_of, options_of
+from mapweave.exit_status import NO
 
 if TYPE_CHECKING:
     from mapweave.agent.calibration.estimate import Estimate
@@ -33,9 +35,15 @@ def add_to(actions: Any) -> None:
         "--robot", metavar="NAME|DRIVER",
         help="of a recording: one of the robots in its splits.toml; without one: the driver, as for `agent`",
     )  # fmt: skip
-    parser.add_argument("--name", help="the robot's name in the fleet (default: as `replay` names it)")
     parser.add_argument(
-        "--seconds", type=float, default=40.0, metavar="S", help="how long to watch a robot (default: 40)"
+        "--name", type=values.name, help="the robot's name in the fleet (default: as `replay` names it)"
+    )
+    parser.add_argument(
+        "--seconds",
+        type=values.seconds,
+        default=40.0,
+        metavar="S",
+        help="how long to watch a robot (default: 40)",
     )
     parser.add_argument(
         "--keep-wheels", action="store_true",
@@ -56,12 +64,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     from mapweave.agent.calibration.recorded_drive import calibrate
     from mapweave.agent.recordings.geometry_file import write_geometry
+    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.errors import InvalidValue
     from mapweave.processes.agent import measured
     from mapweave.terminal import plain_or_terminal
 
     if arguments.recording is None and not (arguments.robot and arguments.name):
-        raise InvalidValue("give a recording, or --robot DRIVER and --name NAME of a robot")
+        raise UsageError("give a recording, or --robot DRIVER and --name NAME of a robot")
     cv2.setNumThreads(1)
     name = name_of(arguments)
     file = calibration_of(arguments, name)
@@ -72,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         found = calibrate(measured(description, file), observations, arguments.keep_wheels)
     except InvalidValue as error:
         print(f"mapweave: {arguments.recording or name}: {error}", file=sys.stderr)
-        return 1
+        return NO
     notes = _print(console, found)
     worse = found.estimated_px > found.declared_px
     if worse:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.commands.usage import UsageError, arguments_read
 
 if TYPE_CHECKING:
     from mapweave.vision.calibration.target import CalibrationTarget
@@ -23,7 +23,7 @@ def add_to(actions: Any) -> None:
     add_target(parser)
     parser.add_argument("--paper", choices=["a4", "a3", "letter", "legal"], default="a4")
     parser.add_argument(
-        "--out", type=Path, default=Path("board.pdf"), metavar="FILE", help="(default: %(default)s)"
+        "-o", "--out", type=Path, default=Path("board.pdf"), metavar="FILE", help="(default: %(default)s)"
     )
     parser.set_defaults(run=run)
 
@@ -46,27 +46,28 @@ def target_of(arguments: argparse.Namespace) -> CalibrationTarget:
     """The target that is declared.
 
     Raises:
-        InvalidValue: it is none.
+        UsageError: it is none.
     """
     from mapweave.vision.calibration.target import CalibrationTarget, Pattern
 
     a = arguments
     columns, rows = size_of(a.squares, "--squares")
     marker = 0.75 * a.square_mm if a.marker_mm is None else a.marker_mm
-    return CalibrationTarget(
-        Pattern(a.pattern), columns, rows, 1e-3 * a.square_mm, 1e-3 * marker, a.dictionary.upper()
-    )
+    with arguments_read():
+        return CalibrationTarget(
+            Pattern(a.pattern), columns, rows, 1e-3 * a.square_mm, 1e-3 * marker, a.dictionary.upper()
+        )
 
 
 def size_of(text: str, option: str) -> tuple[int, int]:
     """Two numbers, as in 7x10.
 
     Raises:
-        InvalidValue: it is something else.
+        UsageError: it is something else.
     """
     first, x, second = text.lower().partition("x")
     if not (x and first.isdecimal() and second.isdecimal()):
-        raise InvalidValue(f"{option} {text}: give two numbers, for example 7x10")
+        raise UsageError(f"{option} {text}: give two numbers, for example 7x10")
     return int(first), int(second)
 
 

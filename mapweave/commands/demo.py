@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.exit_status import DONE, NO
 
 
@@ -19,7 +20,7 @@ def add_to(commands: Any) -> None:
         "and maps its part of an office; the server merges the maps; then one robot is kidnapped, asks where "
         "it is, and drives to a node that another robot mapped. Exit status 0: it arrived; 4: it did not.",
     )
-    parser.add_argument("--seed", type=int, default=0, help="other seeds, other worlds (default: 0)")
+    parser.add_argument("--seed", type=values.seed, default=0, help="other seeds, other worlds (default: 0)")
     parser.add_argument("--robots", type=int, default=3, help="how many (default: 3)")
     parser.add_argument("--rooms", type=int, default=3, help="rooms along the corridor (default: 3)")
     parser.add_argument(
@@ -34,17 +35,16 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.extras import TRIAL, need
 
     need(*TRIAL)
+    from mapweave.commands.usage import arguments_read
     from mapweave.demo.options import DemoOptions
     from mapweave.demo.report import summary_table
     from mapweave.demo.run import run_demo
     from mapweave.terminal import plain_or_terminal
 
-    options = DemoOptions(
-        seed=arguments.seed,
-        robots=arguments.robots,
-        rooms=arguments.rooms,
-        out=arguments.out,
-    )
+    with arguments_read():
+        options = DemoOptions(
+            seed=arguments.seed, robots=arguments.robots, rooms=arguments.rooms, out=arguments.out
+        )
     report = run_demo(options)
     if arguments.json:
         print(json.dumps(report.as_dict()))

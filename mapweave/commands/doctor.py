@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.network import add_network, network_of
 from mapweave.exit_status import DONE, NO
 
@@ -33,10 +34,10 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument(
         "--robot",
-        metavar="FILE",
-        help="settings of the robot (TOML); or a driver, or FILE.py:CLASS, as of `agent`",
+        metavar="DRIVER",
+        help="its driver, or FILE.py:CLASS, as of `agent` (default: that of the settings file)",
     )
-    parser.add_argument("--name", default="r0", help="of the robot in the fleet (default: r0)")
+    parser.add_argument("--name", type=values.name, help="of the robot in the fleet (default: r0)")
     parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
     parser.add_argument(
         "--drive", action="store_true",
@@ -55,8 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.doctor.finding import first_wrong, report
 
     driver = arguments.robot
-    if driver is not None and not driver.rpartition(":")[0].endswith(".py") and driver.endswith(".toml"):
-        arguments.settings, driver = Path(driver), None
 
     def load() -> Settings:
         from mapweave.settings import load_settings
@@ -110,7 +109,7 @@ def _robot(arguments: argparse.Namespace, settings: Settings, driver: str, buses
     network = network_of(arguments, settings)
     bus, _ = connect(network)
     buses.append(bus)
-    return RemoteRobot(bus, network.fleet, arguments.name, REMOTE_PATIENCE)
+    return RemoteRobot(bus, network.fleet, arguments.name or "r0", REMOTE_PATIENCE)
 
 
 REMOTE_PATIENCE = 5.0

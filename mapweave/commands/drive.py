@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.network import add_network, network_of, reach, settings_of, stop_on_signals
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def add_to(commands: Any) -> None:
         description="Drive the robot of a running agent by keyboard or gamepad. Its mission waits meanwhile; "
         "with the missions explore and carried it maps. It stands when no command arrives for 0.5 s.",
     )
-    parser.add_argument("name", help="of the agent, for example r0")
+    parser.add_argument("name", type=values.name, help="of the agent, for example r0")
     parser.add_argument(
         "--gamepad", type=Path, nargs="?", const=Path("/dev/input/js0"), metavar="DEVICE",
         help="drive by the left stick of a gamepad (default device: /dev/input/js0)",
@@ -46,15 +47,15 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Drive until the person quits."""
-    from mapweave.hybridmap.errors import DeviceError, InvalidValue
-    from mapweave.hybridmap.node import check_name
+    from mapweave.commands.usage import UsageError
+    from mapweave.hybridmap.errors import Refused
     from mapweave.teleoperation.gamepad import Gamepad
     from mapweave.teleoperation.keyboard import Keyboard, RawTerminal
     from mapweave.teleoperation.session import Session
 
-    name = check_name(arguments.name)
+    name: str = arguments.name
     if not 0.1 <= arguments.speed <= 1.0:
-        raise InvalidValue(f"--speed: {arguments.speed:g} is not within 0.1 to 1")
+        raise UsageError(f"--speed: {arguments.speed:g} is not within 0.1 to 1")
     gamepad = None if arguments.gamepad is None else Gamepad(arguments.gamepad, arguments.speed)
     terminal = RawTerminal() if gamepad is None else None
     network = network_of(arguments, settings_of(arguments))
@@ -68,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
                 with terminal:
                     _by_keyboard(session, name, terminal, Keyboard(arguments.speed), stop)
         if session.refused:
-            raise DeviceError(f"{name}: {session.refused}")
+            raise Refused(f"{name}: {session.refused}")
     finally:
         bus.close()
         if gamepad is not None:

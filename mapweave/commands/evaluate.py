@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.commands.replay import add_recording, options_of
 
@@ -63,7 +64,7 @@ def add_to(commands: Any) -> None:
         "folder", type=Path, help="recording: images/, camera.toml, odometry.csv; times.txt, truth.csv"
     )
     merge.add_argument(
-        "--robots", type=int, metavar="N",
+        "--robots", type=values.count, metavar="N",
         help="cut it into N consecutive pieces instead, which overlap by 30 %% (even images, odd images)",
     )  # fmt: skip
     merge.add_argument(

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands import values
+
 
 def add_to(commands: Any) -> None:
     """Declare the command."""
@@ -13,14 +15,16 @@ def add_to(commands: Any) -> None:
         "find-cameras",
         help="find the cameras, and save a frame of each",
         description="Open each video device, and each SOURCE that is given, print its size and rate, and "
-        "save a frame of it. Exit status 1 if no camera gives an image.",
+        "save a frame of it. Exit status 4 if no camera gives an image.",
     )
     parser.add_argument(
         "source", nargs="*", help="further video files or streams, as [robot.camera] source takes them"
     )
     parser.add_argument("-o", "--out", type=Path, default=Path("out/cameras"), help="folder for the frames")
-    parser.add_argument("--width", type=int, default=640, help="asked of devices, px (default: 640)")
-    parser.add_argument("--height", type=int, default=480, help="asked of devices, px (default: 480)")
+    parser.add_argument("--width", type=values.count, default=640, help="asked of devices, px (default: 640)")
+    parser.add_argument(
+        "--height", type=values.count, default=480, help="asked of devices, px (default: 480)"
+    )
     parser.set_defaults(run=run)
 
 
@@ -32,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.drivers.settings import CameraSettings
     from mapweave.agent.vision.image_quality import ImageQuality
     from mapweave.doctor.camera import SECONDS, watch
-    from mapweave.hybridmap.errors import DeviceError
+    from mapweave.hybridmap.errors import DeviceError, Refused
     from mapweave.storage.atomic_file import write_whole
 
     devices = sorted(Path("/dev").glob("video*"), key=lambda path: (len(path.name), path.name))
@@ -66,4 +70,4 @@ def run(arguments: argparse.Namespace) -> int:
             print(words)
         return 0
     reasons = "".join(f"{words}; " for words in failed)
-    raise DeviceError(f"{reasons}no camera gives an image; for a Raspberry Pi's own camera see docs/robot.md")
+    raise Refused(f"{reasons}no camera gives an image; for a Raspberry Pi's own camera see docs/robot.md")

@@ -7,6 +7,8 @@ import sys
 import time
 from typing import Any
 
+from mapweave.commands import values
+
 POLL = 0.2
 """s between two looks."""
 
@@ -17,21 +19,23 @@ def add_to(commands: Any) -> None:
         "find-port",
         help="find the serial port of a robot",
         description="Find the serial port of a robot: unplug its cable, and the port is named. Without a "
-        "terminal, or with --list, the ports are listed. Exit status 1 if there is none.",
+        "terminal, or with --list, the ports are listed. Exit status 4 if there is none.",
     )
     parser.add_argument("--list", action="store_true", help="list the ports, and wait for nothing")
-    parser.add_argument("--wait", type=float, default=60.0, metavar="S", help="for the cable (default: 60)")
+    parser.add_argument(
+        "--timeout", type=values.seconds, default=60.0, metavar="S", help="for the cable (default: 60)"
+    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """List the ports, then wait until one is gone."""
     from mapweave.doctor.ports import gone, serial_ports
-    from mapweave.hybridmap.errors import DeviceError
+    from mapweave.hybridmap.errors import Refused
 
     before = serial_ports()
     if not before:
-        raise DeviceError(
+        raise Refused(
             "there is no serial port, as /dev/ttyUSB0 or /dev/ttyACM0: is the robot connected and switched "
             "on, and its cable one for data?"
         )
@@ -40,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list or not sys.stdin.isatty():
         return 0
     print("Unplug the robot's cable now ...", flush=True)
-    end = time.monotonic() + arguments.wait
+    end = time.monotonic() + arguments.timeout
     while time.monotonic() < end:
         left = gone(before, serial_ports())
         if left:
@@ -48,6 +52,6 @@ def run(arguments: argparse.Namespace) -> int:
                 print(f"it was {port.stable or port.path}: plug it in, and give [robot.options] port that")
             return 0
         time.sleep(POLL)
-    raise DeviceError(
-        f"no port has gone within {arguments.wait:g} s; a port on the board itself cannot be unplugged"
+    raise Refused(
+        f"no port has gone within {arguments.timeout:g} s; a port on the board itself cannot be unplugged"
     )

@@ -63,16 +63,21 @@ def http_access(words: str, folder: KeyFolder | None, server: str) -> HttpAccess
         server: whose certificate it is.
 
     Raises:
-        SettingsError: other machines would be served without a login, or unencrypted; or a key is missing.
+        UsageError: other machines would be served without a login, or unencrypted.
+        SettingsError: a key is missing.
     """
+    from mapweave.commands.usage import arguments_read
     from mapweave.identities.key_file import read_key_file
     from mapweave.identities.logins import Logins
     from mapweave.mapserver.http.tls import server_context
     from mapweave.mapserver.http.web import check_reach, parse_address
 
-    address, logins, tls = parse_address(words), None, None
+    logins, tls = None, None
+    with arguments_read():
+        address = parse_address(words)
     if folder is not None:
         logins = Logins(folder.path)
         tls = server_context(read_key_file(folder.key_file(server)).credentials)
-    check_reach(address, logins is not None, tls is not None)
+    with arguments_read():
+        check_reach(address, logins is not None, tls is not None)
     return HttpAccess(address, logins, tls)

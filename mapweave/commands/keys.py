@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands import values
+
 ROLES = ("robot", "server", "operator", "viewer")
 
 
@@ -37,7 +39,7 @@ def add_to(commands: Any) -> None:
     init.set_defaults(run=_init)
 
     add = _action(actions, "add", "give a robot, server or person a key, or a new one")
-    add.add_argument("name", metavar="NAME", help="a robot's name is that of its agent")
+    add.add_argument("name", type=values.name, metavar="NAME", help="a robot's name is that of its agent")
     add.add_argument("--role", choices=ROLES, default="robot", help="what it may do (default: robot)")
     add.add_argument("--days", type=float, default=365.0, help="for which it holds (default: 365)")
     add.set_defaults(run=_add)
@@ -77,10 +79,12 @@ def _action(actions: Any, name: str, words: str) -> argparse.ArgumentParser:
 
 
 def _init(arguments: argparse.Namespace) -> int:
+    from mapweave.commands.usage import arguments_read
     from mapweave.identities.key_folder import KeyFolder, Profile
 
     profile = Profile(arguments.profile)
-    folder = KeyFolder.create(arguments.keys, arguments.fleet, profile, arguments.at, arguments.server)
+    with arguments_read():
+        folder = KeyFolder.create(arguments.keys, arguments.fleet, profile, arguments.at, arguments.server)
     where = ", ".join(folder.catalogue.endpoints)
     print(f"{arguments.keys}: keys of fleet {arguments.fleet}; robots find the server at {where}")
     if not arguments.at:
@@ -152,13 +156,13 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _revoke(arguments: argparse.Namespace) -> int:
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.errors import Refused
     from mapweave.identities.key_folder import KeyFolder
 
     folder = KeyFolder(arguments.keys)
     if arguments.tokens:
         if folder.find(arguments.name) is None or not folder.end_tokens(arguments.name):
-            raise InvalidValue(f"{arguments.name} has no token; `mapweave keys list` shows who has")
+            raise Refused(f"{arguments.name} has no token; `mapweave keys list` shows who has")
         print(f"the tokens of {arguments.name} are void, and who logged in with them is logged out")
         return 0
     folder.revoke(arguments.name, " ".join(arguments.because.split()), arguments.force)
@@ -169,7 +173,11 @@ def _revoke(arguments: argparse.Namespace) -> int:
 def _bundle(arguments: argparse.Namespace) -> int:
     from mapweave.identities.key_file import read_key_file, write_key_file
     from mapweave.identities.key_folder import KeyFolder
+    from mapweave.refusals import refusals
 
-    write_key_file(arguments.out, read_key_file(KeyFolder(arguments.keys).key_file(arguments.name)))
+    folder = KeyFolder(arguments.keys)
+    with refusals():
+        file = folder.key_file(arguments.name)
+    write_key_file(arguments.out, read_key_file(file))
     print(f"{arguments.out}: the key of {arguments.name}")
     return 0

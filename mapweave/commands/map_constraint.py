@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.commands import values
 from mapweave.commands.map_input import opened
 from mapweave.commands.network import add_network, key_holder, network_of, settings_of
 
@@ -24,7 +25,9 @@ def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -
     parser.add_argument("--check", action="store_true", help="only say what it would do; change nothing")
     parser.add_argument("--map", type=Path, metavar="FILE", help="in this map file; no server is asked")
     parser.add_argument("-o", "--out", type=Path, metavar="OUT", help="with --map: write there instead")
-    parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
+    parser.add_argument(
+        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for an answer"
+    )
     add_network(parser)
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network
 
@@ -24,9 +24,11 @@ def add_to(actions: Any) -> None:
     parser.add_argument(
         "--map", type=map_source, metavar="FILE", help=f"explain {SOURCES}; no server is asked"
     )
-    parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the landmarks of the two nodes")
+    parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the landmarks of the two nodes")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
+    parser.add_argument(
+        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for an answer"
+    )
     add_network(parser)
     parser.set_defaults(run=run)
 

@@ -23,7 +23,7 @@ def add_to(actions: Any) -> None:
         "graph that Nav2's route server loads (geojson).",
     )
     parser.add_argument("file", type=map_source, metavar="FILE", help=SOURCES)
-    parser.add_argument("--to", choices=FORMATS, required=True, help="format")
+    parser.add_argument("--format", choices=FORMATS, required=True, help="format")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder (tum)")
     parser.add_argument(
         "--component",
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         plans = placed_plans(Annotations(source.content.annotations), merged)
         placed = plans.plan(arguments.plan).part(arguments.component)
         part = MapPart(merged, placed.component, placed.plan_from_merged)
-    for path in WRITERS[arguments.to](part, arguments.out):
+    for path in WRITERS[arguments.format](part, arguments.out):
         print(path)
     left = len(merged.poses) - len(part.nodes)
     if left:

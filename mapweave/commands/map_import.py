@@ -31,14 +31,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     import gtsam  # noqa: F401, where it is missing this says so before a file is read
 
+    from mapweave.commands.usage import UsageError
     from mapweave.formats.g2o import read_g2o, write_g2o
     from mapweave.formats.g2o_optimum import optimum_of
-    from mapweave.hybridmap.errors import InvalidValue
 
     if arguments.out.suffix == ".mapweave":
-        raise InvalidValue(
-            f"{arguments.out}: what is written is a pose graph, no map; end its name with .g2o"
-        )
+        raise UsageError(f"{arguments.out}: what is written is a pose graph, no map; end its name with .g2o")
     graph = read_g2o(arguments.file)
     poses = optimum_of(graph)
     write_g2o(arguments.out, replace(graph, poses=poses))

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.network import add_network, connect, network_of, reach, settings_of
 
 
@@ -23,14 +24,16 @@ def add_to(actions: Any) -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="images, in the order of their numbers")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the .mapweave file")
     parser.add_argument(
-        "--spacing", type=float, required=True, metavar="M",
+        "--spacing", type=values.metres, required=True, metavar="M",
         help="how far apart the photographs are, on average, to within a third",
     )  # fmt: skip
     parser.add_argument("--camera", type=Path, metavar="FILE", help="default: FOLDER/camera.toml")
-    parser.add_argument("--name", help="of the map in the fleet (default: OUT without its ending)")
+    parser.add_argument(
+        "--name", type=values.name, help="of the map in the fleet (default: OUT without its ending)"
+    )
     parser.add_argument("--send", action="store_true", help="hand the map over to a running server")
     parser.add_argument(
-        "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
+        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for the server"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
@@ -65,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         bus, keys = connect(network)
         try:
             journal = arguments.out.with_suffix(".sqlite")
-            if not send_map(changes, map_id, journal, bus, keys, network.server, arguments.patience):
+            if not send_map(changes, map_id, journal, bus, keys, network.server, arguments.timeout):
                 where = ", ".join(network.endpoints)
                 raise NotConnected(f"no server {network.server} at {where} took the map: see {journal}")
         finally:

@@ -18,8 +18,8 @@ def add_to(actions: Any) -> None:
         "retire",
         help="retire a map, nodes, an area or a time window: they take no part in anything",
         description="Retire a map (r0.1), some nodes (r0.1.17 r0.1.18), an area (its name, or --area), or "
-        "what a map has of a time (r0.1 --from --to): it takes no part in the merge any more, no route leads "
-        "through it, and no view is recognised by it. Nothing is deleted: it is retired until that is "
+        "what a map has of a time (r0.1 --from --until): it takes no part in the merge any more, no route "
+        "leads through it, and no view is recognised by it. Nothing is deleted: it is retired until that is "
         "taken back with --undo or `mapweave map undo`, also when robots map on and the server starts "
         "again; nodes that come into an area or a time window later are retired too. A robot's own way "
         "keeps tying what lies before and behind a retired node; --check says beforehand whether a map "
@@ -36,7 +36,7 @@ def add_to(actions: Any) -> None:
     )  # fmt: skip
     parser.add_argument("--from", dest="begin", default="", metavar="TIME",
                         help="nodes of the map from then on: 2026-03-01T12:00, or ns")  # fmt: skip
-    parser.add_argument("--to", dest="end", default="", metavar="TIME", help="until then")
+    parser.add_argument("--until", dest="end", default="", metavar="TIME", help="until then")
     add_constraint_options(parser)
     parser.set_defaults(run=run)
 
@@ -56,7 +56,7 @@ def _subject(arguments: argparse.Namespace) -> Subject:
 
     in_time = bool(arguments.begin or arguments.end)
     if (arguments.area is not None) == bool(arguments.which) or (in_time and len(arguments.which) != 1):
-        raise UsageError("give a map or nodes, or --area; --from and --to go with one map")
+        raise UsageError("give a map or nodes, or --area; --from and --until go with one map")
     with arguments_read():
         if arguments.area is not None:
             anchor, corners = arguments.area

@@ -6,9 +6,9 @@ import argparse
 import json
 import sys
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import add_network
 from mapweave.exit_status import DONE, NO
@@ -40,9 +40,11 @@ def add_to(actions: Any) -> None:
         "--via", action="append", default=[], metavar="PLACE", help="pass this first; may be given again"
     )
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
-    parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the way on the map")
+    parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
+    parser.add_argument(
+        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for an answer"
+    )
     add_network(parser)
     parser.set_defaults(run=run)
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def add_to(actions: Any) -> None:
     )
     show.add_argument("file", type=map_source, help=SOURCES)
     show.add_argument(
-        "-o", "--out", type=Path, metavar="PNG", help="picture (default: next to the file, as .png)"
+        "-o", "--out", type=values.png, metavar="PNG", help="picture (default: next to the file, as .png)"
     )
     show.add_argument(
         "--component", type=int, default=0, metavar="N",
@@ -46,7 +47,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     from mapweave.drawing.map_picture import MapPicture, draw_map
     from mapweave.extras import MissingExtra, need
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.node import EdgeKind
@@ -82,7 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
     poses = {n: p.mean for n, (c, p) in placed.items() if c == arguments.component}
     if arguments.component not in sizes and sizes:
         choices = "one, 0" if len(sizes) == 1 else f"0 to {len(sizes) - 1}"
-        raise InvalidValue(f"the map has no component {arguments.component}; it has {choices}")
+        from mapweave.hybridmap.errors import Refused
+
+        raise Refused(f"the map has no component {arguments.component}; it has {choices}")
     landmarks = [len(n.landmarks) for n in hybrid.nodes.values()]
     kinds: dict[str, int] = {}
     for edge in hybrid.edges.values():

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.network import add_network, network_of, settings_of
 from mapweave.exit_status import DONE, NO
 
@@ -85,7 +86,7 @@ def _add_common(parser: argparse.ArgumentParser, patience: float | None) -> None
     if patience is not None:
         parser.add_argument("--wait", action="store_true", help="wait until it is over, and say how it ended")
         parser.add_argument(
-            "--timeout", type=float, default=patience, metavar="S",
+            "--timeout", type=values.seconds, default=patience, metavar="S",
             help=f"with --wait: at most so long (default: {patience:g})",
         )  # fmt: skip
     parser.add_argument("--by", default="", metavar="NAME", help="your name (default: the login name)")

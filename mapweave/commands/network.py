@@ -13,6 +13,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
+from mapweave.commands import values
 from mapweave.connection import SOON
 
 if TYPE_CHECKING:
@@ -30,20 +31,22 @@ if TYPE_CHECKING:
 def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
     """Arguments with which a process finds its fleet."""
     group = parser.add_argument_group("network")
-    group.add_argument("--fleet", metavar="NAME", help="name that robots and server share (default: demo)")
+    group.add_argument(
+        "--fleet", type=values.name, metavar="NAME", help="name that robots and server share (default: demo)",
+    )  # fmt: skip
     if listens:
         group.add_argument(
-            "--listen", nargs="+", metavar="ENDPOINT", dest="endpoints",
+            "--listen", nargs="+", type=values.endpoint, metavar="ENDPOINT", dest="endpoints",
             help="Zenoh endpoints to listen at (default: tcp/127.0.0.1:7447, or as the keys say)",
         )  # fmt: skip
         group.add_argument(
-            "--connect", nargs="+", metavar="ROUTER", dest="routers",
+            "--connect", nargs="+", type=values.endpoint, metavar="ROUTER", dest="routers",
             help="another router to join, so that the robots of each reach the servers of both; a map server "
             "without --listen is a client of the first of these routers that is in reach (default: none)",
         )  # fmt: skip
     else:
         group.add_argument(
-            "--connect", nargs="+", metavar="ENDPOINT", dest="endpoints",
+            "--connect", nargs="+", type=values.endpoint, metavar="ENDPOINT", dest="endpoints",
             help="Zenoh endpoints of routers; the first in reach is taken, and the next one when it fails "
             "(default: tcp/127.0.0.1:7447, or as the key says)",
         )  # fmt: skip

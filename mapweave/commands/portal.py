@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.network import add_network
 
 
@@ -23,7 +24,7 @@ def add_to(commands: Any) -> None:
         description="Tell a robot that it stands at the other side of the portal. It looks where it is, and "
         "goes on. The message goes to the robot directly, and works without a map server.",
     )
-    done.add_argument("robot", help="the robot's name, for example r0")
+    done.add_argument("robot", type=values.name, help="the robot's name, for example r0")
     done.add_argument("--by", default="", metavar="NAME", help="your name (default: the login name)")
     add_network(done)
     done.set_defaults(run=run_done)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.agent import add_robot, bus_of, close_on, open_robot, print_error
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 
@@ -21,8 +22,8 @@ def add_to(commands: Any) -> None:
         "until it is interrupted. The robot gets no commands: drive it by other means, or let "
         "`mapweave agent --record DIR` drive. `mapweave replay DIR` maps the recording.",
     )
-    parser.add_argument("name", help="the robot's name in the fleet, for example r0")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new or empty folder")
+    parser.add_argument("name", type=values.name, help="the robot's name in the fleet, for example r0")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="new or empty folder")
     parser.add_argument("--lossless", action="store_true", help="images as PNG instead of JPEG")
     add_robot(parser)
     add_network(parser)
@@ -32,10 +33,9 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Record until the robot ends or the process is stopped."""
     from mapweave.agent.drivers.recorded import RecordedRobot
-    from mapweave.hybridmap.node import check_name
     from mapweave.terminal import Bar, plain_or_terminal
 
-    name = check_name(arguments.name)
+    name: str = arguments.name
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     stop = stop_on_signals()

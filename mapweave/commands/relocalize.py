@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import add_network, key_holder, network_of, reach, settings_of
 from mapweave.commands.plan import add_plan_option, plan_of, plan_place
@@ -46,11 +47,13 @@ def add_to(commands: Any) -> None:
         "--map", type=map_source, metavar="FILE", help=f"answer from {SOURCES}; no server is asked"
     )
     parser.add_argument(
-        "--draw", type=Path, metavar="PNG",
+        "--draw", type=values.png, metavar="PNG",
         help="draw the best candidate's landmarks next to the image, joined where they match",
     )  # fmt: skip
     add_plan_option(parser)
-    parser.add_argument("--timeout", type=float, default=5.0, metavar="S", help="longest wait for an answer")
+    parser.add_argument(
+        "--timeout", type=values.seconds, default=5.0, metavar="S", help="longest wait for an answer"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
     parser.set_defaults(run=run)
@@ -59,6 +62,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from mapweave.agent.recordings.camera_file import read_camera
+    from mapweave.commands.usage import UsageError
     from mapweave.drawing.match_picture import draw_matches
     from mapweave.hybridmap.errors import DeviceError
     from mapweave.hybridmap.query import Certainty
@@ -68,14 +72,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not arguments.image.exists():
         raise DeviceError(f"{arguments.image}: no such file")
-    if not 0.0 < arguments.timeout < math.inf:
-        raise DeviceError(f"--timeout {arguments.timeout:g}: give seconds, more than 0")
     places = [arguments.image.parent / "camera.toml", arguments.image.parent.parent / "camera.toml"]
     camera_file = arguments.camera or next((p for p in places if p.exists()), None)
     if camera_file is None:
-        raise DeviceError("no camera.toml next to the image: give the intrinsics with --camera FILE")
-    if arguments.draw is not None and arguments.draw.suffix.lower() != ".png":
-        raise DeviceError(f"{arguments.draw}: the picture will be a PNG; end its name with .png")
+        raise UsageError("no camera.toml next to the image: give the intrinsics with --camera FILE")
     camera, distortion = read_camera(camera_file)
     grey = read_grey(arguments.image, camera, str(camera_file))
 
@@ -141,7 +141,7 @@ def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
     """Ask until a server answers; a busy server is asked again at its retry time."""
     from mapweave.connection import no_server
-    from mapweave.hybridmap.errors import NotConnected
+    from mapweave.hybridmap.errors import NotConnected, Refused
 
     end = time.monotonic() + patience
     while True:
@@ -152,8 +152,10 @@ def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, pati
         if not replies:
             raise no_server(network.fleet, key_holder(network))
         pause = replies[0].retry_after
-        if not pause or time.monotonic() + pause > end:
-            raise NotConnected(f"the map server refused: {replies[0].error}")
+        if not pause:
+            raise Refused(f"the map server refused: {replies[0].error}")
+        if time.monotonic() + pause > end:
+            raise NotConnected(f"the map server is {replies[0].error}")
         time.sleep(pause)
 
 

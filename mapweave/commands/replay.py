@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.agent import add_calibration, add_rerun, calibration_of
 from mapweave.commands.network import (
     add_network,
@@ -39,12 +40,14 @@ def add_to(commands: Any) -> None:
     )
     add_recording(parser)
     parser.add_argument("--robot", metavar="NAME", help="one of the robots in the recording's splits.toml")
-    parser.add_argument("--name", help="in the fleet (default: the robot's, else the folder's)")
+    parser.add_argument(
+        "--name", type=values.name, help="in the fleet (default: the robot's, else the folder's)"
+    )
     parser.add_argument("--data", type=Path, default=Path("out/replay"), help="folder for the map")
     parser.add_argument("--epoch", type=int, help="least number of the new map (default: the next one)")
     parser.add_argument("--offline", action="store_true", help="do not connect to a router or a server")
     parser.add_argument(
-        "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
+        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for the server"
     )
     add_calibration(parser)
     add_rerun(parser)
@@ -110,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
         server=network.server,
         total=len(robot),
         recorded=True,
-        patience=0.0 if arguments.offline else arguments.patience,
+        patience=0.0 if arguments.offline else arguments.timeout,
         calibration=calibration_of(arguments, name),
         rerun=arguments.rerun,
     )
@@ -165,7 +168,7 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
             )
             say(f"{name}: {len(nodes)} nodes in {map_path(data, map_id)}; its scale is unknown")
             if not arguments.offline:
-                sent = send_map(changes, map_id, path, bus, keys, network.server, arguments.patience)
+                sent = send_map(changes, map_id, path, bus, keys, network.server, arguments.timeout)
                 say(f"{name}: server {network.server} has {'' if sent else 'not taken '}it all")
     finally:
         bus.close()

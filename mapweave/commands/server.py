@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, opened
 from mapweave.commands.network import (
     add_log_format,
@@ -43,7 +44,7 @@ def add_to(commands: Any) -> None:
         "The Zenoh router that robots connect to runs inside. With --http it also serves a page: the merged "
         "map and its robots live, where a photograph was taken, and why maps are one or are not.",
     )
-    parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
+    parser.add_argument("--name", type=values.name, help="the server's name in the fleet (default: s0)")
     parser.add_argument("--data", type=Path, help=f"folder for the store (default: {DATA})")
     parser.add_argument(
         "--store", metavar="postgresql://...",
@@ -81,16 +82,16 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until stopped."""
-    from mapweave.hybridmap.errors import SettingsError
+    from mapweave.commands.usage import UsageError
 
     # What is wrong on the command line is said before anything is loaded for a second.
     if arguments.demo and (arguments.data is not None or arguments.store is not None):
-        raise SettingsError("--demo keeps nothing: leave out --data and --store")
+        raise UsageError("--demo keeps nothing: leave out --data and --store")
     if arguments.store is not None:
         from mapweave.mapserver.log.opening import is_postgres
 
         if not is_postgres(arguments.store):
-            raise SettingsError("--store is a PostgreSQL address: postgresql://USER@HOST/DATABASE")
+            raise UsageError("--store is a PostgreSQL address: postgresql://USER@HOST/DATABASE")
     need("server")
 
     # Modules stay: looking among them for garbage took a sixth of the start.
@@ -109,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
     router, folder = server_settings(network, name)
     cluster = replace(settings.cluster, ray=arguments.ray or settings.cluster.ray)
     if cluster.ray and arguments.lockstep:
-        raise SettingsError("--lockstep is repeatable, and a cluster is not: leave out one of them")
+        raise UsageError("--lockstep is repeatable, and a cluster is not: leave out one of them")
     if cluster.ray:
         need("cluster")
     stop = stop_on_signals()

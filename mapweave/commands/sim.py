@@ -6,8 +6,9 @@ import argparse
 import json
 import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.network import (
     add_log_format,
     add_network,
@@ -18,6 +19,9 @@ from mapweave.commands.network import (
     warn_without_router,
 )
 from mapweave.exit_status import DONE, NO
+
+if TYPE_CHECKING:
+    from mapweave.scenarios.scenario import Scenario
 
 
 def add_to(commands: Any) -> None:
@@ -68,11 +72,13 @@ def _add_run(kinds: Any) -> None:
         "were met; 4: not; 1: it could not be run.",
     )
     _add_scenario(parser)
-    parser.add_argument("--seed", type=int, help="other seeds, other worlds (default: the scenario's)")
+    parser.add_argument(
+        "--seed", type=values.seed, help="other seeds, other worlds (default: the scenario's)"
+    )
     parser.add_argument("-o", "--out", type=Path, help="folder for the report (default: out/sim/NAME-SEED)")
     parser.add_argument("--no-film", action="store_true", help="make no film: a little quicker")
     parser.add_argument(
-        "--view", type=int, nargs="?", const=8090, metavar="PORT",
+        "--view", type=values.port, nargs="?", const=8090, metavar="PORT",
         help="show the trial live at http://127.0.0.1:PORT (default port: 8090)",
     )  # fmt: skip
     parser.add_argument(
@@ -91,8 +97,8 @@ def _add_batch(kinds: Any) -> None:
         "status 0: every trial met its expectations; 2: not; 1: the scenario could not be read.",
     )
     _add_scenario(parser)
-    parser.add_argument("--seeds", type=int, default=10, metavar="N", help="how many (default: 10)")
-    parser.add_argument("--first", type=int, help="the first seed (default: the scenario's)")
+    parser.add_argument("--seeds", type=values.count, default=10, metavar="N", help="how many (default: 10)")
+    parser.add_argument("--first", type=values.seed, help="the first seed (default: the scenario's)")
     parser.add_argument("-o", "--out", type=Path, help="folder for the reports (default: out/sim/NAME)")
     parser.add_argument("--film", action="store_true", help="make a film of each trial")
     _add_fleet(parser)
@@ -107,9 +113,12 @@ def _add_serve(kinds: Any) -> None:
         "its command. The scenario's events do not happen by themselves.",
     )
     _add_scenario(parser)
-    parser.add_argument("--seed", type=int, help="of world, start places and faults")
+    parser.add_argument("--seed", type=values.seed, help="of world, start places and faults")
     parser.add_argument(
-        "--listen", metavar="ENDPOINT", help="be reachable here, instead of connecting to the fleet's router"
+        "--listen",
+        type=values.endpoint,
+        metavar="ENDPOINT",
+        help="be reachable here, instead of connecting to the fleet's router",
     )
     parser.add_argument(
         "--held", action="store_true", help="let no time pass before a scenario's runner asks for it"
@@ -143,15 +152,12 @@ def run_one(arguments: argparse.Namespace) -> int:
 
     need(*TRIAL, *(["rerun"] if arguments.rerun else []))
     from mapweave.scenarios.run import TrialOptions, run_trial
-    from mapweave.scenarios.scenario import load_scenario, scenario_path
     from mapweave.scenarios.summary import summary_table
     from mapweave.terminal import plain_or_terminal
 
     settings = settings_of(arguments)
-    scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
-    seed = scenario.seed if arguments.seed is None else check_seed(arguments.seed)
-    if arguments.view is not None:
-        check_port(arguments.view)
+    scenario = _scenario(arguments)
+    seed = scenario.seed if arguments.seed is None else arguments.seed
     out = arguments.out or Path("out/sim") / f"{scenario.name}-{seed}"
     trial = run_trial(
         scenario,
@@ -182,11 +188,10 @@ def run_batch(arguments: argparse.Namespace) -> int:
     need(*TRIAL)
     from mapweave.output_folder import check_output
     from mapweave.scenarios.batch import BatchOptions, run_batch_of_trials
-    from mapweave.scenarios.scenario import load_scenario, scenario_path
 
     settings = settings_of(arguments)
-    scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
-    first = scenario.seed if arguments.first is None else check_seed(arguments.first, "--first")
+    scenario = _scenario(arguments)
+    first = scenario.seed if arguments.first is None else arguments.first
     options = BatchOptions(
         first=first,
         seeds=arguments.seeds,
@@ -203,7 +208,6 @@ def run_batch(arguments: argparse.Namespace) -> int:
 def run_serve(arguments: argparse.Namespace) -> int:
     """Serve the simulated robots until stopped."""
     from mapweave.processes.simulator import run_sim
-    from mapweave.scenarios.scenario import load_scenario, scenario_path
     from mapweave.terminal import log_with_time
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.zenoh_bus import ZenohBus
@@ -213,8 +217,8 @@ def run_serve(arguments: argparse.Namespace) -> int:
     logging.getLogger("mapweave.sim").setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
-    scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
-    seed = scenario.seed if arguments.seed is None else check_seed(arguments.seed)
+    scenario = _scenario(arguments)
+    seed = scenario.seed if arguments.seed is None else arguments.seed
     stop = stop_on_signals()
     if arguments.listen:
         bus = ZenohBus(BusSettings(mode="router", listen=(arguments.listen,)))
@@ -228,26 +232,20 @@ def run_serve(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def check_seed(seed: int, argument: str = "--seed") -> int:
-    """A seed that random generators take; `argument` is for the error's text.
+def _scenario(arguments: argparse.Namespace) -> Scenario:
+    """The scenario that is named, with what the command line changes of it.
 
     Raises:
-        SettingsError: it is negative.
+        UsageError: there is none of this name, or what is to be changed is not in it.
+        SettingsError: its file is wrong.
     """
-    from mapweave.hybridmap.errors import SettingsError
+    from mapweave.commands.usage import arguments_read
+    from mapweave.scenarios.scenario import load_scenario, scenario_path
 
-    if seed < 0:
-        raise SettingsError(f"{argument} {seed}: use 0 or more")
-    return seed
-
-
-def check_port(port: int) -> None:
-    """Before a whole fleet is started for it.
-
-    Raises:
-        SettingsError: there is no such port.
-    """
-    from mapweave.hybridmap.errors import SettingsError
-
-    if not 0 <= port <= 65535:
-        raise SettingsError(f"--view {port}: a port is 0 to 65535; 0 takes a free one")
+    with arguments_read():
+        path = scenario_path(arguments.scenario)
+    scenario = load_scenario(path)
+    if not arguments.overrides:
+        return scenario
+    with arguments_read():
+        return load_scenario(path, arguments.overrides)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from mapweave.hybridmap.errors import InvalidValue, Refused
+from mapweave.hybridmap.errors import InvalidValue, Refused, SettingsError
 
 
 class UsageError(InvalidValue):
@@ -18,11 +18,11 @@ def arguments_read() -> Iterator[None]:
 
     Raises:
         Refused: the map does not have the name.
-        UsageError: instead of any other InvalidValue.
+        UsageError: instead of any other InvalidValue, or SettingsError.
     """
     try:
         yield
     except Refused:
         raise
-    except InvalidValue as error:
+    except (InvalidValue, SettingsError) as error:
         raise UsageError(str(error)) from error

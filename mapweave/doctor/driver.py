@@ -150,7 +150,7 @@ def _advice(error: str) -> str:
     if "waits for the agents" in error:
         return "start the agents of its other robots, or a simulation of this robot alone: --set robots=1"
     if "mapweave sim serve" in error:
-        return "start it, and the router between (mapweave server), or give --robot robot.toml"
+        return "start it, and the router between (mapweave server), or give --settings robot.toml"
     if "in use" in error:
         return "stop the program that uses it, for example a running agent"
     if "may not be opened" in error:

@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 
-from mapweave.hybridmap.errors import InvalidFile, InvalidValue, SettingsError
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue, Refused, SettingsError
 from mapweave.hybridmap.node import check_name
 from mapweave.identities.folder_changes import kept_on_failure, locked
 from mapweave.identities.key_file import (
@@ -148,14 +148,14 @@ class KeyFolder:
         """Make the authority and the server's key.
 
         Raises:
-            SettingsError: there are keys already, or a host is no name or address.
-            InvalidFile: the disk does not take them; nothing is left there.
+            InvalidValue: a host is no name or address.
+            InvalidFile: there are keys already, or the disk does not take them; nothing is left there.
         """
         check_name(fleet)
         check_name(server)
         for host in hosts:
             if not (HOST_NAME.fullmatch(host) or _is_ipv6(host)):
-                raise SettingsError(
+                raise InvalidValue(
                     f"--at {host!r}: write a name or an address without a port, such as 192.168.1.10"
                 )
         scheme = "tls" if profile is Profile.PRODUCTION else "tcp"
@@ -171,7 +171,7 @@ class KeyFolder:
         try:
             with locked(path):
                 if (path / CATALOGUE).exists():
-                    raise SettingsError(
+                    raise InvalidFile(
                         f"{path}: there are keys already; add to them with `mapweave keys add`"
                     )
                 path.chmod(0o700)
@@ -228,7 +228,7 @@ class KeyFolder:
     def _add(self, name: str, role: Role, days: float) -> Path:
         known = self.find(name)
         if known is not None and not known.revoked and known.role is not role:
-            raise InvalidValue(f"{name} is a {known.role} already; revoke that key first")
+            raise Refused(f"{name} is a {known.role} already; revoke that key first")
         issued_at = datetime.now(UTC).isoformat(timespec="seconds")
         void = () if known is None else known.void
         subject = f"{name}~{len(void)}" if void and self.profile is Profile.PRODUCTION else name
@@ -270,9 +270,9 @@ class KeyFolder:
             identity = self.find(name)
             good = [one for one in self.catalogue.identities if not one.revoked]
             if identity is None or identity.revoked:
-                raise InvalidValue(f"{name} has no key; these have: {', '.join(one.name for one in good)}")
+                raise Refused(f"{name} has no key; these have: {', '.join(one.name for one in good)}")
             if not force and [one.name for one in good if one.role is Role.SERVER] == [name]:
-                raise InvalidValue(
+                raise Refused(
                     f"{name} is the only server: add another one first, or give --force and then "
                     f"`mapweave keys add {name} --role server`"
                 )
@@ -293,9 +293,7 @@ class KeyFolder:
         with self._changing():
             identity = self.find(name)
             if identity is None or identity.state != "good":
-                raise InvalidValue(
-                    f"{name} has no good key: make one, `mapweave keys add {name} --role ROLE`"
-                )
+                raise Refused(f"{name} has no good key: make one, `mapweave keys add {name} --role ROLE`")
             return add_token(self.path, name, days)
 
     def end_tokens(self, name: str) -> int:

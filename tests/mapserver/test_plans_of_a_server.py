@@ -241,9 +241,9 @@ def test_plans_and_pins_of_a_map_file_from_the_shell(
     assert run("plan", "show", "flat", "-o", str(picture))[0] == 0
     assert cv2.imread(str(picture)).shape[0] > 300
     # Exports in the coordinates of the plan.
-    assert main(["map", "export", str(path), "--to", "tum", "-o", str(tmp_path / "a.tum")]) == 0
-    with_plan = ["map", "export", str(path), "--to", "tum", "--plan", "flat", "-o", str(tmp_path / "b.tum")]
-    assert main(with_plan) == 0
+    assert main(["map", "export", str(path), "--format", "tum", "-o", str(tmp_path / "a.tum")]) == 0
+    with_plan = ["map", "export", str(path), "--format", "tum", "--plan", "flat"]
+    assert main([*with_plan, "-o", str(tmp_path / "b.tum")]) == 0
     free, moved = (np.loadtxt(tmp_path / f"{name}.tum")[:, 1:3] for name in "ab")
     assert np.allclose(expected.apply(free), moved, atol=1e-5)
     capsys.readouterr()

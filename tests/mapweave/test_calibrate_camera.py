@@ -82,7 +82,7 @@ def test_images_become_settings_that_an_agent_reads(name, true, frames, capfd, t
                 "calibrate",
                 "camera",
                 str(images),
-                "--robot",
+                "--settings",
                 str(robot),
                 "--height",
                 "0.25",
@@ -139,7 +139,7 @@ def test_a_person_is_guided_live_until_the_views_suffice(frames, monkeypatch, ca
         mapweave.agent.drivers.camera, "Capture", lambda settings: opened.append(settings.source) or camera
     )
     robot = tmp_path / "r1.toml"
-    arguments = ["--robot", str(robot), "--source", "rtsp://camera/1", "--height", "0.3", "--http", "0"]
+    arguments = ["--settings", str(robot), "--source", "rtsp://camera/1", "--height", "0.3", "--http", "0"]
     assert main(["calibrate", "camera", *arguments, *OPTIONS]) == 0
     assert camera.closed and opened == ["rtsp://camera/1"]
     assert camera.given < len(frames["fisheye"]) * 4, "it ends by itself"
@@ -156,7 +156,7 @@ def test_a_stream_that_ends_early_is_refused_with_what_is_missing(
     camera = EmulatedCamera(frames["pinhole"][:5], interrupted)
     monkeypatch.setattr(mapweave.agent.drivers.camera, "Capture", lambda settings: camera)
     robot = tmp_path / "r1.toml"
-    assert main(["calibrate", "camera", "--robot", str(robot), "--height", "0.3", *OPTIONS]) == NO
+    assert main(["calibrate", "camera", "--settings", str(robot), "--height", "0.3", *OPTIONS]) == NO
     errors = capfd.readouterr().err.splitlines()
     assert errors[0] == "mapweave: calibration refused: hold the board nearer to the upper edge"
     assert any("show the board in the lower left corner of the image" in line for line in errors)
@@ -210,7 +210,7 @@ def test_mistakes_are_one_line(frames, capfd, tmp_path: Path) -> None:
     blank = folder_of([np.full((240, 320), 99, np.uint8)] * 2, tmp_path / "blank")
     robot = tmp_path / "r0.toml"
     assert "no view shows the target (charuco 7x10" in complaint(capfd, "calibrate", "camera", blank)
-    assert "give --height" in complaint(capfd, "calibrate", "camera", blank, "--robot", robot)
+    assert "give --height" in complaint(capfd, "calibrate", "camera", blank, "--settings", robot)
     assert "no such folder or video" in complaint(capfd, "calibrate", "camera", tmp_path / "none")
     assert "give two numbers" in complaint(capfd, "calibrate", "target", "--squares", "7")
     assert "do not fit on a4" in complaint(capfd, "calibrate", "target", "--square-mm", "60")
@@ -219,4 +219,4 @@ def test_mistakes_are_one_line(frames, capfd, tmp_path: Path) -> None:
         write_camera(robot, {"fx": 1.5})
     assert robot.read_text() == "robot = { camera = { height_m = 0.3 } }\n"
     robot.write_text("[robot\n")
-    assert "r0.toml" in complaint(capfd, "calibrate", "camera", blank, "--robot", robot)
+    assert "r0.toml" in complaint(capfd, "calibrate", "camera", blank, "--settings", robot)

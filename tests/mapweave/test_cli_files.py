@@ -45,7 +45,7 @@ def test_endless_input_is_not_read(tmp_path, capfd, pipe):
     if pipe:
         os.mkfifo(path)
     for command in (
-        ("map", "show", path), ("map", "export", path, "--to", "tum", "-o", tmp_path / "x"),
+        ("map", "show", path), ("map", "export", path, "--format", "tum", "-o", tmp_path / "x"),
         ("map", "merge", path, "-o", tmp_path / "x"), ("map", "import", path, "-o", tmp_path / "x"),
         ("server", "--settings", path),
     ):  # fmt: skip
@@ -68,7 +68,7 @@ def test_a_map_with_singular_and_huge_covariances_is_solved(tmp_path):
     path = tmp_path / "odd.mapweave"
     write_map_file(path, MapFile("agent", "r0.1", tuple(changes)))
     out = tmp_path / "map.g2o"
-    assert main(["map", "export", str(path), "--to", "g2o", "-o", str(out)]) == 0
+    assert main(["map", "export", str(path), "--format", "g2o", "-o", str(out)]) == 0
     assert out.read_text().count("VERTEX_SE2") == 3
 
 

@@ -206,7 +206,9 @@ def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> 
     sketch.distances = [200, 200, 200]
     still = film(tmp_path / "still.avi", walls, moves=False)
     settings = robot_toml(tmp_path, still, sketch.path)
-    status, findings, first = doctor(capfd, "--robot", settings, "--drive", "--offline", "--data", tmp_path)
+    status, findings, first = doctor(
+        capfd, "--settings", settings, "--drive", "--offline", "--data", tmp_path
+    )
     assert findings["camera"].verdict is Verdict.GOOD and "320x240 px" in findings["camera"].detail
     assert findings["driver"].verdict is Verdict.GOOD and "3 proximity sensors" in findings["driver"].detail
     assert findings["encoders"].verdict is Verdict.WRONG
@@ -218,7 +220,7 @@ def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> 
 
 def test_a_robot_that_is_not_pushed_and_a_wrong_size(walls, sketch, tmp_path, capfd) -> None:
     settings = robot_toml(tmp_path, film(tmp_path / "film.avi", walls), sketch.path, width=640)
-    status, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    status, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
     assert status == NO and first == "camera" and "320x240" in findings["camera"].detail
     assert "declared as 640x240" in findings["camera"].detail
     assert sketch.wheels.way() == (0.0, 0.0)
@@ -227,7 +229,7 @@ def test_a_robot_that_is_not_pushed_and_a_wrong_size(walls, sketch, tmp_path, ca
 def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd) -> None:
     dark = film(tmp_path / "dark.avi", walls, lambda image: (image * 0.02).astype(np.uint8))
     settings = robot_toml(tmp_path, dark, tmp_path / "ttyUSB7")
-    status, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    status, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
     assert (status, first) == (NO, "image") and "dark" in findings["image"].detail
     assert findings["driver"].verdict is Verdict.WRONG and "no such port" in findings["driver"].detail
     assert "mapweave find-port" in findings["driver"].advice
@@ -236,7 +238,7 @@ def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd) -> N
 def test_a_port_that_another_program_uses(walls, sketch, tmp_path, capfd) -> None:
     settings = robot_toml(tmp_path, film(tmp_path / "film.avi", walls), sketch.path)
     port = SerialPort(str(sketch.path), 115200)
-    _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    _, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
     port.close()
     assert first == "driver" and "in use by another process" in findings["driver"].detail
     assert "a running agent" in findings["driver"].advice
@@ -263,10 +265,10 @@ def test_the_end_of_the_terminal_is_no_person(monkeypatch: pytest.MonkeyPatch) -
 
 def test_no_camera_and_wrong_settings(tmp_path, capfd) -> None:
     settings = robot_toml(tmp_path, tmp_path / "none.avi", tmp_path / "none")
-    _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    _, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
     assert first == "camera" and "find-cameras" in findings["camera"].advice
     settings.write_text("[robot]\ndrivre = 1\n")
-    _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    _, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
     assert first == "settings" and "did you mean 'driver'" in findings["settings"].detail
     _, findings, _ = doctor(capfd, "--robot", "koala", "--offline", "--data", tmp_path)
     assert "driver koala" in findings["settings"].detail

@@ -167,11 +167,11 @@ def test_the_command_writes_and_prints_what_is_left_out(
 ) -> None:
     file = tmp_path / "m.mapweave"
     write_map_file(file, map_file_of(merged))
-    assert main(["map", "export", str(file), "--to", form, "-o", str(tmp_path / "out")]) == 0
+    assert main(["map", "export", str(file), "--format", form, "-o", str(tmp_path / "out")]) == 0
     out, err = capfd.readouterr()
     assert all(Path(line).stat().st_size > 100 for line in out.splitlines())
     assert "6 nodes of others are left out" in err
-    arguments = ["map", "export", str(file), "--to", form, "-o", str(tmp_path / "no"), "--component", "7"]
+    arguments = ["map", "export", str(file), "--format", form, "-o", str(tmp_path / "no"), "--component", "7"]
     assert main(arguments) == 1
     assert "the map has no component 7; it has 0 to 1" in capfd.readouterr().err
     assert not (tmp_path / "no").exists()
@@ -223,7 +223,7 @@ def test_the_back_end_finds_gtsam_s_optimum_of_others_graphs(
     factors.add(gtsam.PriorFactorPose2(0, values.atPose2(0), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
     best = 2.0 * factors.error(gtsam.GaussNewtonOptimizer(factors, values).optimize())
     wrong = tmp_path / "out.mapweave"
-    assert main(["map", "import", str(tmp_path / "in.g2o"), "-o", str(wrong)]) == 1
+    assert main(["map", "import", str(tmp_path / "in.g2o"), "-o", str(wrong)]) == 2
     assert "what is written is a pose graph, no map" in capfd.readouterr().err and not wrong.exists()
     arguments = ["map", "import", str(tmp_path / "in.g2o"), "-o", str(tmp_path / "out.g2o"), "--json"]
     assert main(arguments) == 0

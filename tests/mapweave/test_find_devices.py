@@ -14,6 +14,7 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.doctor import camera, ports
+from mapweave.exit_status import NO
 from tests.agent.drivers.emulators import ArduinoSketch
 from tests.mapweave.command_line import complaint
 
@@ -95,7 +96,7 @@ def test_the_port_whose_cable_is_pulled_is_named(plugged, monkeypatch, capsys) -
     terminal.write = write  # type: ignore[method-assign]
     monkeypatch.setattr(sys, "stdout", terminal)
     try:
-        assert main(["find-port", "--wait", "20"]) == 0
+        assert main(["find-port", "--timeout", "20"]) == 0
     finally:
         monkeypatch.setattr(sys, "stdout", out)
         thread.join()
@@ -104,7 +105,7 @@ def test_the_port_whose_cable_is_pulled_is_named(plugged, monkeypatch, capsys) -
 
 def test_no_port_and_no_pull_are_one_line(plugged, monkeypatch, capfd, tmp_path) -> None:
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
-    assert main(["find-port", "--wait", "0"]) == 1
+    assert main(["find-port", "--timeout", "0.05"]) == NO
     assert "no port has gone" in capfd.readouterr().err
     monkeypatch.setattr(ports.serial_ports, "__defaults__", (tmp_path / "nothing",))
     assert "no serial port" in complaint(capfd, "find-port")

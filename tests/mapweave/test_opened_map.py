@@ -126,7 +126,7 @@ def test_every_command_reads_all_three_alike(
         for arguments in (
             ("show", path, "--json", "--out", tmp_path / "map.png"), ("explain", "--json", "--map", path),
             ("route", start, goal, "--json", "--map", path), ("history", "--map", path),
-            ("export", path, "--to", "graphml", "-o", out / "x.graphml"),
+            ("export", path, "--format", "graphml", "-o", out / "x.graphml"),
             ("extract", path, "-o", out / "parts"), ("merge", path, "-o", out / "m.mapweave"),
         ):  # fmt: skip
             out.mkdir(exist_ok=True)

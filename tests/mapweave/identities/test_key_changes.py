@@ -82,7 +82,7 @@ def test_tokens_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
 def test_to_make_keys_again_changes_nothing(folder: KeyFolder) -> None:
     """The mode of the folder neither: the server of another user may read it by its group."""
     folder.path.chmod(0o750)
-    with pytest.raises(SettingsError, match="there are keys already"):
+    with pytest.raises(InvalidFile, match="there are keys already"):
         KeyFolder.create(folder.path, "demo", Profile.LAB, [], "s0")
     assert folder.path.stat().st_mode & 0o777 == 0o750
 

@@ -1,0 +1,85 @@
+"""Values of arguments, read where they are declared: what is none is a wrong command line, in one line.
+
+argparse itself would print the usage above it, and call a word that is no number an "invalid float value".
+`mapweave.cli.CommandParser` puts before the words here which argument it is.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from mapweave.commands.usage import UsageError
+
+
+def name(text: str) -> str:
+    """The name of a robot, server or fleet."""
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.node import check_name
+
+    try:
+        return check_name(text)
+    except InvalidValue as error:
+        raise UsageError(str(error).rpartition(": ")[2]) from None
+
+
+def endpoint(text: str) -> str:
+    """A Zenoh endpoint."""
+    from mapweave.wire.bus_settings import DEFAULT_ENDPOINT, ENDPOINT
+
+    if not ENDPOINT.fullmatch(text):
+        raise UsageError(f"endpoints look like {DEFAULT_ENDPOINT}")
+    return text
+
+
+def seed(text: str) -> int:
+    """A seed that random generators take."""
+    return _whole(text, 0, math.inf, "use 0 or more")
+
+
+def port(text: str) -> int:
+    """A TCP port; 0 takes a free one."""
+    return _whole(text, 0, 65535, "a port is 0 to 65535; 0 takes a free one")
+
+
+def count(text: str) -> int:
+    """How many."""
+    return _whole(text, 1, math.inf, "use 1 or more")
+
+
+def seconds(text: str) -> float:
+    """A time, s."""
+    return _positive(text, "give seconds, more than 0")
+
+
+def metres(text: str) -> float:
+    """A distance, m."""
+    return _positive(text, "give metres, more than 0")
+
+
+def png(text: str) -> Path:
+    """Where a picture goes."""
+    path = Path(text)
+    if path.suffix.lower() != ".png":
+        raise UsageError("the picture will be a PNG; end its name with .png")
+    return path
+
+
+def _whole(text: str, least: float, most: float, words: str) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = -1
+    if not least <= number <= most:
+        raise UsageError(words)
+    return number
+
+
+def _positive(text: str, words: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0.0 < number < math.inf:
+        raise UsageError(words)
+    return number
