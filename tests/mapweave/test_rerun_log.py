@@ -11,8 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
-from rerun.components import Colormap
 from scipy.spatial.transform import Rotation
 
 from mapweave.agent.localization.fix import Fix
@@ -28,7 +26,6 @@ from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.processes.rerun_log import FREE, OCCUPIED, QUEUED, RerunLog, _ellipsoids, _floor, _tracked
 from mapweave.scenarios.fleet import Stage
 from mapweave.scenarios.scenario import load_scenario, scenario_path
 from mapweave.storage.map_file import read_map_file
@@ -38,6 +35,13 @@ from tests.agent.localization.test_node_localizer import located
 from tests.mapweave.command_line import complaint
 from tests.simulator import needs_simulator
 from tests.waiting import free_port
+
+pytest.importorskip("rerun", reason='needs the extra "rerun"')
+
+from rerun.chunk import RrdReader
+from rerun.components import Colormap
+
+from mapweave.processes.rerun_log import FREE, OCCUPIED, QUEUED, RerunLog, _ellipsoids, _floor, _tracked
 
 STEP = 0.02
 COUNT = 60
@@ -125,6 +129,18 @@ def test_a_replay_is_read_back_as_it_was(
     # Landmarks: on the walls, which are ahead of the robot.
     seen = np.array(rows["/walk/map/robot/landmarks:positions"][-1][1])
     assert len(seen) > 10 and (seen[:, 0] > 0.1).all()
+    # Each ellipsoid is around one of them, and larger along the line of sight than across.
+    centres, sizes = (np.array(rows[f"/walk/map/robot/ellipsoids:{what}"][-1][1]) for what in
+                      ("centers", "half_sizes"))  # fmt: skip
+    nearest = np.linalg.norm(centres[:, None] - seen, axis=2).min(axis=1)
+    assert len(centres) == len(sizes) > 10 and nearest.max() < 1e-5
+    assert ((sizes > 0.0) & (sizes <= 3.0)).all() and (
+        sizes.max(axis=1) > 2.0 * sizes.min(axis=1)
+    ).mean() > 0.5
+    # The camera, where the robot has it.
+    intrinsics = np.array(rows["/walk/map/robot/camera:image_from_camera"][0][1]).reshape(3, 3).T
+    assert intrinsics[0] == pytest.approx([277.0, 0.0, 159.5]) and intrinsics[1, 2] == pytest.approx(119.5)
+    assert rows["/walk/map/robot/camera:translation"][0][1][0][2] == pytest.approx(0.3)
     assert "mission: carried" in rows["/walk/now:text"][-1][1][0]
 
 
