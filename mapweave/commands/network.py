@@ -220,16 +220,18 @@ def warn_without_router(bus: ZenohBus, name: str) -> None:
 def stop_on_signals() -> threading.Event:
     """An event that SIGTERM, Ctrl-C, the end of the terminal or of a parent set: a process can end in order.
 
-    A process that `nohup` has started outlasts its terminal.
+    A process that `nohup` has started outlasts its terminal, and so does a job that its shell has disowned.
     """
+    from mapweave.lost_terminal import outlast_terminal
     from mapweave.processes import parent_watchdog
 
+    outlast_terminal()
     stop, came = threading.Event(), SimpleQueue[int]()
     parent_watchdog.hold(stop)
     terminals = [number for number in (1, 2) if os.isatty(number)]
 
     def hang_up(signum: int, _: object) -> None:
-        # To write to a terminal that is gone is an error, and what ends in order says so.
+        # What libraries write beside Python's streams, as FFmpeg does, fails on a terminal that is gone.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for number in terminals:
             os.dup2(nowhere, number)

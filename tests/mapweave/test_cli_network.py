@@ -177,6 +177,36 @@ pathlib.Path({str(tmp_path / "written")!r}).write_text(str(came))
     assert (tmp_path / "written").read_text() == "True"
 
 
+def test_a_process_that_ignores_the_end_of_its_terminal_goes_on_and_may_print(tmp_path):
+    """As a job that its shell has disowned. Before, the first line that it printed ended it."""
+    program = f"""
+import logging, pathlib, signal, time
+from mapweave.commands.network import stop_on_signals
+from mapweave.terminal import log_with_time
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+log_with_time()
+stop = stop_on_signals()
+print("ready", flush=True)
+gone = pathlib.Path({str(tmp_path / "gone")!r})
+while not gone.exists():
+    time.sleep(0.01)
+print("goes on", flush=True)
+logging.warning("and its log")
+pathlib.Path({str(tmp_path / "written")!r}).write_text(str(stop.is_set()))
+"""
+    master, slave = pty.openpty()
+    run = [sys.executable, "-c", program]
+    with subprocess.Popen(run, stdin=slave, stdout=slave, stderr=slave, start_new_session=True) as process:
+        os.close(slave)
+        output = b""
+        while b"ready\r\n" not in output:
+            output += os.read(master, 100)
+        os.close(master)
+        (tmp_path / "gone").touch()
+        assert process.wait(60) == 0
+    assert (tmp_path / "written").read_text() == "False"
+
+
 def test_nohup_keeps_a_process():
     program = """
 import signal
