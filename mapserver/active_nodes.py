@@ -81,6 +81,16 @@ class ActiveNodes:
         return bounded(without_faded(found_node, self._merged))
 
 
+def doubted(merged: MergedMap) -> list[NodeId]:
+    """Nodes of components of which each map is implausible or has wrong geometry.
+
+    They are no second place where a robot could be: where other maps give a certain answer without them, they
+    make it neither ambiguous nor another one. Where no other map does they answer.
+    """
+    odd = merged.wrong.keys() | merged.implausible.keys()
+    return [node for graph in merged.graphs if odd and graph.maps <= odd for node in graph.nodes]
+
+
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
     """Nodes of maps with wrong geometry, of implausible maps and of fragments that show places of other maps.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mapweave.hybridmap.node import Node, NodeId
-from mapweave.mapserver.active_nodes import ActiveNodes
+from mapweave.mapserver.active_nodes import ActiveNodes, doubted
 from mapweave.mapserver.coverage import Coverage
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
@@ -34,6 +34,10 @@ class Answers:
     def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
         """Answers from a merged map; newer nodes, which `node_of` returns, have no merged pose yet."""
         set_apart = [node for map_id in merged.set_apart for node in merger.maps[map_id].nodes]
+        first = None
+        if unsure := doubted(merged):
+            sure = ActiveNodes(merger.places, node_of, merged, [*set_apart, *unsure])
+            first = Relocalizer(sure, sure.node, merged, alike=merger.alike)
         places = ActiveNodes(merger.places, node_of, merged, set_apart)
-        relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
+        relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike, first=first)
         return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Coverage(merged))

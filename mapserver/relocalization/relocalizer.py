@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 from mapweave.hybridmap.node import MapId, Node, NodeId
-from mapweave.hybridmap.query import RelocalizeAnswer, View
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions, AliasedRegionSettings
 from mapweave.mapserver.relocalization.candidates import Retrieval, retrieve
@@ -53,6 +53,7 @@ class Relocalizer:
         merged: MergedMap,
         settings: RelocalizationSettings | None = None,
         alike: AliasCache | None = None,
+        first: Relocalizer | None = None,
     ) -> None:
         """Take what is known.
 
@@ -62,9 +63,11 @@ class Relocalizer:
             merged: where nodes are.
             settings: how.
             alike: cache of aliased nodes; outlives the merged map.
+            first: is asked before, and answers alone where it is certain: it knows less, and nothing of which
+                the truth is in doubt.
         """
         s = settings or RelocalizationSettings()
-        self._index, self._node_of, self._merged = index, node_of, merged
+        self._index, self._node_of, self._merged, self._first = index, node_of, merged, first
         self._least_features = least = s.recognition.least_inliers
         self.alike = alike or AliasCache(s.recognition)
         self.registration = ViewRegistration(node_of, merged, s.recognition, s.faint)
@@ -78,6 +81,10 @@ class Relocalizer:
             view: the image's features.
             elsewhere: maps on which the robot knows that it is not.
         """
+        if self._first is not None:
+            answer = self._first.answer(view, elsewhere)
+            if answer.certainty in (Certainty.FOUND, Certainty.PLACE):
+                return answer
         candidates = retrieve(view, self._index, self._least_features, elsewhere)
         registration = self.registration.register(candidates)
         return self.conclude(registration)
