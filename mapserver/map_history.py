@@ -16,6 +16,7 @@ from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
+from mapweave.merge.mutual_exclusion.collision import is_exclusion
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import FrameChange, frame_changes
@@ -30,12 +31,6 @@ MOST_APART = 2000
 MOST_AT_ONCE = 50
 """Events of one sort that one merge adds one by one: a thousand maps may join at once."""
 Pair = tuple[MapId, MapId]
-EXCLUSION_WORDS = (
-    "would have seen",
-    "would have been at the same place",
-    "show nothing of what the other one mapped",
-)
-"""Words of a refusal by mutual exclusion."""
 
 
 class MapHistory:
@@ -201,7 +196,7 @@ def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pa
         if r.link is None or r.edge is not None:
             continue
         if r.reason not in by_exclusion:
-            by_exclusion[r.reason] = any(words in r.reason for words in EXCLUSION_WORDS)
+            by_exclusion[r.reason] = is_exclusion(r.reason)
         first, second = sorted((r.a.map, r.b.map))
         if by_exclusion[r.reason] and part_of.get(first) != part_of.get(second):
             reasons.setdefault((first, second), Counter())[r.reason] += 1

@@ -10,11 +10,14 @@ from collections import Counter
 from collections.abc import Collection, Container, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
 from mapweave.merge.pose_graph.merged_map import MergedMap
+
+LEAST_SIGMA = 1e-6
+"""Standard deviation of an edge that a robot can measure, m and rad: theirs are some 2e-3."""
 
 
 def implausible(hybrid_map: HybridMap) -> str:
@@ -26,7 +29,59 @@ def implausible(hybrid_map: HybridMap) -> str:
     for clock in sorted({node.clock for node in nodes} - {""}):
         if runs_backwards([node for node in nodes if node.clock == clock]):
             return f"its clock {clock} runs backwards: nothing is concluded from its times"
+    exact = (
+        edge.id
+        for edge in hybrid_map.edges.values()
+        if edge.within and edge.a_from_b.covariance.diagonal().max() < LEAST_SIGMA**2
+    )
+    if (first := min(exact, default=None)) is not None:
+        return f"its edge {first} has no uncertainty, which no robot measures"
     return ""
+
+
+def contradict_themselves(merged: MergedMap) -> dict[MapId, str]:
+    """Maps whose own loops contradict their own way, in words.
+
+    A robot closes no loop that contradicts its way: this tells a wrong way apart from places that look alike,
+    which contradict each other as well.
+    """
+    refused = {refusal.edge for refusal in merged.refused if refusal.edge is not None}
+    many = Counter(MapId(*edge[:2]) for edge in refused)
+    out: dict[MapId, str] = {}
+    for map_id in sorted(map_id for map_id, count in many.items() if count >= LEAST_CONTRADICTIONS):
+        if map_id not in merged.maps:
+            continue
+        edges = sorted(merged.maps[map_id].edges.values(), key=lambda edge: edge.id)
+        # Of two nodes the last loop counts; the others are refused for that alone.
+        loops = {(edge.a, edge.b): edge.id for edge in edges if edge.kind is EdgeKind.LOOP and edge.within}
+        against = len(refused.intersection(loops.values()))
+        if against >= max(LEAST_CONTRADICTIONS, 0.5 * len(loops)):
+            out[map_id] = f"it contradicts itself: {against} of its {len(loops)} loops do not fit its own way"
+    return out
+
+
+def contradict_each_other(merged: MergedMap) -> dict[MapId, str]:
+    """Maps of robots that leave very many which show the same places and contradict each other, in words.
+
+    Counted are maps that nothing joins with another robot's, with links to other maps of their own robot of
+    which none is accepted.
+    """
+    refused = {
+        (end.map, other.map)
+        for refusal in merged.refused
+        if refusal.link is not None and refusal.a.agent == refusal.b.agent and refusal.a.map != refusal.b.map
+        for end, other in (refusal.pair, refusal.pair[::-1])
+    }
+    joined = {map_id for graph in merged.graphs if len(graph.maps) > 1 for map_id in graph.maps}
+    by_robot: dict[str, list[MapId]] = {}
+    for map_id in sorted({first for first, _ in refused} - joined):
+        by_robot.setdefault(map_id.agent, []).append(map_id)
+    return {
+        map_id: f"it and {len(some) - 1} others of its robot show the same places and contradict each other"
+        for some in by_robot.values()
+        if len(some) > MOST_FRAGMENTS
+        for map_id in some
+    }
 
 
 def rightly_superseded(merged: MergedMap) -> dict[NodeId, Superseded]:
@@ -42,6 +97,8 @@ def rightly_superseded(merged: MergedMap) -> dict[NodeId, Superseded]:
     }
 
 
+LEAST_CONTRADICTIONS = 4
+"""Loops of a map that contradict its own way, at least: one or two may be false."""
 LEAST_NODES = 4
 """Of a map whose geometry can be tested."""
 MOST_FRAGMENTS = 8

@@ -27,13 +27,14 @@ from rich.progress import Progress
 from benchmarks.command_line import command_line
 from benchmarks.rules.switches import Switch, switched_off
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver import active_nodes
+from mapweave.mapserver import active_nodes, answers
 from mapweave.mapserver.log import entry
-from mapweave.mapserver.merging import merger
+from mapweave.mapserver.merging import implausible_maps
 from mapweave.mapserver.merging.copies import Copies
 from mapweave.merge.mutual_exclusion import trajectories
 from mapweave.merge.outlier_rejection import distinctness, wrong_geometry
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
+from mapweave.merge.torn_maps import TornMapSearch
 from mapweave.scenarios.liar.lies import EVERY, Map
 from mapweave.scenarios.liar.trial import Outcome, Trial, row, totals
 from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet, lost_views
@@ -51,10 +52,16 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "unreliable robots": ((active_nodes, "unreliable_robots", lambda *_: {}),),
     "copies": ((Copies, "maps", lambda *_: {}),),
     "implausible maps": (
-        (merger, "implausible", lambda _: ""),
-        (merger, "scattered", lambda _: {}),
-        (merger.Merger, "note_refusal", lambda *_: None),
+        (implausible_maps, "implausible", lambda _: ""),
+        (implausible_maps, "scattered", lambda *_: {}),
+        (implausible_maps.ImplausibleMaps, "note_refusal", lambda *_: False),
     ),
+    "maps that contradict themselves": (
+        (implausible_maps, "contradict_themselves", lambda _: {}),
+        (implausible_maps, "contradict_each_other", lambda _: {}),
+    ),
+    "torn maps": ((TornMapSearch, "torn", lambda *_: {}),),
+    "answers without implausible maps": ((answers, "doubted", lambda _: []),),
     "fragments": ((active_nodes, "fragments", lambda _: []),),
     "unmeasurable edges": ((entry, "unmeasurable", lambda _: ""),),
     "clocks that run backwards": ((trajectories, "runs_backwards", lambda _: False),),

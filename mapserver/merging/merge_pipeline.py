@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import replace
 
 import numpy as np
 
@@ -53,8 +54,17 @@ class MergePipeline:
         touched: set[MapId],
         constraints: ManualConstraints,
         pins: Sequence[Pin] = (),
+        implausible: Callable[[MergedMap], Mapping[MapId, str]] = lambda merged: {},
     ) -> MergedMap:
         """See `Islands.merge`; components are where pins hold them, oldest first.
+
+        Args:
+            maps: see `Islands.merge`; likewise verdicts, touched and constraints.
+            verdicts: on pairs of their nodes.
+            touched: maps that have changed.
+            constraints: manual constraints.
+            pins: hold frames.
+            implausible: gives the implausible maps of the merged map.
 
         Raises:
             InvalidValue: a node's pose is out of the range of messages.
@@ -64,4 +74,5 @@ class MergePipeline:
             # Written so that NaN fails.
             if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():
                 raise InvalidValue(f"nodes joined with {graph.anchor} lie beyond {MAX_POSITION:g} m")
+        merged = replace(merged, implausible=implausible(merged))
         return self._remover.fade(self._superseder.renewed(merged))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap
@@ -14,13 +15,14 @@ from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.merging.copies import Copies
+from mapweave.mapserver.merging.implausible_maps import ImplausibleMaps
 from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, NodeComparisons, compare
 from mapweave.mapserver.merging.pruning import PrunePlan, Pruning
 from mapweave.mapserver.merging.verification_cache import VerificationCache
-from mapweave.mapserver.plausibility import implausible, rightly_superseded, scattered
+from mapweave.mapserver.plausibility import rightly_superseded
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
@@ -75,8 +77,7 @@ class Merger:
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
         self._copies, self._copied = Copies(), dict[MapId, str]()
-        self._refused: dict[MapId, str] = {}
-        self._implausible: dict[MapId, str] = {}
+        self._implausible = ImplausibleMaps(self.settings.consistency)
         self._contradictions = WrongGeometrySearch(self.settings.consistency)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._stale: set[MapPair] = set()
@@ -191,9 +192,7 @@ class Merger:
 
     def note_refusal(self, map_id: MapId, reason: str) -> None:
         """Note that a change of a map was refused; the first reason is kept."""
-        if map_id not in self._refused:
-            self._refused[map_id] = reason
-            self._dirty = True
+        self._dirty |= self._implausible.note_refusal(map_id, reason)
 
     def merged(self, use: Callable[[MergedMap], object] | None = None) -> MergedMap:
         """The merged map of all changes; merged again only if something has changed, and where it has.
@@ -222,7 +221,7 @@ class Merger:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
-                self._implausible[map_id] = implausible(self._kept[map_id])
+                self._implausible.changed(map_id, self._kept[map_id])
             self._isolation.changed(self._changed)
             before = self._copied.keys()
             linked = {frozenset((a.map, b.map)) for a, b in self._constraints.links}
@@ -241,6 +240,8 @@ class Merger:
                 merged = self._made_without_bad(maps, error, use)
             for node_id, overlaps in self.places.leave_out(merged.superseded, self.node).items():
                 self._comparisons.put_overlaps(node_id, overlaps)
+            if self._merged.implausible.keys() - merged.implausible.keys():
+                self.alike.forget()
             self._merged = merged
             self.counters.merges += 1
             self._touched, self._changed = set(), set()
@@ -256,14 +257,12 @@ class Merger:
         use: Callable[[MergedMap], object] | None,
     ) -> MergedMap:
         kept = {map_id: self._kept[map_id] for map_id in maps}
-        merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins)
-        odd = {which: reason for which, reason in self._implausible.items() if reason}
-        odd |= scattered(kept, self.pruning.pruned.maps) | self._refused
+        odd = partial(self._implausible.of, pruned=self.pruning.pruned.maps)
+        merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins, odd)
         merged = replace(
             merged,
             set_apart=self._set_apart(),
             copies={which: self._kept[which] for which in self._copied},
-            implausible={which: odd[which] for which in sorted(odd.keys() & kept.keys())},
             wrong=self._wrong,
             pruned=self.pruning.pruned,
         )

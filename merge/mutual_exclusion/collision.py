@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+WORDS = ("would have seen", "would have been at the same place")
+"""Each reason has some of these."""
+
+
+def is_exclusion(reason: str) -> bool:
+    """Whether a link was refused since two robots exclude each other."""
+    return any(words in reason for words in WORDS)
+
 
 @dataclass(frozen=True)
 class Collision:

@@ -23,9 +23,10 @@ from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.log.entry import unmeasurable
 from mapweave.mapserver.merging.copies import Copies, copied_landmarks
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.plausibility import MOST_FRAGMENTS, unreliable_robots
+from mapweave.mapserver.plausibility import MOST_FRAGMENTS, implausible, unreliable_robots
 from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.codec import decode_change
 from mapweave.wire.log_messages import Head
 from mapweave.wire.messages import encode
@@ -102,7 +103,13 @@ def said(fleet: Fleet, words: str) -> list[MapEventKind]:
 
 
 @pytest.mark.parametrize(
-    ("name", "map_id"), [("copies", FIRST), ("copies", LAST), ("vague edges", LAST), ("a clock", FIRST)]
+    ("name", "map_id"),
+    [
+        ("copies", FIRST),
+        ("copies", LAST),
+        ("vague edges", LAST),
+        ("a clock", FIRST),
+    ],
 )
 def test_the_others_keep_their_map_and_their_answers(name: str, map_id: MapId, tmp_path: Path) -> None:
     path = tmp_path / "s0.sqlite"
@@ -232,6 +239,84 @@ def test_many_bad_maps_speak_against_a_robot_unless_most_of_its_nodes_are_sound(
     large = {MapId("z", 50): held(3 * len(small))}
     assert not unreliable_robots(small | large, ())
     assert unreliable_robots(small | large, [*large]) == {"z": {*small, *large}}
+
+
+def sound_merger() -> Merger:
+    """With what the two sound robots have sent."""
+    merger = Merger()
+    for log in sound_logs().values():
+        for message in log:
+            merger.on_change(decode_change(message))
+    return merger
+
+
+def certainties(merger: Merger, merged: MergedMap) -> list[Certainty]:
+    """Of the answers to lost robots."""
+    relocalizer = Answers.of(merger, merged, merger.node).relocalizer
+    return [relocalizer.answer(view).certainty for view in lost()]
+
+
+@pytest.mark.parametrize(("spread", "words"), [(0.0, "its edge z.1.2 has no uncertainty"), (1e-4, "")])
+def test_no_robot_measures_without_uncertainty(spread: float, words: str) -> None:
+    hybrid_map = HybridMap()
+    for body in views(LAST, Pose2(1.0), spread**2 * np.eye(3)):
+        hybrid_map.apply(body)
+    assert implausible(hybrid_map).startswith(words) and bool(words) == bool(implausible(hybrid_map))
+
+
+@pytest.mark.parametrize("wrong", [0, 3, 4])
+def test_a_map_that_contradicts_itself_is_named(wrong: int) -> None:
+    """Its own loops do; what a server recognises may be a place that looks the same."""
+    tour = [*TOUR, *TOUR]
+    steps = [a.inverse() @ b for a, b in pairwise(tour)]
+    nodes = take_map(WORLD, LAST, tour, np.random.default_rng(8))[0]
+    merger = Merger()
+    log = driven(LAST, nodes, steps)
+    ends = [(i, j) for i in range(len(tour)) for j in range(i + 2, len(tour))][:6]
+    for k, (i, j) in enumerate(ends):
+        off = Pose2(1.0) if k < wrong else Pose2()
+        pose = PoseGaussian(tour[i].inverse() @ tour[j] @ off, STEP)
+        edge = Edge(
+            NodeId(*LAST, 100 + k), NodeId(*LAST, 2 * i + 1), NodeId(*LAST, 2 * j + 1), pose, EdgeKind.LOOP
+        )
+        log.append(EdgePut(edge))
+    for number, body in enumerate(log, start=1):
+        merger.on_change(Change(LAST, number, 0, body))
+    found = merger.merged().implausible
+    assert list(found) == ([LAST] if wrong > 3 else [])
+    assert not found or found[LAST].startswith("it contradicts itself: 4 of its 6 loops")
+
+
+@pytest.mark.parametrize("count", [MOST_FRAGMENTS, MOST_FRAGMENTS + 1])
+def test_many_maps_of_one_robot_that_contradict_each_other_make_no_answer_ambiguous(count: int) -> None:
+    """Each has true views in an order of its own, with wrong ways between them."""
+    merger, rng = sound_merger(), np.random.default_rng(3)
+    nodes = take_map(WORLD, LAST, TOUR, np.random.default_rng(8))[0]
+    for epoch in range(1, count + 1):
+        map_id = MapId(LAST.agent, epoch)
+        steps = [Pose2.from_vector(rng.uniform(-3.0, 3.0, 3)) for _ in nodes[1:]]
+        for number, body in enumerate(driven(map_id, nodes, steps), start=1):
+            merger.on_change(Change(map_id, number, 0, body))
+    merged = merger.merged()
+    assert len(merged.implausible) == (count if count > MOST_FRAGMENTS else 0)
+    if merged.implausible:
+        assert certainties(merger, merged) == [Certainty.FOUND] * 2
+
+
+def test_places_of_an_implausible_map_answer_only_where_no_other_map_does() -> None:
+    """Alone it may know a place; beside others it is no second place, linked with them or not."""
+    merger = sound_merger()
+    for number, body in enumerate(views(LAST, Pose2(1.0, 2.0, 0.5), STEP), start=1):
+        merger.on_change(Change(LAST, number, 0, body))
+    merged = merger.merged()
+    # As if its nodes had been compared with no others: none is known to be misplaced.
+    unlinked = replace(merged, refused=(), wrong={})
+    assert {node.map for node in merged.components[-1]} == {LAST} and not merged.implausible
+    assert certainties(merger, unlinked) == [Certainty.AMBIGUOUS] * 2
+    odd = replace(unlinked, implausible={LAST: "it contradicts itself"})
+    assert certainties(merger, odd) == [Certainty.FOUND] * 2
+    every = replace(unlinked, implausible=dict.fromkeys(merged.maps, "it contradicts itself"))
+    assert certainties(merger, every) == [Certainty.AMBIGUOUS] * 2
 
 
 def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_rooms_does() -> None:

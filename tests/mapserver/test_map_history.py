@@ -21,9 +21,9 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.map_history import EXCLUSION_WORDS, MOST_AT_ONCE, MapHistory
+from mapweave.mapserver.map_history import MOST_AT_ONCE, MapHistory
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.merge.mutual_exclusion.collision import Collision
+from mapweave.merge.mutual_exclusion.collision import Collision, is_exclusion
 from mapweave.merge.pose_graph.links import refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.messages import KeptHistory, decode, encode
@@ -116,7 +116,7 @@ def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
 ) -> None:
     clash = Collision("a", "b", "hall", 40, 0.1, 12.0, 99.0)
     seen = replace(clash, where="ahead")
-    assert all(any(words in one.reason for words in EXCLUSION_WORDS) for one in (clash, seen))
+    assert is_exclusion(clash.reason) and is_exclusion(seen.reason)
     links = [link for link in one.links if {link.a.map, link.b.map} == {A, B}]
     held = replace(two, refused=tuple(refuse(link, clash.reason) for link in links))
     history = MapHistory(store)

@@ -1,0 +1,53 @@
+"""Implausible maps: what is wrong with each map by itself, and beside the others once they are merged."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.plausibility import (
+    contradict_each_other,
+    contradict_themselves,
+    implausible,
+    scattered,
+)
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import ConsistencySettings
+from mapweave.merge.torn_maps import TornMapSearch
+
+
+class ImplausibleMaps:
+    """Finds them, and keeps what was found of maps that did not change."""
+
+    def __init__(self, consistency: ConsistencySettings) -> None:
+        """Nothing is known yet.
+
+        Args:
+            consistency: when links agree.
+        """
+        self._by_itself: dict[MapId, str] = {}
+        self._refused: dict[MapId, str] = {}
+        self._torn = TornMapSearch(consistency)
+
+    def changed(self, map_id: MapId, hybrid_map: HybridMap) -> None:
+        """Look at a map that is new or has changed."""
+        self._by_itself[map_id] = implausible(hybrid_map)
+
+    def note_refusal(self, map_id: MapId, reason: str) -> bool:
+        """Note that a change of a map was refused; returns whether it is the first, which is kept."""
+        first = map_id not in self._refused
+        self._refused.setdefault(map_id, reason)
+        return first
+
+    def of(self, merged: MergedMap, pruned: Container[MapId]) -> dict[MapId, str]:
+        """The implausible maps of a merged map, in order, with what is wrong in words.
+
+        Args:
+            merged: as it was just merged.
+            pruned: maps that had more nodes, which newer ones have superseded.
+        """
+        odd = self._torn.torn(merged) | contradict_each_other(merged) | contradict_themselves(merged)
+        odd |= {which: reason for which, reason in self._by_itself.items() if reason}
+        odd |= scattered(merged.maps, pruned) | self._refused
+        return {which: odd[which] for which in sorted(odd.keys() & merged.maps.keys())}

@@ -1,0 +1,115 @@
+"""Torn maps: maps that show places of two robots, in another arrangement than the one that those agree on.
+
+Mutual exclusion refutes all links of such a map with both robots, as it does with a map of rooms that look
+the same. But rooms that look the same elsewhere have one arrangement. Where links with the one robot and with
+the other put the map in different places, and lines of sight refute each of these
+(mapweave.merge.outlier_rejection.wrong_geometry), the map is right nowhere.
+
+Who is wrong is decided by what joins: the two robots' maps are in one component, and nothing joins this map
+with any other robot's. Both of them exclude it, so no single robot makes a map of another one seem torn.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.merge.mutual_exclusion.collision import is_exclusion
+from mapweave.merge.outlier_rejection.bent_maps import AGREEING
+from mapweave.merge.outlier_rejection.wrong_geometry import UNSOLVABLE, all_refuted, link_sets
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ConsistencySettings
+
+MOST_OF_A_NODE = 2
+"""Links of each node that are tested, those with most landmarks: so many confirm each other."""
+MOST_NODES = 100
+"""Nodes of a map that are tested, evenly chosen."""
+Excluded = dict[tuple[int, int], dict[str, list[Link]]]
+"""Refused links from one component to another, by the robot at their far end."""
+
+
+class TornMapSearch:
+    """Finds torn maps in merged maps. What was found of links that did not change is kept."""
+
+    def __init__(self, consistency: ConsistencySettings) -> None:
+        """Nothing is known yet.
+
+        Args:
+            consistency: when links agree.
+        """
+        self._s = consistency
+        self._known: dict[frozenset[Pair], tuple[tuple[HybridMap, ...], bool]] = {}
+
+    def torn(self, merged: MergedMap) -> dict[MapId, str]:
+        """The torn maps of a merged map, and what they contradict, in words."""
+        out: dict[MapId, str] = {}
+        known = {}
+        for (alone, joined), by_robot in _excluded(merged).items():
+            links = _thinned([link for some in by_robot.values() for link in some])
+            placed, fixed = merged.graphs[alone], merged.graphs[joined]
+            key = frozenset(link.key for link in links)
+            maps = tuple(merged.maps[map_id] for map_id in sorted(placed.maps))
+            before = self._known.get(key)
+            if before is None or any(a is not b for a, b in zip(before[0], maps, strict=True)):
+                before = maps, self._is_torn(links, placed, fixed, merged)
+            known[key] = before
+            if before[1]:
+                *most, last = sorted(by_robot)
+                robots = f"{', '.join(most)} and {last}"
+                words = f"it shows places of {robots} in another arrangement than theirs"
+                out |= dict.fromkeys(sorted(placed.maps), words)
+        self._known = known
+        return out
+
+    def _is_torn(self, links: Sequence[Link], placed: PoseGraph, fixed: PoseGraph, merged: MergedMap) -> bool:
+        if len(links) < 2:
+            return False
+        pieces = Fragment(placed.anchor, placed, ()), Fragment(fixed.anchor, fixed, ())
+        nodes = {node: merged.maps[node.map].nodes[node] for graph in (placed, fixed) for node in graph.nodes}
+        try:
+            if len(link_sets(links, *pieces, self._s)[0]) >= AGREEING * len(links):
+                return False  # a place that looks the same, as a whole
+            return all_refuted(links, *pieces, nodes, self._s)
+        except UNSOLVABLE:
+            return False
+
+
+def _excluded(merged: MergedMap) -> Excluded:
+    """Links of maps that nothing joins, with components in which two robots exclude them."""
+    robots = [{map_id.agent for map_id in graph.maps} for graph in merged.graphs]
+    links: Excluded = defaultdict(lambda: defaultdict(list))
+    excluded = Counter[tuple[int, int, str]]()
+    by_reason = {reason: is_exclusion(reason) for reason in {r.reason for r in merged.refused}}
+    if not any(by_reason.values()):
+        return {}
+    for refusal in merged.refused:
+        if refusal.link is None or refusal.edge is not None or refusal.a.agent == refusal.b.agent:
+            continue
+        for link in (refusal.link, refusal.link.turned()):
+            alone, joined = merged.component_of(link.a), merged.component_of(link.b)
+            if alone is None or joined is None or len(robots[alone]) > 1 or len(robots[joined]) < 2:
+                continue
+            robot = link.b.agent
+            links[alone, joined][robot].append(link)
+            excluded[alone, joined, robot] += by_reason[refusal.reason]
+    out: Excluded = {}
+    for pair, by_robot in links.items():
+        against = {robot: some for robot, some in by_robot.items() if 2 * excluded[*pair, robot] > len(some)}
+        if len(against) >= 2:
+            out[pair] = against
+    return out
+
+
+def _thinned(links: Sequence[Link]) -> list[Link]:
+    """The links of some nodes with most landmarks, so many of each."""
+    own: dict[NodeId, list[Link]] = {}
+    for link in sorted(links, key=lambda link: (link.a, -link.weight, link.b)):
+        own.setdefault(link.a, []).append(link)
+    step = -(-len(own) // MOST_NODES)
+    return [link for node in sorted(own)[::step] for link in own[node][:MOST_OF_A_NODE]]

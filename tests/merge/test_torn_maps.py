@@ -1,0 +1,87 @@
+"""A map with two robots' places in another arrangement is torn; a place that looks the same is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.merging import merge_maps
+from mapweave.merge.pose_graph.links import RefusedLink, refuse
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import ConsistencySettings
+from mapweave.merge.torn_maps import TornMapSearch
+from mapweave.scenarios.liar.lies import Setting, altered, bodies, chain
+from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet
+
+SEED = 5
+AWAY, TORN = Pose2(40.0, -10.0, 2.0), Pose2(2.0, -2.0, 1.0)
+EXCLUDED = "{} and r3 would have been at the same place at the same time: 0.01 m apart"
+
+
+@pytest.fixture(scope="module")
+def fleet() -> Fleet:
+    return draw_fleet(SEED, SCENES["house"], Fault.NONE, stops=2)
+
+
+def beside_copies(fleet: Fleet, shift: Pose2, excluding: tuple[str, ...]) -> MergedMap:
+    """Copies of r0's nodes, and of r1's shifted against where they are, beside the true maps.
+
+    Links with some robots are refused by mutual exclusion, others for want of support.
+    """
+    rng = np.random.default_rng(SEED)
+    sound = {map_id: content for map_id, content in fleet.maps.items() if map_id != ODD}
+    theirs = [node for k in ("r0", "r1") for node in sound[MapId(k, 1)][0]]
+    poses = [AWAY @ (shift if node.id.agent == "r1" else Pose2()) @ fleet.truth[node.id] for node in theirs]
+    copied = chain(Setting(ODD, fleet.maps[ODD], sound, rng), [altered(node, rng) for node in theirs], poses)
+    merger = Merger()
+    for map_id, content in {**sound, ODD: copied}.items():
+        for body in bodies(content):
+            merger.apply(map_id, body)
+    merged = merger.merged()
+    found = [*merged.links, *(r.link for r in merged.refused if r.link is not None)]
+    mine = [link for link in found if (link.a.map == ODD) != (link.b.map == ODD)]
+
+    def against(robot: str) -> str:
+        return EXCLUDED.format(robot) if robot in excluding else "no 2 links agree"
+
+    refused: list[RefusedLink] = [refuse(link, against(min(link.a.agent, link.b.agent))) for link in mine]
+    others = [link for link in found if ODD not in {link.a.map, link.b.map}]
+    return merge_maps(dict(merged.maps), others, refused)
+
+
+@pytest.mark.parametrize(
+    ("shift", "excluding", "torn"),
+    [
+        (TORN, ("r0", "r1"), True),
+        (Pose2(), ("r0", "r1"), False),
+        (TORN, ("r0",), False),
+        (TORN, (), False),
+    ],
+)
+def test_two_robots_that_agree_exclude_a_torn_map(
+    fleet: Fleet, shift: Pose2, excluding: tuple[str, ...], torn: bool
+) -> None:
+    merged = beside_copies(fleet, shift, excluding)
+    assert [{node.agent for node in part} for part in merged.components] == [{"r0", "r1", "r2"}, {"r3"}]
+    found = TornMapSearch(ConsistencySettings()).torn(merged)
+    assert found.keys() == ({ODD} if torn else set())
+    assert not torn or found[ODD].startswith(
+        "it shows places of r0 and r1 in another arrangement than theirs"
+    )
+
+
+def test_what_did_not_change_is_not_tested_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    merged, search = beside_copies(fleet, TORN, ("r0", "r1")), TornMapSearch(ConsistencySettings())
+    assert search.torn(merged)
+    tested = []
+    monkeypatch.setattr("mapweave.merge.torn_maps.all_refuted", lambda *_: tested.append(1))
+    assert search.torn(merged) and not tested
+    # Its robot has put a node again.
+    maps = {**merged.maps, ODD: HybridMap(merged.maps[ODD].contents())}
+    assert not search.torn(replace(merged, maps=maps)) and tested
