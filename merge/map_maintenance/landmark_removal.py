@@ -13,7 +13,7 @@ a single visit is never enough.
 
 The views are all that are near in the merged map, linked with the node or not: the more a place has changed,
 the fewer views are linked with it. A view that is not linked counts only if its pose in the merged map is
-certain.
+certain. Views of an implausible map count for its own robot's nodes alone.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.map_maintenance.changed_nodes import ChangedNodes
@@ -73,6 +73,7 @@ class LandmarkRemover:
         self._faded: dict[NodeId, NDArray[np.bool_]] = {}
         self._graphs: tuple[PoseGraph, ...] = ()
         self._links = Adjacency()
+        self._implausible: frozenset[MapId] = frozenset()
         # Each of two nodes may move by a part of `moved`, before and after their comparison.
         self._drift = ChangedNodes(MOVED / 8.0, MOVED / (4.0 * NEAR))
 
@@ -89,18 +90,20 @@ class LandmarkRemover:
         for node_id in self._drift.removed(merged.components):
             self._observations.pop(node_id, None)
             self._faded.pop(node_id, None)
+        others = self._implausible ^ merged.implausible.keys()
+        self._implausible = frozenset(merged.implausible)
         for graph in merged.graphs:
-            if id(graph) not in solved:
-                self._fade(merged, graph)
+            if id(graph) not in solved or not graph.maps.isdisjoint(others):
+                self._fade(merged, graph, others)
         active = {node: mask for node, mask in sorted(self._faded.items()) if node not in merged.superseded}
         return replace(merged, faded=active)
 
-    def _fade(self, merged: MergedMap, graph: PoseGraph) -> None:
+    def _fade(self, merged: MergedMap, graph: PoseGraph, others: Container[MapId]) -> None:
         from scipy.spatial import cKDTree
 
         nodes = [merged.maps[node.map].nodes[node] for node in graph.nodes]
         tree = cKDTree(graph.means[:, :2])
-        for row in self._affected(graph, nodes, tree, merged.superseded):
+        for row in self._affected(graph, nodes, tree, merged.superseded, others):
             node = nodes[row]
             linked = {link.b if link.a == node.id else link.a: link for link in self._links.at(node.id)}
             nearby = [nodes[k] for k in self._around(graph, row, tree)]
@@ -121,10 +124,24 @@ class LandmarkRemover:
                 self._faded[node.id] = faded
 
     def _affected(
-        self, graph: PoseGraph, nodes: Sequence[Node], tree: cKDTree, but: Container[NodeId]
+        self,
+        graph: PoseGraph,
+        nodes: Sequence[Node],
+        tree: cKDTree,
+        but: Container[NodeId],
+        others: Container[MapId],
     ) -> list[int]:
-        """Rows of nodes whose observations may have changed."""
+        """Rows of nodes whose observations may have changed.
+
+        Args:
+            graph: that they are in.
+            nodes: all of its nodes.
+            tree: of their positions.
+            but: superseded nodes.
+            others: maps that have become implausible, or plausible again.
+        """
         changed = self._drift.changed(nodes, graph.means)
+        changed |= np.array([node.id.map in others for node in nodes], np.bool_)
         touched = [graph.rows[node] for node in self._links.touched if node in graph.rows]
         observed = np.array([node.id in self._observations for node in nodes], np.bool_)
         affected = changed | ~observed
@@ -149,6 +166,7 @@ class LandmarkRemover:
 
     def _views(self, node: Node, nearby: Sequence[Node], linked: Sequence[Node]) -> list[Node]:
         """Later views of a node's place, the earliest first."""
+        nearby, linked = ([k for k in some if self._counts(node, k)] for some in (nearby, linked))
         linked_ids = {candidate.id for candidate in linked}
         unlinked = [
             candidate for candidate in nearby if candidate.id not in linked_ids and is_older(node, candidate)
@@ -161,6 +179,10 @@ class LandmarkRemover:
         newest = sorted(unlinked, key=lambda candidate: (candidate.stamp_ns, candidate.id))[-MOST:]
         views = [*(candidate for candidate in linked if is_older(node, candidate)), *newest]
         return sorted(views, key=lambda candidate: (candidate.stamp_ns, candidate.id))
+
+    def _counts(self, node: Node, view: Node) -> bool:
+        """Whether a view tells anything of a node: no robot takes others' landmarks by an impossible map."""
+        return view.id.agent == node.id.agent or view.id.map not in self._implausible
 
     def _observe(
         self, merged: MergedMap, graph: PoseGraph, node: Node, views: list[Node], linked: dict[NodeId, Link]

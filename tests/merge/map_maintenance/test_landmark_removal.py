@@ -205,6 +205,29 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     assert shares[-1][0].mean() < 0.2
 
 
+def test_views_of_implausible_maps_fade_no_landmarks_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From when they are found to be so, and until they are not."""
+    rng = np.random.default_rng(2)
+    world = room(0, 0, 6, 4, 700, rng)
+    thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
+    other = replace(world, vectors=world.vectors.copy())
+    other.vectors[thing] = random_vectors(len(thing), rng)
+    monkeypatch.setattr(superseding, "FOUND", 10_000)
+    merger = Merger()
+    for epoch, now in enumerate([world, *[other] * 6], start=1):
+        tour = [Pose2(2.6 + 0.5 * k, 2.0 + rng.normal(0, 0.04), 0.05 * k) for k in range(2)]
+        _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
+    merged = merger.merged()
+    assert NodeId("r1", 1, 1) in merged.faded
+    odd = replace(merged, implausible=dict.fromkeys(merged.maps, "it contradicts itself"))
+    remover = LandmarkRemover()
+    for given, fades in ((merged, True), (odd, False), (merged, True), (odd, False)):
+        for before in (remover, LandmarkRemover()):
+            faded = before.fade(given).faded
+            assert faded.keys() == (merged.faded.keys() if fades else set())
+            assert all(np.array_equal(mask, merged.faded[node]) for node, mask in faded.items())
+
+
 @pytest.mark.slow
 def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """From drive to drive, superseded nodes included, as a remover that sees only the last map."""
