@@ -43,6 +43,8 @@ RATING_SHARE = 0.1
 MOST_RATED = 5000
 """Nodes of a component whose links get probabilities: 4000 nodes with 600 links take 2 s, and the time grows
 with the square. An explanation of a link has it in any case."""
+EXPECTED = 5.0
+"""s in which a browser that has asked for the page opens its WebSocket."""
 MOST_VIEWERS = 64
 """More are refused."""
 LONGEST_HOLD = 10.0
@@ -99,7 +101,7 @@ class Live:
         self._events: dict[MapEvent, int] = {}
         self._counted = 0
         self._state = ""
-        self._viewers = 0
+        self._viewers, self._expected_until = 0, -math.inf
         self._looked = asyncio.Event()
         self._looking: asyncio.Task[None] | None = None
         self._rating: asyncio.Task[None] | None = None
@@ -116,8 +118,7 @@ class Live:
             await viewer.close(1013, f"{MOST_VIEWERS} watch already")
             return
         self._viewers += 1
-        if self._looking is None or self._looking.done():
-            self._looking = asyncio.create_task(self._look_on())
+        self._begin()
         hearing = asyncio.create_task(_until_gone(viewer))
         showing = asyncio.create_task(self._show(viewer, person))
         try:
@@ -127,6 +128,15 @@ class Live:
             for task in (hearing, showing):
                 task.cancel()
             await asyncio.gather(hearing, showing, return_exceptions=True)
+
+    def expect(self) -> None:
+        """A viewer comes soon: look at the server already. In the server's thread."""
+        self._expected_until = time.monotonic() + EXPECTED
+        self._begin()
+
+    def _begin(self) -> None:
+        if self._looking is None or self._looking.done():
+            self._looking = asyncio.create_task(self._look_on())
 
     async def _show(self, viewer: WebSocket, person: Person) -> None:
         hello = {"kind": "hello", **self._access.described(person, self._server.read_only)}
@@ -160,7 +170,7 @@ class Live:
         return json_bytes(content).decode(), self._counted
 
     async def _look_on(self) -> None:
-        while self._viewers:
+        while self._viewers or time.monotonic() < self._expected_until:
             try:
                 fresh = await run_in_threadpool(self._look)
             except MapweaveError as error:

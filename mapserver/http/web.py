@@ -40,7 +40,6 @@ from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from http import HTTPStatus
-from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
@@ -48,8 +47,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
-from starlette.routing import Mount, Route, WebSocketRoute
-from starlette.staticfiles import StaticFiles
+from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp
 
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
@@ -68,6 +66,7 @@ from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.live import Live
 from mapweave.mapserver.http.login import PERSON, PUBLIC, Access, address_of
 from mapweave.mapserver.http.nodes import node_answers
+from mapweave.mapserver.http.pages import page, static
 from mapweave.mapserver.http.plans import plan_answers
 from mapweave.mapserver.http.rates import LIMITED, Rates
 from mapweave.mapserver.http.reply import PATIENCE, Reply, busy, refusal
@@ -77,7 +76,6 @@ from mapweave.wire.each_robot import each_robot
 
 log = logging.getLogger(__name__)
 
-STATIC = Path(__file__).with_name("static")
 PAGES = ("/", "/why")
 MOST_AT_ONCE = 32
 """Questions that are served at once; the next one is refused."""
@@ -227,14 +225,14 @@ class Questions:
             ("POST", "/constraints", "constrain", self._constrain),
         ]
         routes = [
-            *(Route(path, _page("index.html")) for path in PAGES),
+            *(Route(path, page("index.html", self.live.expect)) for path in PAGES),
             *access.routes(lambda: server.read_only, self._answering),
             WebSocketRoute("/live", self.live.serve),
             *(
                 Route(path, self._answering(answer, question), methods=[method])
                 for method, path, question, answer in answering
             ),
-            Mount("/static", StaticFiles(directory=STATIC)),
+            Route("/static/{name}", static()),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such})
         app.router.redirect_slashes = False
@@ -385,15 +383,6 @@ def _asker(request: Request) -> str:
 def _author(request: Request) -> str:
     """Who gives a mission: the person who has logged in, without keys the one that the request names."""
     return request.scope[PERSON].name or request.query_params.get("by", BY)
-
-
-def _page(name: str) -> Callable[[Request], Awaitable[Response]]:
-    content = (STATIC / name).read_bytes()
-
-    async def endpoint(_: Request) -> Response:
-        return Response(content, media_type="text/html")
-
-    return endpoint
 
 
 async def _no_such(request: Request, error: Exception) -> Response:
