@@ -1,4 +1,4 @@
-"""The page and its files: all asked for at once, of the right types, and the server is ready for the viewer."""
+"""The page and its files: all asked for at once, of the right types, and the map is ready for the viewer."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from mapweave.mapserver.http.pages import STATIC, WORKERS
 from mapweave.mapserver.http.web import Web
 from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
+
+KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 
 
 def test_the_browser_asks_for_all_modules_at_once(served: Web) -> None:
