@@ -394,7 +394,7 @@ class Navigator:
         (a, b), now = follower.blocked, self._motion.now
         words, obstacle = obstruction(
             self._description, self._motion.observation, follower.fix, follower.robot_from_target,
-            self._touched, self._beside(),
+            follower.to_goal, self._touched, self._beside(),
         )  # fmt: skip
         if obstacle is None and follower.to_goal <= NEAR and not self._parking_retried:
             # Nothing keeps it from its goal but its own precision: that blocks no other robot.

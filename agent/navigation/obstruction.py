@@ -37,19 +37,22 @@ def obstruction(
     observation: Observation,
     fix: Fix,
     robot_from_target: Pose2,
+    to_goal: float,
     touched: str,
     beside: RobotBeside | None,
 ) -> Obstruction:
     """What is between a robot and where it drives.
 
     Another robot is in the way if this one would touch it on the straight way to its target. Else it is a
-    point of that way right before the robot.
+    point of that way right before the robot. Within its own length of the goal there is no such place:
+    it would reach the goal, and bar every way there for what may be beside the robot.
 
     Args:
         description: of the robot.
         observation: what it senses.
         fix: where it is.
         robot_from_target: where it drives.
+        to_goal: how far its goal is, m.
         touched: what it touched, in words; empty without a touch.
         beside: the robot next to it.
     """
@@ -63,7 +66,7 @@ def obstruction(
         way = np.array([[robot_from_target.x, robot_from_target.y]])
         if distances(np.array([[beside.x, beside.y]]), np.zeros((1, 2)), way)[0, 0] < reach:
             return Obstruction(words, _obstacle(fix, beside.x, beside.y, reach, beside.robot))
-    if not near:
+    if not near or to_goal < 2.0 * description.radius + MARGIN:
         return Obstruction(words, None)
     distance = math.hypot(robot_from_target.x, robot_from_target.y)
     share = min((description.radius + MARGIN) / max(distance, 1e-9), 1.0)

@@ -125,6 +125,25 @@ def test_endless_parking_is_retried_before_it_is_a_block(home):
     assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself rebuilt"
 
 
+def test_what_is_near_at_the_goal_bars_no_other_way_to_it(home):
+    """Before, the place right before the robot was the goal itself, and for 15 to 120 s no way led there."""
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    settings = NavigatorSettings(blind_distance=1e9, parking_patience=3.0)
+    nav = navigator(eyes, NOWHERE, B, settings)
+    routes: list[WhichWay] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        routes.append(question)
+        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B), step=0.3), "a way"))
+
+    trial = Trial(nav, eyes, fleet, WALL_AHEAD, held=True)
+    trial.run(20.0, lambda: len(routes) == 3)
+    assert routes[-1].blocked == ((A, B),)
+    assert [question.obstacles for question in routes] == [()] * 3
+
+
 def test_blocks_are_kept_for_a_time_that_doubles():
     blocks = Blocks(NavigatorSettings(blocked_first=10.0, blocked_longest=25.0))
     blocks.add(B, A, 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.navigation.obstruction import MARGIN, NO_PROGRESS, obstruction
+from mapweave.agent.navigation.obstruction import MARGIN, NO_PROGRESS, Obstruction, obstruction
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.robots_in_view import RobotBeside
@@ -25,9 +25,11 @@ FIX = Fix(A, PoseGaussian(Pose2(1.0, 2.0, math.pi / 2), 1e-4 * np.eye(3)))
 AHEAD = Pose2(1.0, 0.0)
 
 
-def seen(proximity: np.ndarray, touched: str = "", beside: RobotBeside | None = None):
+def seen(
+    proximity: np.ndarray, touched: str = "", beside: RobotBeside | None = None, to_goal: float = 3.0
+) -> Obstruction:
     observation = Observation(0, Odometry(0.0, 0.0), IMAGE, proximity)
-    return obstruction(BODY, observation, FIX, AHEAD, touched, beside)
+    return obstruction(BODY, observation, FIX, AHEAD, to_goal, touched, beside)
 
 
 def test_a_robot_on_the_straight_way_is_the_obstacle_and_one_beside_it_is_only_named() -> None:
@@ -47,6 +49,13 @@ def test_what_is_near_is_right_before_the_robot_and_leaves_the_robot_outside() -
     assert obstacle.reach < math.dist((obstacle.x, obstacle.y), (1.0, 2.0))
     assert seen(FREE, touched="a box").obstacle == obstacle
     assert seen(FREE) == (NO_PROGRESS, None)
+
+
+def test_within_its_own_length_of_the_goal_only_another_robot_is_an_obstacle() -> None:
+    words, obstacle = seen(WALL_AHEAD, to_goal=2.0 * BODY.radius)
+    assert obstacle is None and "0.06 m off" in words
+    beside = RobotBeside(0.1, "r7", 0.5, 0.1, 0.2)
+    assert seen(WALL_AHEAD, "", beside, 2.0 * BODY.radius).obstacle is not None
 
 
 def test_the_own_map_leads_around_a_place_whichever_edges_pass_it() -> None:
