@@ -9,10 +9,10 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from mapweave.agent.drive_geometry import check_mount
+from mapweave.agent.drive_geometry import FARTHEST, check_mount
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.errors import SettingsError
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.vision.lens import Distortion, LensModel, lens_of
 
 REMOTE = "remote"
@@ -95,6 +95,12 @@ class Geometry:
     max_turn: Positive | None = None
     ranger_bearings_deg: tuple[float, ...] | None = None
     ranger_reach: Positive | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what no robot can be."""
+        for name, value in (("radius", self.radius), ("axle", self.axle)):
+            if value is not None and value > FARTHEST:
+                raise InvalidValue(f"geometry: {name} is {value:g}; it is in metres, at most {FARTHEST:g}")
 
     def over(self, defaults: Geometry) -> Geometry:
         """These values where given, the defaults elsewhere."""

@@ -53,9 +53,10 @@ def test_what_has_no_default_is_printed_as_a_comment() -> None:
     text = text.replace("ranger_bearings_deg =", "ranger_bearings_deg = [1]")
     text = text.replace("wheel_noise =", "wheel_noise = 0.1")
     text = text.replace("height_m =", "height_m = 0.2")
+    text = re.sub(r"^(radius|axle) =", r"\1 = 0.3", text, flags=re.MULTILINE)
     text = re.sub(r"= *$", "= 64", text, flags=re.MULTILINE)
     settings = build(Settings, tomllib.loads(text), "filled in")
-    assert settings.robot.camera is not None and settings.robot.geometry.axle == 64.0
+    assert settings.robot.camera is not None and settings.robot.geometry.axle == 0.3
 
 
 def test_each_has_a_text_and_the_page_counts_them() -> None:

@@ -206,6 +206,7 @@ def test_settings_go_over_what_the_driver_knows() -> None:
             "height_m = 300\n",
             "height_m is 300; it is in metres, from 0 to 10",
         ),
+        ("[robot.geometry]\naxle = 150", "robot.toml: geometry: axle is 150; it is in metres, at most 10"),
         ('[robot]\ndrivr = "koala"', "'drivr'; did you mean 'driver'"),
     ],
 )
