@@ -272,7 +272,7 @@ def all_refuted(
         [_seen_through_shares(some, [some_links], placed, fixed, nodes) for some_links, some in own.items()]
     )
     return all(
-        _more(
+        more_than_usual(
             _seen_through_shares(
                 some_links, sorted(own.keys() - {k.a for k in some_links}), placed, fixed, nodes
             ),
@@ -300,7 +300,7 @@ def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
     return len(agree) >= LEAST_NODES and sum(agree) >= AGREEING * len(agree)
 
 
-def _more(shares: Array, usual: Array) -> bool:
+def more_than_usual(shares: Array, usual: Array) -> bool:
     """Whether more nodes than by chance are seen through more than usual."""
     from scipy.special import bdtrc
 
