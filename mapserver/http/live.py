@@ -49,7 +49,8 @@ MOST_VIEWERS = 64
 """More are refused."""
 LONGEST_HOLD = 10.0
 """s for which the map of before is shown at most once the server is there, while it merges its own."""
-HELD = "loading; the map is that of before"
+LOADING = "loading"
+HELD = f"{LOADING}; the map is that of before"
 """What is said of the fleet meanwhile."""
 SERVER_FIELDS = ("summary", "settled", "event", "loading")
 """Of the server's status, which are sent along."""
@@ -188,11 +189,8 @@ class Live:
         """Take over what is new; returns whether the links' probabilities are due."""
         status = self._server.status()
         if self._holds(status):
-            content = {
-                "kind": "state",
-                "server": {"summary": HELD, "loading": True},
-                **json_values(FleetStatus()),
-            }
+            summary = HELD if self._before else LOADING
+            content = {"kind": "state", "server": {"summary": summary, "loading": True}, "robots": []}
             self._state = json_bytes(content).decode()
             return False
         merged, floors = self._server.merged(), self._server.annotations().floors
@@ -210,9 +208,9 @@ class Live:
         return merged is not self._rated and time.monotonic() >= self._rest_until
 
     def _holds(self, status: Mapping[str, Scalar]) -> bool:
-        """Whether the map of before is shown still: maps that are not merged yet lie apart."""
+        """Whether the map of before is shown still, or none: maps that are not merged yet lie apart."""
         if status.get("loading"):
-            return bool(self._before)
+            return True
         self._hold_until = min(self._hold_until, time.monotonic() + LONGEST_HOLD)
         if status.get("settled") or time.monotonic() >= self._hold_until:
             self._before = ""
@@ -220,9 +218,9 @@ class Live:
 
     def message(self) -> str:
         """The message with the newest merged map, whole; empty if it is not shown yet. From any thread."""
-        merged = self._server.merged()
-        if self._before or not merged.maps:
+        if self._before or self._server.status().get("loading") or not self._server.merged().maps:
             return ""
+        merged = self._server.merged()
         with self._turn:
             self._map.show(merged, self._probabilities, self._server.annotations().floors)
             return self._map.message(0)

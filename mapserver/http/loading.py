@@ -7,13 +7,11 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import Busy, InvalidFile
 from mapweave.hybridmap.floor_plan import PlacedPlans
-from mapweave.hybridmap.map_event import MapEvent
 from mapweave.mapserver.http.answering import Answering
-from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.mapserver.http.live import LOADING
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.wire.log_messages import Scalar
 
@@ -28,7 +26,11 @@ AGAIN = 1.0
 
 
 class LoadingServer:
-    """A map server that is not there yet; once it is, this passes everything on to it."""
+    """A map server that is not there yet; once it is, this passes everything on to it.
+
+    Until then it says that it loads, and has what the page asks for by itself. All else is refused: who stops
+    every robot must not be told that there is none.
+    """
 
     def __init__(self) -> None:
         """Begin without a server."""
@@ -43,10 +45,6 @@ class LoadingServer:
         """Whether nothing can be changed, as with a map file."""
         return self._server is not None and self._server.read_only
 
-    def merged(self) -> MergedMap:
-        """The newest merged map."""
-        return MergedMap.empty() if self._server is None else self._server.merged()
-
     def annotations(self) -> Annotations:
         """What people say about the map."""
         return Annotations() if self._server is None else self._server.annotations()
@@ -55,18 +53,10 @@ class LoadingServer:
         """Floor plans."""
         return PlacedPlans() if self._server is None else self._server.plans()
 
-    def robots(self) -> FleetStatus:
-        """The robots."""
-        return FleetStatus() if self._server is None else self._server.robots()
-
-    def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps."""
-        return () if self._server is None else self._server.history()
-
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does; `loading` until it is there."""
         if self._server is None:
-            return {"summary": "loading", "loading": True, "settled": False}
+            return {"summary": LOADING, "loading": True, "settled": False}
         return self._server.status()
 
     def __getattr__(self, name: str) -> Any:
