@@ -28,8 +28,8 @@ AGAIN = 1.0
 class LoadingServer:
     """A map server that is not there yet; once it is, this passes everything on to it.
 
-    Until then it says that it loads, and has what the page asks for by itself. All else is refused: to who stops
-    every robot, an answer without robots would mean that all stand.
+    Until then it says that it loads, and has what the page asks for by itself. All else is refused: after a
+    stop of every robot an answer without robots would mean that all stand.
     """
 
     def __init__(self) -> None:
