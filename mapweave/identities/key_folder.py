@@ -171,9 +171,7 @@ class KeyFolder:
         try:
             with locked(path):
                 if (path / CATALOGUE).exists():
-                    raise InvalidFile(
-                        f"{path}: there are keys already; add to them with `mapweave keys add`"
-                    )
+                    raise InvalidFile(f"{path}: there are keys already; add to them with `mapweave keys add`")
                 path.chmod(0o700)
                 cls._make(path, catalogue, server)
         except BaseException:
