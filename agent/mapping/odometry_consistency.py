@@ -17,8 +17,8 @@ APART = (0.15, 0.15)
 """How far filter and wheels may be apart after any way, m and rad,"""
 SHARE = 0.1
 """and besides as a share of the way and of the turns: no wheel is quite round."""
-LASTING = 3
-"""Images in a row that must contradict the wheels."""
+LASTING = 5
+"""Images in a row that must contradict the wheels: half a second. A car that nods over a bump took three."""
 
 
 class OdometryConsistency:
