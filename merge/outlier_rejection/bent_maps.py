@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
@@ -31,16 +32,25 @@ def is_bent(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> bool:
         placed: piece of map.
         fixed: piece of map.
     """
+    return bool((nearly_there(links, placed, fixed).mean(axis=1) >= AGREEING).any())
+
+
+def nearly_there(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> NDArray[np.bool_]:
+    """(N, N) whether the placement by link j has the node of link k nearly where link k has it.
+
+    Args:
+        links: from `placed` to `fixed`, at least one.
+        placed: piece of map.
+        fixed: piece of map.
+    """
     own = compose_poses(
         fixed.graph.means[fixed.graph.index([link.b for link in links])],
         inverse_poses(np.stack([link.a_from_b.mean.vector for link in links])),
     )
     inside = placed.graph.means[placed.graph.index([link.a for link in links])]
     placements = compose_poses(own, inverse_poses(inside))
-    for placement in placements:
+    near = np.zeros((len(links), len(links)), np.bool_)
+    for k, placement in enumerate(placements):
         off = compose_poses(inverse_poses(own), compose_poses(placement[None], inside))
-        near = np.hypot(off[:, 0], off[:, 1]) < BENT_XY
-        near &= np.abs(off[:, 2]) < BENT_HEADING
-        if near.mean() >= AGREEING:
-            return True
-    return False
+        near[k] = (np.hypot(off[:, 0], off[:, 1]) < BENT_XY) & (np.abs(off[:, 2]) < BENT_HEADING)
+    return near

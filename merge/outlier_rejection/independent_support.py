@@ -39,7 +39,7 @@ class Support:
 
     Attributes:
         crowds: of the set.
-        others: of all other links between the two.
+        others: of all other links between the two that place them elsewhere.
         coincidence: how probable it is that two false links agree as well as the set's do.
     """
 
@@ -192,8 +192,12 @@ def support_of(
     agree: NDArray[np.bool_],
     neighbouring: NDArray[np.bool_],
     chance: Array,
+    nearly: NDArray[np.bool_],
 ) -> Support:
     """The support of some of the links. Those without distinct landmarks do not count.
+
+    Links outside the set that place the two maps nearly as it does are no false places: they show the same
+    places, and the geometry of one map is wrong. No place that only looks like another is so near to it.
 
     Args:
         some: which.
@@ -201,8 +205,9 @@ def support_of(
         agree: (N, N) symmetric.
         neighbouring: (N, N), see `neighbours`.
         chance: (N, N), see `chances`.
+        nearly: (N, N), see mapweave.merge.outlier_rejection.bent_maps.nearly_there.
     """
-    outside = np.setdiff1d(np.flatnonzero(telling), some)
+    outside = np.setdiff1d(np.flatnonzero(telling & ~nearly[some].any(axis=0)), some)
     some = [k for k in some if telling[k]]
     inside = np.ix_(some, some)
     apart = np.triu(~neighbouring[inside], 1)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array
+from mapweave.merge.outlier_rejection.bent_maps import nearly_there
 from mapweave.merge.outlier_rejection.independent_support import (
     NOTHING,
     ChanceSupport,
@@ -173,8 +174,9 @@ def sort_links(
     sets = tuple(kept), tuple(links[k] for k in rival)
     chance = chances(distances2, spreads, first, second)
     telling = np.array([link.telling for link in links])
+    nearly = nearly_there(links, first, second)
     best_support, rival_support = (
-        support_of(some, telling, agree, neighbouring, chance) for some in (best, rival)
+        support_of(some, telling, agree, neighbouring, chance, nearly) for some in (best, rival)
     )
     rivals: tuple[tuple[Link, ...], ...] = ()
     # In number and in places: a single place may bring many links however false they are.

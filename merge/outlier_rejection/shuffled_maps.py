@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.node import NodeId
-from mapweave.merge.outlier_rejection.bent_maps import BENT_HEADING, BENT_XY
+from mapweave.merge.outlier_rejection.bent_maps import nearly_there
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
-from mapweave.registration.pose_arrays import compose_poses, inverse_poses
 
 LEAST_PLACED = 4
 """Nodes of a map whose place two links or more tell."""
@@ -43,14 +42,6 @@ def in_company(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> NDAr
     best = [max(some, key=lambda link: link.weight) for some in own.values() if len(some) > 1]
     if not best:
         return np.zeros(0, np.bool_)
-    there = compose_poses(
-        fixed.graph.means[fixed.graph.index([link.b for link in best])],
-        inverse_poses(np.stack([link.a_from_b.mean.vector for link in best])),
-    )
-    inside = placed.graph.means[placed.graph.index([link.a for link in best])]
-    agree = np.zeros((len(best), len(best)), np.bool_)
-    for k, placement in enumerate(compose_poses(there, inverse_poses(inside))):
-        off = compose_poses(inverse_poses(there), compose_poses(placement[None], inside))
-        agree[k] = (np.hypot(off[:, 0], off[:, 1]) < BENT_XY) & (np.abs(off[:, 2]) < BENT_HEADING)
+    agree = nearly_there(best, placed, fixed)
     np.fill_diagonal(agree, False)
     return np.asarray((agree | agree.T).any(axis=1))

@@ -13,6 +13,8 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.bent_maps import is_bent
+from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
+from mapweave.merge.outlier_rejection.pairwise_consistency import sort_links
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
@@ -63,3 +65,16 @@ def test_a_bent_map_is_at_one_place_and_a_second_room_is_at_another(
     steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
     placed = piece("b", [Pose2(scale * s.x, scale * s.y, s.heading) for s in steps])
     assert is_bent(links(rng, shift), placed, piece("a", steps)) is bent
+
+
+@pytest.mark.parametrize(("scale", "shift", "false"), [(1.2, Pose2(), 0), (1.0, Pose2(4.0), 1)])
+def test_what_contradicts_a_bent_map_is_no_evidence_of_false_places(
+    scale: float, shift: Pose2, false: int
+) -> None:
+    """Else one robot with a wrong way parts the maps of all others."""
+    steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
+    placed = piece("b", [Pose2(scale * s.x, scale * s.y, s.heading) for s in steps])
+    given = [link.turned() for link in links(np.random.default_rng(1), shift)]
+    found = sort_links(given, piece("a", steps), placed)
+    assert len(found.refused) >= 10, "they contradict each other"
+    assert (ChanceSupport.of([found.supports[0]]).count > 0.5) is bool(false)

@@ -45,13 +45,18 @@ def test_neighbours_at_both_ends_count_as_one_place() -> None:
     near = neighbours(links, a, b, 2.0)
     assert crowds(np.ones((5, 5), bool), near).tolist() == [3, 3, 3, 1, 1]
     assert crowds(np.eye(5, dtype=bool), near).tolist() == [1] * 5
-    support = support_of([0, 1, 2, 4], np.ones(5, bool), np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
+    every, chance, nearly = np.ones((5, 5), bool), np.full((5, 5), 0.01), np.eye(5, dtype=bool)
+    support = support_of([0, 1, 2, 4], np.ones(5, bool), every, near, chance, nearly)
     assert support.places == pytest.approx(2.0) and support.coincidence == pytest.approx(0.01)
     assert support.others.tolist() == [1]
     # Landmarks that occur at other places too do not count, on either side.
     telling = np.array([True, True, True, False, False])
-    support = support_of([0, 1, 2, 4], telling, np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
+    support = support_of([0, 1, 2, 4], telling, every, near, chance, nearly)
     assert support.places == pytest.approx(1.0) and support.others.tolist() == []
+    # What places the two maps nearly as the set does is no false place.
+    nearly[4, 3] = True
+    support = support_of([0, 1, 2, 4], np.ones(5, bool), every, near, chance, nearly)
+    assert support.places == pytest.approx(2.0) and support.others.tolist() == []
 
 
 def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
