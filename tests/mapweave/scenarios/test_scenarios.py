@@ -8,13 +8,19 @@ from mapweave.scenarios.run import TrialOptions, run_trial
 from mapweave.scenarios.scenario import load_scenario, scenario_names, scenario_path
 
 SEED = 77
-UNMET = {"one-liar": "four of fifteen lies are not contained: SECURITY.md says which"}
-"""Scenarios whose expectations are known not to be met, and why."""
+LONG = {"one-liar": 3000}
+"""Seconds that some may take: each lie is merged, and once more after a restart."""
 
 
 @pytest.mark.scenario
-@pytest.mark.timeout(500)
-@pytest.mark.parametrize("name", [name for name in scenario_names() if name not in ("demo", *UNMET)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.timeout(LONG.get(name, 500)))
+        for name in scenario_names()
+        if name != "demo"
+    ],
+)
 def test_scenario(name, tmp_path):
     options = TrialOptions(seed=SEED, out=tmp_path / "out", quiet=True)
     trial = run_trial(load_scenario(scenario_path(name)), options)
