@@ -107,12 +107,14 @@ def distinctness(landmarks: Landmarks, alike: float) -> Array:
 
 def _ranked(places: Array, value: Array, crowd: float, most: int) -> NDArray[np.int64]:
     """The first indices in greedy order of worth, given those before."""
+    x, y = places.T
+    away = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
+    crowding = np.exp(away / (-2 * crowd**2))
     crowded, left = np.ones(len(places)), np.array(value, np.float64)
     order = np.empty(most, np.int64)
     for k in range(most):
         order[k] = best = int((left / crowded).argmax())
-        away = ((places - places[best]) ** 2).sum(axis=1)
-        crowded += np.exp(-away / (2 * crowd**2))
+        crowded += crowding[best]
         left[best] = -1.0
     return order
 

@@ -179,6 +179,7 @@ class Explorer:
     @property
     def _views(self) -> Array:
         """(N, 4) of own and of others' nodes; see `views_of`."""
+        self._mapper.finish_pending()
         return np.concatenate([views_of(self._mapper.map), self._fleet_coverage.views])
 
     def _ask(self) -> None:

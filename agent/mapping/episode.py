@@ -18,12 +18,11 @@ class EpisodeRequest(Enum):
     ADD_VIEW = auto()
     """Keep the current image as a further node, for example at the far end of a drive."""
     FINISH = auto()
-    """End the episode: its views become nodes, and the current image becomes the next anchor. This ends the
-    tick."""
+    """End the episode: the image becomes the next anchor, its views become nodes in the next ticks."""
 
 
 Move = Command | EpisodeRequest
-"""What a behaviour does next. A command ends its tick, and so does `FINISH`."""
+"""What a behaviour does next. A command ends its tick."""
 
 
 class Episode(Protocol):
@@ -32,6 +31,9 @@ class Episode(Protocol):
     @property
     def map(self) -> HybridMap:
         """What was mapped so far."""
+
+    def finish_pending(self) -> None:
+        """Put into the map what is left of the last episode."""
 
     @property
     def typical_depth(self) -> float:

@@ -127,38 +127,56 @@ class KeyframeBuilder:
         return images
 
     def place(
-        self, anchor: View, leaves: list[View], estimate: EpisodeEstimate, trajectory: TrajectoryRecorder
-    ) -> Node | None:
-        """Make a node of an episode's anchor, and edges to the episode before.
+        self,
+        anchor: View,
+        leaves: list[View],
+        estimate: EpisodeEstimate,
+        trajectory: TrajectoryRecorder,
+        moved: PoseGaussian,
+    ) -> Landmarks | None:
+        """Begin the next episode elsewhere; the last one's anchor becomes a node, with edges to those before.
 
-        Nodes of its further views, and loop closures, are left for `continue_pending`.
+        The node, those of further views and loop closures are left for `continue_pending`.
 
         Args:
             anchor: the view where the episode began.
             leaves: further views of the episode.
             estimate: what it is known by.
             trajectory: trajectory since the last node; it goes with the anchor, if that becomes a node.
+            moved: `old_anchor_from_new`, by the filter.
 
         Returns:
-            The anchor's node; None, and nothing is changed, if the anchor shows too little.
+            The landmarks of the anchor's node; None if it shows too little and becomes no node.
         """
         self.finish_pending()
-        placed = self._node(anchor, estimate, self.map_from_anchor, trajectory)
-        if placed is None:
+        here, (landmarks, tracks) = self.map_from_anchor, self._landmarks(anchor, estimate)
+        if len(landmarks) < LEAST_LANDMARKS:
+            self.move_anchor(moved)
             return None
-        self.join(placed)
-        for leaf in reversed(leaves):
-            self._pending.appendleft(
-                partial(self._place_beside, placed, leaf, estimate, self.map_from_anchor)
-            )
-        return placed.node
+        ranges = self._description.ranges(anchor.proximity)
+        segment = trajectory.segment(anchor.stamp_ns, ranges)
+
+        def make() -> None:
+            self.map_from_anchor = here
+            placed = AnchoredKeyframe(self._node(anchor, landmarks, here, segment), tracks)
+            self.join(placed)
+            for leaf in reversed(leaves):
+                self._pending.appendleft(
+                    partial(self._place_beside, placed, leaf, estimate, self.map_from_anchor)
+                )
+            self.move_anchor(moved)
+
+        self._pending.append(make)
+        self.map_from_anchor = here @ self._sober(moved)
+        return landmarks
 
     def _place_beside(
         self, placed: AnchoredKeyframe, leaf: View, estimate: EpisodeEstimate, map_from_anchor: PoseGaussian
     ) -> None:
         """Make a node of a further view of an episode whose anchor has become a node."""
-        beside = self._node(leaf, estimate, map_from_anchor)
-        if beside is not None:
+        landmarks, tracks = self._landmarks(leaf, estimate)
+        if len(landmarks) >= LEAST_LANDMARKS:
+            beside = AnchoredKeyframe(self._node(leaf, landmarks, map_from_anchor), tracks)
             self._write(beside.node, self._edge(placed, beside, self._sober(leaf.anchor_from_view)))
 
     def join(self, placed: AnchoredKeyframe) -> None:
@@ -266,23 +284,18 @@ class KeyframeBuilder:
     def _node(
         self,
         view: View,
-        estimate: EpisodeEstimate,
+        landmarks: Landmarks,
         map_from_anchor: PoseGaussian,
-        trajectory: TrajectoryRecorder | None = None,
-    ) -> AnchoredKeyframe | None:
-        landmarks, tracks = self._landmarks(view, estimate)
-        if len(landmarks) < LEAST_LANDMARKS:
-            return None
-        pose = map_from_anchor @ view.anchor_from_view
-        d = self._description
-        ranges = d.ranges(view.proximity)
-        segment = TrajectorySegment() if trajectory is None else trajectory.segment(view.stamp_ns, ranges)
+        segment: TrajectorySegment | None = None,
+    ) -> Node:
+        pose, d = map_from_anchor @ view.anchor_from_view, self._description
         node = Node(
-            self.new_id(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius, ranges, segment
-        )
+            self.new_id(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius,
+            d.ranges(view.proximity), segment or TrajectorySegment(),
+        )  # fmt: skip
         if view.image is not None:
             self._images.append((node.id, view.image))
-        return AnchoredKeyframe(node, tracks)
+        return node
 
     def _landmarks(self, view: View, estimate: EpisodeEstimate) -> tuple[Landmarks, NDArray[np.int64]]:
         """The view's features with depth in the view: by the filter, else triangulated; and their tracks."""

@@ -200,7 +200,7 @@ class Mapper:
             self._keyframes.retire(node)
 
     def finish_pending(self) -> None:
-        """Make what is left of the last episode: nodes of its further views, and loop closures.
+        """Make what is left of the last episode: its nodes and loop closures.
 
         The ticks that follow do it else, piece by piece.
         """
@@ -298,28 +298,25 @@ class Mapper:
         self._extracting = self._extract(observation.image, observation.left_out), take
 
     def finish(self, observation: Observation) -> bool:
-        """End the episode: its anchor becomes a node, and the current image the next anchor.
-
-        Its further views become nodes in the ticks that follow.
+        """End the episode: its views become nodes in the ticks after, the current image the next anchor.
 
         Returns:
-            Whether the anchor view became a node. False without an image.
+            Whether the anchor view becomes a node. False without an image.
         """
         self._use_extracted()
         if observation.image is None or self._anchor is None:
             return False
         features = self._extract(observation.image, observation.left_out)
         self._tracking.remember(force=True)
-        node = self._keyframes.place(self._anchor, self._leaves, self._tracking.estimate, self._trajectory)
-        if node is not None:
-            self.typical_depth = float(np.median(node.landmarks.depths))
-        anchor = self._tracking.take(observation, features.result(), HERE)
+        estimate = self._tracking.estimate
         moved = self._tracking.reanchor()
-        self._keyframes.move_anchor(moved)
-        if node is not None:
-            self._trajectory.clear(anchor.stamp_ns)
-        else:
+        landmarks = self._keyframes.place(self._anchor, self._leaves, estimate, self._trajectory, moved)
+        anchor = self._tracking.take(observation, features.result(), HERE)
+        if landmarks is None:
             self._trajectory.move_anchor(moved.mean)
+        else:
+            self.typical_depth = float(np.median(landmarks.depths))
+            self._trajectory.clear(anchor.stamp_ns)
         self._anchor, self._leaves = anchor, []
         if self._take_up_pending():
             # Tracks and features of another lens are of no use to a filter of this one.
@@ -328,7 +325,7 @@ class Mapper:
             self.begin(observation)
         else:
             self._tracking.follow(anchor, self.typical_depth)
-        return node is not None
+        return landmarks is not None
 
     def _extract(self, image: NDArray[np.uint8], left_out: Array) -> Future[Features]:
         """Have the features of an image extracted, without those of some regions."""

@@ -78,6 +78,7 @@ class PhotoWalls:
                 mapper.begin(observation)
             before = Pose2(x)
         mapper.finish(observation)
+        mapper.finish_pending()
         (node,) = mapper.map.nodes.values()
         return node
 

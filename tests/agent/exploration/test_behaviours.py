@@ -47,6 +47,9 @@ class View:
     def map_from_robot(self) -> PoseGaussian:
         return PoseGaussian(self.pose, np.zeros((3, 3)))
 
+    def finish_pending(self) -> None:
+        """It makes no nodes."""
+
     @property
     def map(self) -> HybridMap:
         return HybridMap()

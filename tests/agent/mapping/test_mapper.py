@@ -34,6 +34,7 @@ def test_depths_of_a_node_are_those_of_the_walls(walls, description):
     last = drive(mapper, walls, [*there, *there[::-1]])
     assert mapper.take_changes() == ()
     assert mapper.finish(last)
+    mapper.finish_pending()
     (node,) = mapper.map.nodes.values()
     assert mapper.take_changes() == (NodePut(node),)
     assert mapper.take_changes() == (), "each change leaves once"
@@ -49,8 +50,10 @@ def test_an_edge_is_the_drive_between_two_views(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
     first = drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025)))
     mapper.finish(first)
+    mapper.finish_pending()
     second = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
     mapper.finish(second)
+    mapper.finish_pending()
     (edge,) = mapper.map.edges.values()
     a, b = mapper.map.nodes[edge.a], mapper.map.nodes[edge.b]
     assert abs(edge.a_from_b.mean.x - 0.5) < 0.01
@@ -71,6 +74,8 @@ def test_what_is_left_of_an_episode_is_made_at_the_end_of_the_process(walls, des
     mapper.leaf(last)
     last = drive(mapper, walls, there[::-1], start=50)
     assert mapper.finish(last)
+    assert mapper.take_changes() == (), "no tick does all of it"
+    mapper.step(replace(last, odometry=Odometry(0.0, 0.0)))
     (node,) = mapper.map.nodes.values()
     assert mapper.take_changes() == (NodePut(node),)
     mapper.finish_pending()
@@ -91,9 +96,11 @@ def test_a_camera_found_further_ahead_moves_the_robot_and_no_landmark(walls, des
     known = replace(description, camera=replace(description.camera, mount_forward=mounted))
     mapper.recalibrate(known, Lens(known.camera, known.distortion), Pose2(-forward))
     mapper.finish(first)
+    mapper.finish_pending()
     assert mapper.map_from_robot.mean.x == pytest.approx(0.5 - forward, abs=0.01)
     second = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
     mapper.finish(second)
+    mapper.finish_pending()
     a, b = mapper.map.nodes.values()
     assert b.map_from_robot.mean.distance(Pose2(0.5 - forward)) < 0.015
     (edge,) = mapper.map.edges.values()
@@ -124,6 +131,7 @@ def test_standing_still_gives_no_depth(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
     last = drive(mapper, walls, [0.0] * 30)
     mapper.finish(last)
+    mapper.finish_pending()
     assert not mapper.map.nodes
 
 
@@ -160,5 +168,6 @@ def test_a_camera_that_turned_away_from_all_landmarks_has_not_failed(walls, desc
         collected.append(mapper.health)
     assert "landmark" in collected[-1], "it has turned away from what it mapped"
     mapper.finish(seen)
+    mapper.finish_pending()
     mapper.step(walls.observe(pose, pose, tick + 1))
     assert mapper.anchor_features > 0 and mapper.health == ""

@@ -97,6 +97,7 @@ def test_a_mapped_drive_records_the_trajectory(walls, clocked):
             mapper.begin(observation)
         before = Pose2(x)
     mapper.finish(observation)
+    mapper.finish_pending()
     (node,) = mapper.map.nodes.values()
     ticks = np.rint((node.segment.ages * 1e9 + node.stamp_ns) / 1e8).astype(int)
     assert len(ticks) == 3 and (np.diff(ticks) == 10).all()
@@ -106,4 +107,5 @@ def test_a_mapped_drive_records_the_trajectory(walls, clocked):
     assert node.segment.distances[:, 0] == pytest.approx(true + clocked.radius)
     # The next node begins with none of it.
     mapper.finish(replace(observation, stamp_ns=observation.stamp_ns + 1))
+    mapper.finish_pending()
     assert sum(len(one.segment) for one in mapper.map.nodes.values()) == 3
