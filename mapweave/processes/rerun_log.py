@@ -128,6 +128,7 @@ class RerunLog:
         recording.set_log_tick_enabled(False)
         recording.set_log_time_enabled(False)
         self._pipeline: Pipeline | None = None
+        self._stamp_ns = 0
         self._ticks = 0
         self._changed = True
         self._waiting: queue.Queue[Moment | None] = queue.Queue(QUEUED)
@@ -146,7 +147,7 @@ class RerunLog:
             pipeline: after the tick.
         """
         self._changed |= bool(step.changes) or pipeline is not self._pipeline
-        self._pipeline = pipeline
+        self._pipeline, self._stamp_ns = pipeline, observation.stamp_ns
         if self._waiting.full():
             self.left_out += 1
             return
@@ -176,6 +177,10 @@ class RerunLog:
         with contextlib.suppress(queue.Full):
             self._waiting.put(None, timeout=PATIENCE)
         self._thread.join(PATIENCE)
+        if self._pipeline is not None and not self._thread.is_alive():
+            # Nodes that were made when the robot had stopped.
+            self._recording.set_time("stamp", timestamp=np.datetime64(self._stamp_ns, "ns"))
+            self._write_nodes(*_map_of(self._pipeline))
         missing = f"{self.left_out} ticks, since writing was too slow" if self.left_out else ""
         try:
             self._recording.flush(timeout_sec=PATIENCE)
@@ -241,16 +246,18 @@ class RerunLog:
 
     def _write_map(self, moment: Moment) -> None:
         if moment.map is not None:
-            nodes, edges = moment.map
-            places = {node.id: _raised(node.map_from_robot.mean) for node in nodes}
-            labels = [str(node.id) for node in nodes]
-            self._log(
-                "map/nodes", rr.Points3D(list(places.values()), labels=labels, show_labels=False, radii=0.04)
-            )
-            self._log("map/edges", _edges(places, edges))
-            self._log("map/path", rr.LineStrips3D([self._path], colors=[90, 130, 255]))
+            self._write_nodes(*moment.map)
         if moment.floor is not None:
             self._log("map/floor", _floor(moment.floor))
+
+    def _write_nodes(self, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
+        places = {node.id: _raised(node.map_from_robot.mean) for node in nodes}
+        labels = [str(node.id) for node in nodes]
+        self._log(
+            "map/nodes", rr.Points3D(list(places.values()), labels=labels, show_labels=False, radii=0.04)
+        )
+        self._log("map/edges", _edges(places, edges))
+        self._log("map/path", rr.LineStrips3D([self._path], colors=[90, 130, 255]))
 
     def _write_words(self, moment: Moment) -> None:
         status = moment.status
