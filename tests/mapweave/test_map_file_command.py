@@ -100,7 +100,7 @@ def test_the_summary_of_a_merged_map(merged_file, capfd, tmp_path):
     values = summary(capfd, merged_file, "--out", tmp_path / "other.png", "--component", 1)
     assert values["drawn"] == "component 1, 1 nodes"
     assert (tmp_path / "other.png").read_bytes() != (tmp_path / "pictures" / "m.png").read_bytes()
-    assert main(["map", "show", str(merged_file), "--component", "2"]) == 1
+    assert main(["map", "show", str(merged_file), "--component", "2"]) == 4
     assert "has no component 2; it has 0 to 1" in capfd.readouterr().err
 
 

@@ -33,5 +33,5 @@ def test_the_server_needs_no_cluster(
 
 
 def test_lock_step_and_a_cluster_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["server", "--lockstep", "--ray", "auto"]) == 1
+    assert main(["server", "--lockstep", "--ray", "auto"]) == 2
     assert "--lockstep is repeatable, and a cluster is not" in capsys.readouterr().err
