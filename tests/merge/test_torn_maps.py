@@ -18,6 +18,7 @@ from mapweave.merge.settings import ConsistencySettings
 from mapweave.merge.torn_maps import TornMapSearch
 from mapweave.scenarios.liar.lies import Setting, altered, bodies, chain
 from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet
+from tests.quick import first_quick
 
 SEED = 5
 AWAY, TORN = Pose2(40.0, -10.0, 2.0), Pose2(2.0, -2.0, 1.0)
@@ -57,12 +58,15 @@ def beside_copies(fleet: Fleet, shift: Pose2, excluding: tuple[str, ...]) -> Mer
 
 @pytest.mark.parametrize(
     ("shift", "excluding", "torn"),
-    [
-        (TORN, ("r0", "r1"), True),
-        (Pose2(), ("r0", "r1"), False),
-        (TORN, ("r0",), False),
-        (TORN, (), False),
-    ],
+    first_quick(
+        [
+            (TORN, ("r0", "r1"), True),
+            (Pose2(), ("r0", "r1"), False),
+            (TORN, ("r0",), False),
+            (TORN, (), False),
+        ],
+        2,
+    ),
 )
 def test_two_robots_that_agree_exclude_a_torn_map(
     fleet: Fleet, shift: Pose2, excluding: tuple[str, ...], torn: bool
@@ -76,6 +80,7 @@ def test_two_robots_that_agree_exclude_a_torn_map(
     )
 
 
+@pytest.mark.slow
 def test_what_did_not_change_is_not_tested_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     merged, search = beside_copies(fleet, TORN, ("r0", "r1")), TornMapSearch(ConsistencySettings())
     assert search.torn(merged)
