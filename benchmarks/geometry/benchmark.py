@@ -120,6 +120,7 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
             true.append(pose)
     if len(true) < 2:
         raise InvalidValue("the recording has no truth.csv for its images: there is no error to compute")
+    pipeline.finish()
     nodes += len(pipeline.map.nodes)
     causes = tuple(pipeline.calibration.causes)
     return Result(_error(mapped, true), _error(by_wheels, true), used / count, nodes, maps, causes)

@@ -13,7 +13,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.asking_again import Asked, Trial, trials_of
 from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import LEVELS, SURE, Verdict
-from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.hybridmap.query import Whereabouts
@@ -71,14 +71,15 @@ class DriveMap:
         map_id = MapId("map", 1)
         pipeline = Pipeline(map_id, robot.describe(), settings)
         pipeline.set_mission(Carried())
-        merger, sequence = Merger(), 0
+        merger, bodies, stamp_ns = Merger(), list[ChangeBody](), 0
         for _, observation in zip(ticks, iter(robot.sense, None), strict=False):
             assert observation is not None, "the recording ends the loop"
             if (pose := truth.robot_at(observation.stamp_ns, camera)) is not None:
                 covered.append(pose)
-            for change in pipeline.step(observation, ()).changes:
-                sequence += 1
-                merger.on_change(Change(map_id, sequence, observation.stamp_ns, change))
+            bodies += pipeline.step(observation, ()).changes
+            stamp_ns = observation.stamp_ns
+        for sequence, body in enumerate([*bodies, *pipeline.finish()[0]], start=1):
+            merger.on_change(Change(map_id, sequence, stamp_ns, body))
         merged = merger.merged()
         relocalizer = Relocalizer(merger.places, merger.node, merged)
         return DriveMap(merged.maps[map_id].nodes if merged.maps else {}, relocalizer, covered, truth)

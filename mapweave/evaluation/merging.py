@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import time
 from collections.abc import Iterator, Mapping
@@ -155,16 +156,17 @@ def changes(name: str, robot: Replay, settings: AgentSettings) -> Iterator[list[
     epoch, pipeline = 0, None
     while (observation := robot.sense()) is not None:
         if pipeline is None or pipeline.lost:
-            epoch, sequence = epoch + 1, 0
+            epoch, numbers = epoch + 1, itertools.count(1)
             map_id = MapId(name, epoch)
             calibration = pipeline.calibration if pipeline is not None else None
             pipeline = Pipeline(map_id, robot.describe(), settings, calibration=calibration)
             pipeline.set_mission(Carried())
-        made = []
-        for change in pipeline.step(observation, ()).changes:
-            sequence += 1
-            made.append(Change(map_id, sequence, observation.stamp_ns, change))
-        yield made
+        stamp_ns = observation.stamp_ns
+        yield [
+            Change(map_id, next(numbers), stamp_ns, body) for body in pipeline.step(observation, ()).changes
+        ]
+    if pipeline is not None:
+        yield [Change(map_id, next(numbers), stamp_ns, body) for body in pipeline.finish()[0]]
 
 
 def evaluate_merging(

@@ -187,6 +187,7 @@ def evaluate_replay(
         reason = "" if status.located else status.detail.partition(":")[0] or status.doing
         frames.append(Frame(observation.stamp_ns, len(pipelines) - 1, pose, wheels, reason))
         on_frame(frames[-1])
+    pipelines[-1].finish()
     stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
     maps = [pipeline.map for pipeline in pipelines]
     notes = [str(cause) for cause in pipelines[-1].calibration.causes]
