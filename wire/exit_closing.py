@@ -8,7 +8,8 @@ from mapweave.wire.bus import Closing
 
 THREAD = "close-at-exit"
 _lock = threading.Lock()
-_open: set[Closing] = set()
+_open: dict[Closing, None] = {}
+"""The oldest first."""
 
 
 def remember(closing: Closing) -> None:
@@ -16,12 +17,12 @@ def remember(closing: Closing) -> None:
     with _lock:
         if not any(thread.name == THREAD for thread in threading.enumerate()):
             threading.Thread(target=_close_at_exit, name=THREAD, daemon=False).start()
-        _open.add(closing)
+        _open[closing] = None
 
 
 def forget(closing: Closing) -> None:
     """It was closed."""
-    _open.discard(closing)
+    _open.pop(closing, None)
 
 
 def _close_at_exit() -> None:
@@ -32,5 +33,7 @@ def _close_at_exit() -> None:
     in the middle of closing.
     """
     threading.main_thread().join()
-    for closing in list(_open):
+    # The newest first: clients of a router of this process take back declarations while it still routes.
+    # In another order Zenoh 1.x may panic in a thread of the router, now and then.
+    for closing in reversed(list(_open)):
         closing.close()
