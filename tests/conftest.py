@@ -24,7 +24,7 @@ pytest.register_assert_rewrite(
 )
 
 # The duration of an example means nothing on a busy machine. Other examples are drawn in each run.
-settings.register_profile("patient", deadline=None, max_examples=30)
+settings.register_profile("patient", deadline=None, max_examples=50)
 settings.load_profile("patient")
 cv2.setNumThreads(1)
 

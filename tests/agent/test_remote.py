@@ -176,7 +176,7 @@ MESSAGES: list[tuple[bytes, Callable[[bytes], object]]] = [
 ]
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(st.sampled_from(MESSAGES), st.data())
 def test_damaged_bytes_decode_or_are_refused_but_never_fail_otherwise(
     message: tuple[bytes, Callable[[bytes], object]], data: st.DataObject

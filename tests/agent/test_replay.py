@@ -381,7 +381,7 @@ toml_values = st.one_of(
 )
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.sampled_from(["width", "height", "fx", "cx", "height_m", "forward_m", "distortion"]), toml_values)
 def test_any_camera_file_is_read_or_refused(tmp_path, name, value):
     path = tmp_path / "camera.toml"

@@ -30,7 +30,7 @@ bodies = st.one_of(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(bodies, max_size=25))
 def test_contents_are_a_log_of_the_same_map(log: list[ChangeBody]) -> None:
     first = HybridMap(log)
@@ -44,7 +44,7 @@ def test_contents_are_a_log_of_the_same_map(log: list[ChangeBody]) -> None:
         assert first.graph.has_edge(one.a, one.b, key=key)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(bodies, max_size=20), bodies)
 def test_applying_a_change_twice_changes_nothing_more(log: list[ChangeBody], body: ChangeBody) -> None:
     once, twice = HybridMap([*log, body]), HybridMap([*log, body, body])

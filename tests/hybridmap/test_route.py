@@ -35,7 +35,7 @@ def random_map(seed: int, n: int = 14, m: int = 22) -> HybridMap:
     return HybridMap(changes_of(nodes, edges))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.booleans())
 def test_costs_no_more_than_dijkstra(seed: int, optimised: bool) -> None:
     hybrid_map = random_map(seed)

@@ -66,7 +66,7 @@ lifts = st.tuples(st.sampled_from([(0, 1), (1, 2), (2, 0)]), numbers, numbers).m
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=60)
 @given(
     st.lists(lifts, max_size=5, unique=True), st.lists(st.booleans(), min_size=5, max_size=5),
     st.lists(st.sampled_from([0.5, 1.0, 4.0]), min_size=5, max_size=5), st.data(),

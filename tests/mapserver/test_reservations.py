@@ -228,7 +228,7 @@ robots = st.sampled_from(["r0", "r1", "r2"])
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(robots, st.integers(0, 8), st.integers(0, 3)), max_size=20))
 def test_robots_that_drive_no_further_than_granted_never_meet(
     router: Router, drives: list[tuple[str, int, int]]

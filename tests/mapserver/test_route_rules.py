@@ -81,7 +81,7 @@ steps = st.tuples(st.integers(0, SIZE - 2), st.integers(0, SIZE - 1), st.boolean
 factors = st.sampled_from([0.2, 0.5, 3.0, 10.0])
 
 
-@settings(max_examples=40)
+@settings(max_examples=60)
 @given(
     st.lists(boxes, max_size=2), st.lists(steps, max_size=4),
     st.lists(st.tuples(boxes | steps, factors), max_size=3), st.data(),

@@ -16,7 +16,7 @@ from mapweave.agent.drivers.camera import Frame
 from mapweave.agent.drivers.settings import Geometry
 from mapweave.agent.drivers.settings_writer import camera_table, write_camera
 from mapweave.cli import main
-from mapweave.exit_status import NO
+from mapweave.exit_status import NO, USAGE
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.settings import load_settings
 from mapweave.vision.calibration.target import CalibrationTarget
@@ -209,10 +209,14 @@ def test_the_target_is_written(capfd, tmp_path: Path) -> None:
 def test_mistakes_are_one_line(frames, capfd, tmp_path: Path) -> None:
     blank = folder_of([np.full((240, 320), 99, np.uint8)] * 2, tmp_path / "blank")
     robot = tmp_path / "r0.toml"
-    assert "no view shows the target (charuco 7x10" in complaint(capfd, "calibrate", "camera", blank)
-    assert "give --height" in complaint(capfd, "calibrate", "camera", blank, "--settings", robot)
+    assert "no view shows the target (charuco 7x10" in complaint(
+        capfd, "calibrate", "camera", blank, status=NO
+    )
+    assert "give --height" in complaint(
+        capfd, "calibrate", "camera", blank, "--settings", robot, status=USAGE
+    )
     assert "no such folder or video" in complaint(capfd, "calibrate", "camera", tmp_path / "none")
-    assert "give two numbers" in complaint(capfd, "calibrate", "target", "--squares", "7")
+    assert "give two numbers" in complaint(capfd, "calibrate", "target", "--squares", "7", status=USAGE)
     assert "do not fit on a4" in complaint(capfd, "calibrate", "target", "--square-mm", "60")
     robot.write_text("robot = { camera = { height_m = 0.3 } }\n")
     with pytest.raises(SettingsError, match=r"no table \[robot.camera\]"):

@@ -14,6 +14,7 @@ import pytest
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.cli import main
+from mapweave.exit_status import NO, USAGE
 from synthetic.room_drive import CAMERA, drive, write
 from tests.mapweave.command_line import complaint
 
@@ -95,23 +96,23 @@ def test_a_robot_is_watched_while_it_is_driven(
     assert forward["declared"] == pytest.approx(0.2)
     assert forward["estimated"] == pytest.approx(TRUE.forward, abs=0.06)
     assert read_geometry(tmp_path / "r7.toml")["forward"] == pytest.approx(forward["estimated"], rel=1e-4)
-    assert "too short" in complaint(capfd, "calibrate", "drive", *given[:-1], 3)
+    assert "too short" in complaint(capfd, "calibrate", "drive", *given[:-1], 3, status=NO)
 
 
 @pytest.mark.slow
 def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     command = ["calibrate", "drive", folder, "--calibration", tmp_path]
-    assert "--robot DRIVER" in complaint(capfd, "calibrate", "drive")
-    assert "--name" in complaint(capfd, "calibrate", "drive", "--robot", "koala")
+    assert "--robot DRIVER" in complaint(capfd, "calibrate", "drive", status=USAGE)
+    assert "--name" in complaint(capfd, "calibrate", "drive", "--robot", "koala", status=USAGE)
     assert "nowhere" in complaint(capfd, "calibrate", "drive", tmp_path / "nowhere")
     odometry = (folder / "odometry.csv").read_text()
     lines = [line.split(",") for line in odometry.splitlines()]
     straight = [",".join([*line[:-1], "0" if k else line[-1]]) for k, line in enumerate(lines)]
     (folder / "odometry.csv").write_text("\n".join(straight) + "\n")
-    assert "turns by 0 degrees" in complaint(capfd, *command)
+    assert "turns by 0 degrees" in complaint(capfd, *command, status=NO)
     (folder / "odometry.csv").write_text(odometry)
     (folder / "splits.toml").write_text('[[robot]]\nname = "a"\nfirst = 0\nlast = 40\n')
-    assert "too short" in complaint(capfd, *command, "--robot", "a")
+    assert "too short" in complaint(capfd, *command, "--robot", "a", status=NO)
     assert not list(tmp_path.glob("*.toml"))
 
 

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from mapweave.cli import main
-from mapweave.exit_status import NO
+from mapweave.exit_status import FAILED, NO, USAGE
 from tests.mapweave.command_line import commands, complaint
 
 pytestmark = pytest.mark.usefixtures("signals", "simulator")
@@ -44,13 +44,19 @@ def test_a_wrong_use_shows_how_to_use_it(arguments, capfd):
 
 @pytest.mark.parametrize("name", ["R0", "a b", "", "r0/1", "*", "ä", "x" * 33, "-x"])
 def test_names_that_cannot_be_in_a_key(name, capfd, recording, closed, tmp_path):
-    output = complaint(capfd, "agent", "--", name)
+    output = complaint(capfd, "agent", "--", name, status=USAGE)
     assert "use 1 to 32 of a-z" in output
     if name:
-        assert "use 1 to 32 of a-z" in complaint(capfd, "agent", "r0", "--connect", closed, f"--fleet={name}")
-        assert "use 1 to 32 of a-z" in complaint(capfd, "replay", recording, "--offline", f"--name={name}")
+        assert "use 1 to 32 of a-z" in complaint(
+            capfd, "agent", "r0", "--connect", closed, f"--fleet={name}", status=USAGE
+        )
+        assert "use 1 to 32 of a-z" in complaint(
+            capfd, "replay", recording, "--offline", f"--name={name}", status=USAGE
+        )
         data = tmp_path / "data"
-        output = complaint(capfd, "server", "--listen", closed, f"--name={name}", "--data", data)
+        output = complaint(
+            capfd, "server", "--listen", closed, f"--name={name}", "--data", data, status=USAGE
+        )
         assert "use 1 to 32 of a-z" in output
         assert not data.exists(), "nothing is left behind"
 
@@ -60,7 +66,7 @@ def test_names_that_cannot_be_in_a_key(name, capfd, recording, closed, tmp_path)
     ["--robots=1", "--rooms=99", "--seed=-1"],
 )
 def test_demos_out_of_range(arguments, capfd, tmp_path):
-    output = complaint(capfd, "demo", arguments, "--out", tmp_path)
+    output = complaint(capfd, "demo", arguments, "--out", tmp_path, status=USAGE)
     assert arguments.replace("=", " ") in output
 
 
@@ -79,7 +85,8 @@ def test_demos_out_of_range(arguments, capfd, tmp_path):
 )
 def test_scenarios_that_cannot_be_run(arguments, words, capfd, closed, tmp_path):
     for what in (["run", "--out", tmp_path / "out"], ["serve", "--connect", closed]):
-        assert words in complaint(capfd, "sim", what[0], *arguments, *what[1:])
+        status = FAILED if words.endswith("no such file") else USAGE
+        assert words in complaint(capfd, "sim", what[0], *arguments, *what[1:], status=status)
     assert not (tmp_path / "out" / "agents").exists()
 
 
@@ -97,8 +104,8 @@ def test_a_batch_names_its_failures(capfd, tmp_path):
     assert main([str(a) for a in [*arguments, "--json"]]) == NO
     values = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
     assert values == json.loads((tmp_path / "out" / "batch.json").read_text())
-    assert "seeds" in complaint(capfd, "sim", "batch", path, "--seeds", 0)
-    assert "--first -1: use 0 or more" in complaint(capfd, "sim", "batch", path, "--first", -1)
+    assert "seeds" in complaint(capfd, "sim", "batch", path, "--seeds", 0, status=USAGE)
+    assert "--first -1: use 0 or more" in complaint(capfd, "sim", "batch", path, "--first", -1, status=USAGE)
 
 
 def test_a_trial_prints_one_json_object(capfd, tmp_path):
@@ -128,7 +135,9 @@ def test_a_trial_prints_one_json_object(capfd, tmp_path):
 
 def test_a_live_view_at_no_port_starts_no_fleet(capfd, tmp_path):
     for port in (-1, 65536):
-        output = complaint(capfd, "sim", "run", "office", f"--view={port}", "--out", tmp_path / "out")
+        output = complaint(
+            capfd, "sim", "run", "office", f"--view={port}", "--out", tmp_path / "out", status=USAGE
+        )
         assert f"--view {port}: a port is 0 to 65535" in output
     assert not (tmp_path / "out").exists()
 
@@ -136,7 +145,9 @@ def test_a_live_view_at_no_port_starts_no_fleet(capfd, tmp_path):
 def test_an_epoch_out_of_range(capfd, recording, tmp_path, closed):
     for epoch in (-1, 2**60):
         data = tmp_path / f"agent{epoch}"
-        output = complaint(capfd, "agent", "r0", "--connect", closed, "--data", data, f"--epoch={epoch}")
+        output = complaint(
+            capfd, "agent", "r0", "--connect", closed, "--data", data, f"--epoch={epoch}", status=USAGE
+        )
         assert "epoch" in output and not data.exists(), "before any body is waited for"
         data = tmp_path / str(epoch)
         output = complaint(capfd, "replay", recording, "--offline", "--data", data, f"--epoch={epoch}")

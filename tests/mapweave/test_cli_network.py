@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
+from mapweave.exit_status import USAGE
 from tests.mapweave.command_line import complaint
 from tests.simulator import needs_simulator
 from tests.waiting import eventually
@@ -30,8 +31,8 @@ def test_endpoints(endpoint, capfd, recording, tmp_path):
         ["relocalize", picture],
         ["replay", recording],
     ):
-        assert "endpoint" in complaint(capfd, *command, "--connect", endpoint)
-    assert "endpoint" in complaint(capfd, "server", "--listen", endpoint, "--data", tmp_path)
+        assert "endpoint" in complaint(capfd, *command, "--connect", endpoint, status=USAGE)
+    assert "endpoint" in complaint(capfd, "server", "--listen", endpoint, "--data", tmp_path, status=USAGE)
 
 
 def test_a_port_that_is_taken(capfd, port, tmp_path):
@@ -42,7 +43,9 @@ def test_a_port_that_is_taken(capfd, port, tmp_path):
 def test_a_port_for_people_that_is_taken(capfd, port, closed, tmp_path):
     output = complaint(capfd, "server", "--listen", closed, "--data", tmp_path / "a", "--http", port)
     assert f"cannot listen at http 127.0.0.1:{port}: the port is taken" in output
-    output = complaint(capfd, "server", "--listen", closed, "--data", tmp_path / "b", "--http", "here")
+    output = complaint(
+        capfd, "server", "--listen", closed, "--data", tmp_path / "b", "--http", "here", status=USAGE
+    )
     assert "write a port, or HOST:PORT" in output
     assert not (tmp_path / "b").exists()
 
@@ -66,14 +69,14 @@ def test_asking_about_an_image(capfd, recording, tmp_path, closed):
     rest = ["--connect", closed, "--timeout", "0.1"]
     lonely = tmp_path / "a.png"
     lonely.write_bytes((recording / "images" / "0.png").read_bytes())
-    assert "give the intrinsics with --camera" in complaint(capfd, "relocalize", lonely, *rest)
+    assert "give the intrinsics with --camera" in complaint(capfd, "relocalize", lonely, *rest, status=USAGE)
     camera = ["--camera", recording / "camera.toml"]
     assert "no router" in complaint(capfd, "relocalize", lonely, *camera, *rest)
     assert "no such file" in complaint(capfd, "relocalize", lonely, "--camera", tmp_path / "b.toml", *rest)
     for known in (camera, []):
         assert "b.png: no such file" in complaint(capfd, "relocalize", tmp_path / "b.png", *known)
     for seconds in ("0", "-1", "nan", "inf"):
-        output = complaint(capfd, "relocalize", lonely, *camera, f"--timeout={seconds}")
+        output = complaint(capfd, "relocalize", lonely, *camera, f"--timeout={seconds}", status=USAGE)
         assert f"--timeout {seconds}: give seconds" in output
     lonely.write_text("no image")
     assert "not an image" in complaint(capfd, "relocalize", lonely, *camera, *rest)

@@ -108,7 +108,7 @@ def test_no_port_and_no_pull_are_one_line(plugged, monkeypatch, capfd, tmp_path)
     assert main(["find-port", "--timeout", "0.05"]) == NO
     assert "no port has gone" in capfd.readouterr().err
     monkeypatch.setattr(ports.serial_ports, "__defaults__", (tmp_path / "nothing",))
-    assert "no serial port" in complaint(capfd, "find-port")
+    assert "no serial port" in complaint(capfd, "find-port", status=NO)
 
 
 def video(path: Path, size: tuple[int, int], level: int) -> Path:
@@ -142,6 +142,6 @@ def test_a_frame_of_each_camera_is_saved(tmp_path: Path, capfd: pytest.CaptureFi
 
 
 def test_no_camera_is_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    words = complaint(capfd, "find-cameras", tmp_path / "none.avi", "--out", tmp_path / "frames")
+    words = complaint(capfd, "find-cameras", tmp_path / "none.avi", "--out", tmp_path / "frames", status=NO)
     assert "no such file" in words and "no camera gives an image" in words
     assert not (tmp_path / "frames").exists()

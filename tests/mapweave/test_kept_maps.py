@@ -21,7 +21,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
-from mapweave.exit_status import USAGE
+from mapweave.exit_status import NO, USAGE
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import InvalidFile
@@ -317,7 +317,7 @@ def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, closed, simu
     assert complaint(capfd, *arguments, "foo", status=USAGE) == (
         "mapweave: 'foo' is no map: write it as r0.1, the robot and the map's number"
     )
-    output = complaint(capfd, *arguments, "r0.3")
+    output = complaint(capfd, *arguments, "r0.3", status=NO)
     assert "there is no journal of r0" in output
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 

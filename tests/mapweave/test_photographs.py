@@ -12,6 +12,7 @@ import pytest
 
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.cli import main
+from mapweave.exit_status import FAILED, USAGE
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -104,11 +105,11 @@ def test_an_invalid_stretch_is_reported_in_one_line(stretch, tmp_path: Path, cap
     folder, _ = stretch
     out = tmp_path / "hall.mapweave"
 
-    def said(*arguments: object) -> str:
-        return complaint(capfd, "map", "from-photos", *arguments, "-o", out)
+    def said(*arguments: object, status: int = FAILED) -> str:
+        return complaint(capfd, "map", "from-photos", *arguments, "-o", out, status=status)
 
-    assert "spacing" in said(folder, "--spacing", "0")
-    assert "spacing" in said(folder, "--spacing", "nan")
+    assert "spacing" in said(folder, "--spacing", "0", status=USAGE)
+    assert "spacing" in said(folder, "--spacing", "nan", status=USAGE)
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "camera.toml" in said(empty, "--spacing", "0.5")
@@ -118,7 +119,7 @@ def test_an_invalid_stretch_is_reported_in_one_line(stretch, tmp_path: Path, cap
     assert "two photographs" in said(empty, "--spacing", "0.5")
     cv2.imwrite(str(empty / "2.png"), np.full((240, 320), 90, np.uint8))
     assert "1 and 2 do not show the same" in said(empty, "--spacing", "0.5")
-    assert "use 1 to 32" in said(folder, "--spacing", "0.5", "--name", "Hall")
+    assert "use 1 to 32" in said(folder, "--spacing", "0.5", "--name", "Hall", status=USAGE)
     assert not out.exists()
 
 

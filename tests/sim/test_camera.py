@@ -100,7 +100,7 @@ def test_an_ideal_lens_leaves_the_picture_alone(stand) -> None:
     np.testing.assert_array_equal(still(setup, scene, stand), ideal)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     st.tuples(
         *[st.floats(-0.6, 0.6), st.floats(-0.5, 0.5), *[st.floats(-0.05, 0.05)] * 2, st.floats(-0.3, 0.3)]

@@ -150,7 +150,7 @@ def test_the_least_likely_is_not_longer_than_is_allowed() -> None:
     assert np.array_equal(unpack_landmarks(packed, large).codes, codes)
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(data)
 def test_damage_is_noticed(some: SimpleNamespace, data: st.DataObject) -> None:
     good = pack_landmarks(some.node(20).landmarks, CAMERA)
@@ -173,7 +173,7 @@ def both_forms(packed: bytes) -> list[Landmarks | str]:
     return collected
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(data)
 def test_forgeries_with_a_right_checksum_do_no_harm(some: SimpleNamespace, data: st.DataObject) -> None:
     """Every decoded value is finite, within the image's surroundings, and round-trips."""

@@ -57,7 +57,7 @@ def test_a_second_reader(content: MapFile) -> None:
     assert struct.unpack("<9f", pose) == (1.5, -2.5, 0.25, 0.25, 0, 0, 0.25, 0, 0.0625)
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(where=st.floats(0, 1, exclude_max=True), change=st.integers(1, 255))
 def test_any_changed_byte_is_noticed(
     tmp_path_factory: pytest.TempPathFactory, some: SimpleNamespace, where: float, change: int

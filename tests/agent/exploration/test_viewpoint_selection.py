@@ -31,7 +31,7 @@ readings = st.lists(st.floats(0.0, 3.0), min_size=16, max_size=16).map(np.array)
 directions = st.sampled_from(BEARINGS)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(readings, directions)
 @example(np.array([3.0, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1]), -math.pi)  # nothing in reach
 def test_the_footprint_moves_freely_within_the_clearance(proximity, direction):
@@ -50,7 +50,7 @@ def test_the_footprint_moves_freely_within_the_clearance(proximity, direction):
         assert (along[in_way] >= BODY.radius + BEFORE - 1e-6).all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(readings, directions, st.integers(0, 15), st.floats(0.0, 1.0))
 def test_approaching_obstacles_reduce_the_clearance(proximity, direction, which, share):
     nearer = proximity.copy()

@@ -35,7 +35,7 @@ def test_the_history_keeps_its_own_arrays():
     assert history.observations(np.array([2]))[1].tolist() == [[[20.0, 2.5]]]
 
 
-@settings(max_examples=40)
+@settings(max_examples=60)
 @given(
     st.lists(st.sets(st.integers(0, 12)), min_size=1, max_size=12),
     st.lists(st.integers(0, 15), unique=True, max_size=10),

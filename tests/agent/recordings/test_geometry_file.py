@@ -36,7 +36,7 @@ def within(field: str) -> st.SearchStrategy[float]:
 
 
 @given(geometry=st.builds(DriveGeometry, **{field: within(field) for field in KEYS}), fresh=st.booleans())
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_what_is_written_is_read(tmp_path: Path, geometry: DriveGeometry, fresh: bool) -> None:
     file = tmp_path / "new" / "r0.toml"
     file.unlink(missing_ok=True)

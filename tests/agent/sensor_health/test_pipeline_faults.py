@@ -103,7 +103,7 @@ def drive(how: str, seed: int) -> tuple[Pipeline, dict[int, Pose2], list[Step], 
         pipeline = Pipeline(MapId("r0", 1), description)
         pipeline.set_mission(Explore())
         command, truth, steps = Command(), dict[int, Pose2](), list[Step]()
-        for tick in range(480):
+        for tick in range(450):
             simulation.advance({"r0": command})
             seen = simulation.observe("r0")
             if 200 <= tick < 300:

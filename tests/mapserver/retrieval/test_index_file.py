@@ -106,7 +106,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory, mapped: tuple[list[Node], li
     return path.read_bytes()
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_any_bit_that_is_turned_is_noticed(tmp_path: Path, saved: bytes, at: float, bit: int) -> None:
     data = bytearray(saved)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from mapweave.exit_status import NO
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, SettingsError
 from mapweave.identities import key_folder
 from mapweave.identities.key_folder import KeyFolder, Profile
@@ -160,7 +161,13 @@ def test_the_only_server_is_revoked_by_force_alone(
 ) -> None:
     """A running router keeps its key, and no other could be started."""
     assert "s0 is the only server: add another one first" in complaint(
-        capfd, "keys", "revoke", "s0", "--keys", folder.path
+        capfd,
+        "keys",
+        "revoke",
+        "s0",
+        "--keys",
+        folder.path,
+        status=NO,
     )
     with pytest.raises(InvalidValue, match="only server"):
         folder.revoke("s0")

@@ -17,6 +17,7 @@ from cryptography import x509
 
 from mapweave.cli import main
 from mapweave.connection import no_server
+from mapweave.exit_status import NO, USAGE
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder
 from mapweave.identities.logins import Logins
@@ -108,8 +109,8 @@ def test_a_token_is_shown_once_and_its_hash_alone_is_kept(
     assert f"token of {rows['r0']['tokens'][0]['issued'][:10]}, until 2" in capfd.readouterr().out
     assert main(["keys", "revoke", "r0", "--tokens", *where]) == 0
     assert Logins(keys).login(token) is None and (keys / "r0.key.toml").exists()
-    assert "r0 has no token" in complaint(capfd, "keys", "revoke", "r0", "--tokens", *where)
-    assert "r9 has no good key" in complaint(capfd, "keys", "token", "r9", *where)
+    assert "r0 has no token" in complaint(capfd, "keys", "revoke", "r0", "--tokens", *where, status=NO)
+    assert "r9 has no good key" in complaint(capfd, "keys", "token", "r9", *where, status=NO)
 
 
 def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> None:
@@ -123,12 +124,16 @@ def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.Capture
     where = ("--keys", keys)
     assert "there are keys already" in complaint(capfd, "keys", "init", *where)
     assert "no keys are here" in complaint(capfd, "keys", "list", "--keys", tmp_path)
-    assert "r9 has no key" in complaint(capfd, "keys", "revoke", "r9", *where)
-    assert "r0 is a robot already" in complaint(capfd, "keys", "add", "r0", "--role", "viewer", *where)
+    assert "r9 has no key" in complaint(capfd, "keys", "revoke", "r9", *where, status=NO)
+    assert "r0 is a robot already" in complaint(
+        capfd, "keys", "add", "r0", "--role", "viewer", *where, status=NO
+    )
     assert "no keys are here" in complaint(capfd, "server", "--keys", tmp_path, "--data", tmp_path / "d")
     fresh = ("--keys", tmp_path / "fresh")
     for host in ('a"b', "a b", "-x", "a/b", ""):
-        assert "write a name or an address" in complaint(capfd, "keys", "init", *fresh, f"--at={host}")
+        assert "write a name or an address" in complaint(
+            capfd, "keys", "init", *fresh, f"--at={host}", status=USAGE
+        )
     assert not (tmp_path / "fresh").exists()
     cut = tmp_path / "cut.key.toml"
     whole = (keys / "r0.key.toml").read_bytes()
@@ -240,7 +245,7 @@ def test_a_host_is_a_name_or_an_address_without_a_port(
     host: str, capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     where = tmp_path / "keys"
-    assert "without a port" in complaint(capfd, "keys", "init", f"--at={host}", "--keys", where)
+    assert "without a port" in complaint(capfd, "keys", "init", f"--at={host}", "--keys", where, status=USAGE)
     assert not where.exists()
 
 

@@ -133,7 +133,7 @@ values = st.recursive(
 )
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=80)
 @given(
     name=st.sampled_from(["robots", "robot", "world", "events", "expect", "seed", "name", "summary"]),
     value=values,

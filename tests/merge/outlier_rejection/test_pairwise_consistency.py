@@ -161,7 +161,7 @@ def test_loops_within_a_map_must_agree_with_its_own_way() -> None:
     assert "own way" in sorted_links.refused[0].reason
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(1, 9), st.integers(0, 10**6))
 def test_best_clique_against_brute_force(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
