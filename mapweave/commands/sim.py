@@ -248,4 +248,6 @@ def _scenario(arguments: argparse.Namespace) -> Scenario:
     if not arguments.overrides:
         return scenario
     with arguments_read():
-        return load_scenario(path, arguments.overrides)
+        scenario = load_scenario(path, arguments.overrides)
+        scenario.world(0)  # what is wrong with it is said before anything is started
+    return scenario
