@@ -207,6 +207,7 @@ def test_edges_that_no_robot_measures() -> None:
         assert words in unmeasurable(EdgePut(edge)) and bool(words) == bool(unmeasurable(EdgePut(edge)))
 
 
+@pytest.mark.slow
 def test_fragments_make_no_answer_ambiguous() -> None:
     """A robot begins map after map, each with two views of the room and a wrong way between them."""
     merger = Merger()

@@ -201,6 +201,7 @@ def sketch(tmp_path: Path) -> Iterator[ArduinoSketch]:
     emulator.close()
 
 
+@pytest.mark.slow
 def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> None:
     """All is well but that the camera does not see the drive; without --drive nothing moves."""
     sketch.distances = [200, 200, 200]

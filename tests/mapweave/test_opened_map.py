@@ -204,6 +204,7 @@ def test_a_cut_off_or_newer_file_is_reported_in_one_line(
     assert "format" in complaint(capfd, "map", "show", path)
 
 
+@pytest.mark.slow
 def test_a_map_is_served_to_people_and_never_changed(folder: Path, tmp_path: Path) -> None:
     before = state(folder)
     with Children(tmp_path) as children:

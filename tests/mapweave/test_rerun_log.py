@@ -80,6 +80,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_replay_is_read_back_as_it_was(
     drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], signals: None
 ) -> None:

@@ -65,7 +65,7 @@ def beside_copies(fleet: Fleet, shift: Pose2, excluding: tuple[str, ...]) -> Mer
             (TORN, ("r0",), False),
             (TORN, (), False),
         ],
-        2,
+        1,
     ),
 )
 def test_two_robots_that_agree_exclude_a_torn_map(

@@ -84,6 +84,7 @@ def test_a_taken_port_is_reported_in_one_line() -> None:
         first.close()
 
 
+@pytest.mark.slow
 def test_idle_connections_block_no_other() -> None:
     port = free_port()
     endpoints = (f"tcp/127.0.0.1:{port}",)

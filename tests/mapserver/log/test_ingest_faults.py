@@ -90,6 +90,7 @@ steps = st.lists(
 shares = st.sampled_from([0.0, 0.2, 0.6])
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(steps, st.builds(Faults, shares, shares, shares, st.integers(1, 30)), st.integers(0, 2**32 - 1))
 def test_the_store_becomes_the_journals(

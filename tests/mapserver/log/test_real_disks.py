@@ -23,6 +23,8 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.ingest_settings import IngestSettings
+
+pytestmark = pytest.mark.slow
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub

@@ -365,6 +365,7 @@ def test_what_later_changes_supersede_is_compacted(place: Path | str) -> None:
     store.close()
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 4), st.integers(5, 6)), max_size=30))
 def test_a_compacted_map_is_the_same(

@@ -101,6 +101,7 @@ def poses_apart(a: MergedMap, b: MergedMap) -> float:
     return max(a.pose(node).distance(b.pose(node)) for node in b.poses)
 
 
+@pytest.mark.slow
 def test_what_is_superseded_for_long_leaves_and_the_rest_stays(logs: Logs, tmp_path: Path) -> None:
     path = tmp_path / "s0.sqlite"
     with serving(path) as server:
