@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 UNSHARE = ["unshare", "--user", "--map-root-user", "--mount"]
 
 PROGRAM = """
@@ -23,8 +25,6 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.ingest_settings import IngestSettings
-
-pytestmark = pytest.mark.slow
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
