@@ -116,18 +116,17 @@ def _met(
     grid = np.arange(math.ceil(start / STEP), math.floor(end / STEP) + 1) * STEP
     times = np.unique(np.concatenate([first.times, second.times, grid]))
     times = times[(times >= start) & (times <= end)]
-    first_stay, second_stay = (
-        stay(trajectory, trajectory.poses(graph)[:, :2], times) for trajectory in (first, second)
-    )
+    first_poses, second_poses = first.poses(graph), second.poses(graph)
+    first_stay, second_stay = stay(first, first_poses[:, :2], times), stay(second, second_poses[:, :2], times)
     radii_known = first.radius > 0.0 and second.radius > 0.0
     least_apart = first.radius + second.radius if radii_known else s.least_apart
     both_known = first_stay.known & second_stay.known
     apart = second_stay.places - first_stay.places
     distances = np.hypot(apart[:, 0], apart[:, 1])
     close = np.flatnonzero(both_known & (distances < least_apart))
-    intervals = visibility_intervals(graph, first, second, second_stay, times) + visibility_intervals(
-        graph, second, first, first_stay, times
-    )
+    intervals = visibility_intervals(
+        graph, first, first_poses, second, second_stay, times
+    ) + visibility_intervals(graph, second, second_poses, first, first_stay, times)
     if len(close) == 0 and len(intervals) == 0:
         return None
     spreads = (first_stay.spreads + second_stay.spreads)[close]

@@ -29,28 +29,46 @@ class RangeScans:
     seen: NDArray[np.bool_]
 
     @staticmethod
-    def of(ranges: Sequence[Ranges], segments: Sequence[TrajectorySegment]) -> RangeScans:
+    def of(
+        ranges: Sequence[Ranges], segments: Sequence[TrajectorySegment], owners: NDArray[np.int64]
+    ) -> RangeScans:
         """Of one robot's nodes, in their order, and then of their trajectory segments, likewise.
 
         A broken sensor also reports that there is nothing. So a scan without any reading in range, and a
         sensor without any, are not used.
+
+        Args:
+            ranges: of the nodes.
+            segments: of those nodes that have any.
+            owners: (N,) which node each scan is of.
         """
-        scans = [*((node_ranges, node_ranges.distances) for node_ranges in ranges)]
-        scans += [
-            (node_ranges, row)
-            for node_ranges, segment in zip(ranges, segments, strict=True)
-            for row in segment.distances
-        ]
-        most = max((len(node_ranges) for node_ranges in ranges), default=0)
-        bearings, distances = np.zeros((2, len(scans), most))
-        present, met = np.zeros((2, len(scans), most), np.bool_)
-        for k, (node_ranges, row) in enumerate(scans):
-            present[k, : len(node_ranges)] = True
-            bearings[k, : len(node_ranges)], distances[k, : len(node_ranges)] = node_ranges.bearings, row
-            met[k, : len(node_ranges)] = row < node_ranges.reach - 1e-6
+        widths = np.array([len(node_ranges) for node_ranges in ranges], np.int64)
+        most = int(widths.max(initial=0))
+        reaches = np.array([node_ranges.reach for node_ranges in ranges])
+        by_node = _rows([node_ranges.bearings[None] for node_ranges in ranges], most)
+        distances = _rows(
+            [
+                *(node_ranges.distances[None] for node_ranges in ranges),
+                *(segment.distances for segment in segments),
+            ],
+            most,
+        )
+        bearings = by_node[owners]
+        present = (np.arange(most) < widths[:, None])[owners]
+        met = present & (distances < (reaches[owners] - 1e-6)[:, None])
         valid = present & met.any(axis=1, keepdims=True) & met.any(axis=0, keepdims=True)
         return RangeScans(bearings, distances, valid)
 
     def take(self, order: NDArray[np.int64]) -> RangeScans:
         """Some of the scans, or all in another order."""
         return RangeScans(self.bearings[order], self.distances[order], self.seen[order])
+
+
+def _rows(parts: Sequence[Array], width: int) -> Array:
+    """Arrays (n, k) below each other, with zeros up to a width of at least all k."""
+    padded = [
+        part if part.shape[1] == width else np.pad(part, ((0, 0), (0, width - part.shape[1])))
+        for part in parts
+    ]
+    out: Array = np.concatenate([np.zeros((0, width)), *padded])
+    return out

@@ -85,19 +85,17 @@ def trajectories_of(nodes: Collection[Node]) -> tuple[RobotTrajectory, ...]:
         nodes_of_clock.sort(key=lambda node: (node.stamp_ns, node.id))
         radius = min(node.radius for node in nodes_of_clock)
         # Segments of neighbours may overlap by a rounded moment: they are ordered by time here.
-        teller = np.concatenate(
-            [np.arange(len(nodes_of_clock)), np.repeat(range(len(nodes_of_clock)), _lengths(nodes_of_clock))]
-        )
-        segments = [node.segment for node in nodes_of_clock if len(node.segment)]
+        lengths = np.array([len(node.segment) for node in nodes_of_clock], np.int64)
+        own = np.arange(len(nodes_of_clock))
+        teller = np.concatenate([own, np.repeat(own, lengths)])
+        segments = [nodes_of_clock[k].segment for k in np.flatnonzero(lengths)]
         ages = np.concatenate([np.zeros(len(nodes_of_clock)), *(segment.ages for segment in segments)])
         offsets = np.concatenate(
             [np.zeros((len(nodes_of_clock), 3)), *(segment.node_from_robot for segment in segments)]
         )
         times = _seconds(nodes_of_clock)[teller] + ages
         order = np.argsort(times, kind="stable")
-        scans = RangeScans.of(
-            [node.ranges for node in nodes_of_clock], [node.segment for node in nodes_of_clock]
-        ).take(order)
+        scans = RangeScans.of([node.ranges for node in nodes_of_clock], segments, teller).take(order)
         ids = tuple(nodes_of_clock[k].id for k in teller[order])
         trajectories.append(RobotTrajectory(clock, ids, offsets[order], times[order], radius, scans))
     return tuple(trajectories)
@@ -121,10 +119,6 @@ class TrajectoryCache:
 
 def _seconds(nodes: Sequence[Node]) -> Array:
     return np.array([node.stamp_ns for node in nodes]) / NANOSECONDS
-
-
-def _lengths(nodes: Sequence[Node]) -> list[int]:
-    return [len(node.segment) for node in nodes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +174,9 @@ def stay(trajectory: RobotTrajectory, places: Array, times: Array) -> Stay:
     ahead = lines / np.maximum(lengths, 1e-9)[:, None]
     along2 = (ALONG * bow) ** 2 + (CLOCK_ERROR * lengths / gaps) ** 2
     aside2 = (ASIDE * bow) ** 2
-    outer = ahead[:, :, None] * ahead[:, None, :]
-    spreads = (along2 - aside2)[:, None, None] * outer + (aside2 + trajectory.drifts[nearest] ** 2)[
-        :, None, None
-    ] * np.eye(2)
+    every_way, longer = aside2 + trajectory.drifts[nearest] ** 2, along2 - aside2
+    x, y = ahead.T
+    spreads = np.empty((len(times), 2, 2))
+    spreads[:, 0, 0], spreads[:, 1, 1] = longer * (x * x) + every_way, longer * (y * y) + every_way
+    spreads[:, 0, 1] = spreads[:, 1, 0] = longer * (x * y)
     return Stay(inside, places[before] + share[:, None] * lines, spreads, nearest)

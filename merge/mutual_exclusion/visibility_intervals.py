@@ -64,19 +64,24 @@ class VisibilityInterval:
 
 
 def visibility_intervals(
-    graph: PoseGraph, observer: RobotTrajectory, other: RobotTrajectory, stay: Stay, times: Array
+    graph: PoseGraph,
+    observer: RobotTrajectory,
+    poses: Array,
+    other: RobotTrajectory,
+    stay: Stay,
+    times: Array,
 ) -> VisibilityInterval:
     """All observations of one robot with the other robot's expected place in reach.
 
     Args:
         graph: the merged component that holds the nodes of both.
         observer: its trajectory.
+        poses: (N, 3) m, m and rad, where it was at each moment.
         other: the other's.
         stay: where the other one was at `times`.
         times: (T,) s, ascending; among them all times of the observer's trajectory that both have in common.
     """
     rows, other_rows = graph.index(observer.nodes), graph.index(other.nodes)[stay.nearest]
-    poses = observer.poses(graph)
     at = np.minimum(np.searchsorted(times, observer.times), len(times) - 1)
     offsets = stay.places[at] - poses[:, :2]
     furthest = np.max(observer.looks.distances, axis=1, initial=0.0, where=observer.looks.seen)
