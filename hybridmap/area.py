@@ -83,12 +83,6 @@ class Area:
         x, y = np.array(self.corners, dtype=float).T
         return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2.0)
 
-    @property
-    def centre(self) -> tuple[float, float]:
-        """Mean of the corners, in the anchor's frame, m."""
-        x, y = np.mean(self.corners, axis=0)
-        return float(x), float(y)
-
     def contains(self, points_in_anchor: Array) -> NDArray[np.bool_]:
         """(N,) which points lie inside.
 

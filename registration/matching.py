@@ -32,23 +32,6 @@ class MatchSettings:
     most_distance: float = 0.75
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
-    """Pairs of features, best first.
-
-    Attributes:
-        pairs: (K, 2) int64, indices in a and in b; no index occurs twice in a column.
-        distances: (K,) float32, between the descriptors; 0 where rounding could explain all of it.
-    """
-
-    pairs: NDArray[np.int64]
-    distances: NDArray[np.float32]
-
-    def __len__(self) -> int:
-        """How many."""
-        return len(self.pairs)
-
-
 def squared_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
     """(N, D) and (M, D) -> (N, M) squared Euclidean distances, by one matrix product.
 
@@ -64,8 +47,8 @@ def match_vectors(
     b: NDArray[np.float32],
     settings: MatchSettings | None = None,
     noise: float = 0.0,
-) -> Matches:
-    """Match descriptors that are already decoded.
+) -> NDArray[np.int64]:
+    """Match descriptors that are already decoded, as `match` does.
 
     Args:
         a: (N, D).
@@ -77,19 +60,16 @@ def match_vectors(
     return _mutual(squared_distances(a, b) - np.float32(noise), settings or MatchSettings())
 
 
-def _mutual(squared: NDArray[np.float32], s: MatchSettings) -> Matches:
+def _mutual(squared: NDArray[np.float32], s: MatchSettings) -> NDArray[np.int64]:
     """Pairs that are each other's nearest and distinctly so, of (N, M) squared distances."""
     if squared.size == 0:
-        return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+        return np.zeros((0, 2), np.int64)
     (best_in_b, best, second), (best_in_a, _, second_in_a) = two_nearest(squared), two_nearest(squared.T)
     mutual = best_in_a[best_in_b] == np.arange(len(best))
     distinct = best < s.ratio**2 * np.minimum(second, second_in_a[best_in_b])
     kept = np.flatnonzero(mutual & distinct & (best <= s.most_distance**2))
     kept = kept[np.argsort(best[kept], kind="stable")]
-    return Matches(
-        np.stack([kept, best_in_b[kept]], axis=1).astype(np.int64),
-        np.sqrt(np.maximum(best[kept], 0)).astype(np.float32),
-    )
+    return np.stack([kept, best_in_b[kept]], axis=1).astype(np.int64)
 
 
 def two_nearest(
@@ -118,7 +98,7 @@ def match(
         settings: when two descriptors are taken for the same.
 
     Returns:
-        (K, 2) int64, indices in a and in b, best first; `match_vectors` gives the distances as well.
+        (K, 2) int64, indices in a and in b, best first; no index occurs twice in a column.
 
     Raises:
         InvalidValue: the input is not (N, 32) bytes.
@@ -128,4 +108,4 @@ def match(
             raise InvalidValue(f"codes must be (N, {CODE_BYTES}) uint8, not {codes.shape} {codes.dtype}")
     steps = squared_distances(codes_a.astype(np.float32), codes_b.astype(np.float32))
     squared = steps * np.float32(landmark_tables().step ** 2)
-    return _mutual(squared - np.float32(rounding_noise()), settings or MatchSettings()).pairs
+    return _mutual(squared - np.float32(rounding_noise()), settings or MatchSettings())

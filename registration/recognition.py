@@ -22,7 +22,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.registration.evidence import GRID, depth_agreement, gather
 from mapweave.registration.matching import MatchSettings, match
-from mapweave.registration.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
+from mapweave.registration.planar_pose import PlanarPoseSettings, solve_sightings
 from mapweave.registration.sightings import Sightings
 
 
@@ -66,7 +66,6 @@ class Recognition:
         pairs: (K, 2) int64, inliers: landmark of the node (a), feature of the view (landmark of b).
         matches: mutual matches, with or without depth.
         usable: matches with a depth on either side, which could have been inliers.
-        fix: the pose with its residuals.
         evidence: the numbers that support it, for an edge's `evidence`.
     """
 
@@ -74,7 +73,6 @@ class Recognition:
     pairs: NDArray[np.int64]
     matches: int
     usable: int
-    fix: PlanarFix
     evidence: dict[str, float]
 
     @property
@@ -223,7 +221,7 @@ def _examine(
         return Refusal(reason, len(pairs), inliers, fix.node_from_robot, evidence)
     unknown = min(a.scale_share, b.scale_share) if measured else a.scale_share
     pose = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
-    return Recognition(pose, inliers, len(pairs), len(usable), fix, evidence)
+    return Recognition(pose, inliers, len(pairs), len(usable), evidence)
 
 
 def of_unknown_scale(pose: PoseGaussian, share: float, of_node: Camera, of_view: Camera) -> PoseGaussian:

@@ -53,11 +53,6 @@ class Similarity:
         """Map (..., 2) points of b into a."""
         return Pose2(self.x, self.y, self.heading).apply(self.scale * np.asarray(points, np.float64))
 
-    def inverse(self) -> Similarity:
-        """Return `b_from_a`."""
-        x, y = Pose2(0.0, 0.0, -self.heading).apply(np.array([-self.x, -self.y])) / self.scale
-        return Similarity(float(x), float(y), wrap_angle(-self.heading), 1.0 / self.scale)
-
 
 @dataclass(frozen=True, eq=False)
 class SimilarityFit:

@@ -101,11 +101,6 @@ class AnswerTrial:
             self._last = f"the map server says that the robot is at node {self.node}; every way is blocked"
 
     @property
-    def reason(self) -> str:
-        """The last refutation, in words."""
-        return self._last
-
-    @property
     def ended(self) -> str:
         """Why no further answer is tried; empty if one may be."""
         if self._failed >= TRIALS:

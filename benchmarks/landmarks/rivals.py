@@ -123,7 +123,7 @@ def matched(name: str, pair: Pair, first: Kept, second: Kept) -> tuple[int, int]
         # Squared distances of bits are Hamming's; the ratio is of those.
         settings = MatchSettings(ratio=settings.ratio**0.5, most_distance=np.inf)
     noise = rounding_noise() if name == "ours" else 0.0
-    pairs = match_vectors(first.vectors, second.vectors, settings, noise).pairs
+    pairs = match_vectors(first.vectors, second.vectors, settings, noise)
     return len(pairs), pair.right(first.pixels[pairs[:, 0]], second.pixels[pairs[:, 1]])
 
 

@@ -64,7 +64,7 @@ class Exhaustive:
         view, sightings = query.picture.view, []
         for k in np.flatnonzero(counts >= self._settings.least_inliers).tolist():
             place = self._place_of(k)
-            pairs = match_vectors(root_sift(place.sift), roots, self._settings.matching).pairs
+            pairs = match_vectors(root_sift(place.sift), roots, self._settings.matching)
             if len(pairs) < self._settings.least_inliers:
                 continue
             rng = np.random.default_rng(zlib.crc32(str(place.node.id).encode()))

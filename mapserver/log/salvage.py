@@ -23,7 +23,6 @@ class Salvage:
 
     Attributes:
         maps: the replay of the changes that are good, by their map.
-        changes: how many these are.
         damaged: rows with wrong checksums.
         whole: whether all pages could be read.
         constraints: the manual constraints that are good, encoded, in order.
@@ -32,7 +31,6 @@ class Salvage:
     """
 
     maps: dict[MapId, HybridMap]
-    changes: int
     damaged: int
     whole: bool
     constraints: tuple[bytes, ...]
@@ -53,14 +51,12 @@ def salvage(path: Path) -> Salvage:
 def all_of(store: Store) -> Salvage:
     """The same of a store that is open."""
     maps: dict[MapId, HybridMap] = {}
-    changes = 0
     for map_id in store.maps():
         for change in store.replay(map_id):
             maps.setdefault(map_id, HybridMap()).apply(change.body)
-            changes += 1
     history = store.result(HISTORY)
     return Salvage(
-        maps, changes, 0, True, tuple(store.constraints()), tuple(store.annotations()),
+        maps, 0, True, tuple(store.constraints()), tuple(store.annotations()),
         {} if history is None else {HISTORY: history},
     )  # fmt: skip
 
@@ -90,7 +86,7 @@ def _read(connection: sqlite3.Connection, path: Path) -> Salvage:
     annotations, annotations_whole = _good(connection, "annotation")
     results, results_whole = _good(connection, "result")
     return Salvage(
-        maps, len(good), damaged, not error and constraints_whole and annotations_whole and results_whole,
+        maps, damaged, not error and constraints_whole and annotations_whole and results_whole,
         tuple(bytes(body) for _, body in constraints), tuple(bytes(body) for _, body in annotations),
         {str(name): bytes(value) for name, value in results},
     )  # fmt: skip

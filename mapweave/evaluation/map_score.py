@@ -55,7 +55,6 @@ class MapScore:
         ate: root mean square position error of the nodes after one rigid alignment a component, m.
         links: links between maps.
         false_links: links that are off by more than 0.5 m or 15 degrees.
-        world_from_merged: the alignment of the largest component.
         world_from_component: the alignment of each component.
     """
 
@@ -63,7 +62,6 @@ class MapScore:
     ate: float
     links: int
     false_links: int
-    world_from_merged: Pose2
     world_from_component: Mapping[int, Pose2]
 
 
@@ -90,9 +88,7 @@ def score_map(
     ate = float(np.sqrt(np.concatenate(squares).mean())) if squares else math.nan
     between = [e for e in links if e.a in truth and e.b in truth and e.a.map != e.b.map]
     false = sum(is_false(e, truth) for e in between)
-    largest = max(members, key=lambda c: len(members[c]), default=None)
-    world_from_merged = Pose2() if largest is None else alignments[largest]
-    return MapScore(len(members), ate, len(between), false, world_from_merged, alignments)
+    return MapScore(len(members), ate, len(between), false, alignments)
 
 
 def is_false(link: Edge, truth: Mapping[NodeId, Pose2]) -> bool:

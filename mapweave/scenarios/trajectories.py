@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.pose import Array
 from mapweave.scenarios.recording import Trajectory
 
 RPE_DELTA = 1.0
@@ -31,7 +31,6 @@ class TrajectoryScore:
         ate_m: absolute trajectory error, RMSE of positions after one planar alignment without scale, m.
         rpe_m: relative pose error over 1 m of the true path, RMSE, m; None for a shorter way.
         rpe_deg: likewise of headings, degrees.
-        world_from_map: the alignment.
         stamps_ns: (N,) of the poses that have a truth.
         errors: (N,) distance of each from the truth after the alignment, m.
     """
@@ -39,7 +38,6 @@ class TrajectoryScore:
     ate_m: float
     rpe_m: float | None
     rpe_deg: float | None
-    world_from_map: Pose2
     stamps_ns: NDArray[np.int64]
     errors: Array
 
@@ -83,7 +81,6 @@ def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore
         ate_m=float(ape.get_statistic(metrics.StatisticsType.rmse)),
         rpe_m=rpe[0],
         rpe_deg=rpe[1],
-        world_from_map=world_from_map,
         stamps_ns=np.round(np.asarray(true.timestamps) * 1e9).astype(np.int64),
         errors=np.asarray(ape.error, dtype=np.float64),
     )

@@ -105,7 +105,7 @@ def test_codes_keep_right_matches_of_real_photographs() -> None:
         a, b, shift = a[known], b[known], shift[known]
         return int((np.abs(a - [1, 0] * shift[:, None] - b).max(axis=1) < 2.5).sum())
 
-    full = right_ones(match_vectors(root_sift(sift[0]), root_sift(sift[1])).pairs)
+    full = right_ones(match_vectors(root_sift(sift[0]), root_sift(sift[1])))
     code = right_ones(match(encode(sift[0]), encode(sift[1])))
     assert full > 80
     assert code >= 0.95 * full

@@ -63,12 +63,6 @@ def by_scipy(a: Array, b: Array, covariance: Array, scale: float | None) -> tupl
     return similarity(best.x), 2.0 * best.cost
 
 
-@given(transforms, numbers, numbers)
-def test_the_inverse_takes_points_back(transform: Similarity, x: float, y: float) -> None:
-    point = np.array([x, y])
-    assert np.allclose(transform.inverse().apply(transform.apply(point)), point, atol=1e-6)
-
-
 @given(transforms, st.integers(0, 2**32 - 1), st.integers(3, 9), st.booleans())
 @settings(max_examples=40, deadline=None)
 def test_exact_pairs_give_the_exact_transform(truth: Similarity, seed: int, count: int, known: bool) -> None:

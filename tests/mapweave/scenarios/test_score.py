@@ -15,7 +15,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.main_ape import ape
 from evo.main_rpe import rpe
 
-from mapweave.evaluation.map_score import pose_error
+from mapweave.evaluation.map_score import align, pose_error
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -104,8 +104,8 @@ def test_errors_over_time_make_up_the_ate():
     outcome = score_trajectory(truth, estimate)
     assert np.array_equal(outcome.stamps_ns, estimate.stamps_ns)
     assert math.sqrt(np.square(outcome.errors).mean()) == pytest.approx(outcome.ate_m)
-    moved = outcome.world_from_map.apply(estimate.poses[:, :2])
     true = truth.poses[np.searchsorted(truth.stamps_ns, estimate.stamps_ns), :2]
+    moved = align(estimate.poses[:, :2], true).apply(estimate.poses[:, :2])
     assert np.allclose(np.hypot(*(moved - true).T), outcome.errors)
 
 
