@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,9 @@ from rich.progress import Progress
 
 from benchmarks.relocalize.distractors import AGENT, gather
 from benchmarks.relocalize.exhaustive import AT_MOST, Exhaustive, asked_of, lost
-from benchmarks.relocalize.peer import Vocabulary
 from benchmarks.relocalize.places import Place, joined, mapped, mapped_sites
 from benchmarks.relocalize.queries import KINDS, Query, known, nowhere, twins
 from benchmarks.relocalize.score import Reply, ask, judged, share, spent
-from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
@@ -48,11 +45,6 @@ class Bench:
         self.merged = joined(self.places, seed)
         self.making = np.zeros(2)
         """What was spent on making nodes, see benchmarks.relocalize.score.spent."""
-
-    @cached_property
-    def vocabulary(self) -> Vocabulary:
-        """Of the bag of words, learned from the real places."""
-        return Vocabulary(np.concatenate([decode(p.node.landmarks.codes) for p in self.places]), self.seed)
 
     @contextmanager
     def task(self, name: str, total: int) -> Iterator[Callable[[], None]]:

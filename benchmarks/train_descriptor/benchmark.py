@@ -23,7 +23,8 @@ from rich.progress import track
 
 from benchmarks.images.known_warps import HELD_OUT, TRAINED_ON, Image, load, warp
 from benchmarks.images.printed_matter import printed_page
-from benchmarks.tracking.scenes import room_drive
+from benchmarks.images.surface_points import Surfaces
+from benchmarks.landmarks.places import LENSES, WORLDS
 from mapweave import hybridmap
 from mapweave.hybridmap.descriptor import project, quantise, root_sift
 from mapweave.hybridmap.landmark_tables import (
@@ -37,6 +38,11 @@ from mapweave.hybridmap.landmark_tables import (
 )
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.quantization import CELLS, CELLS_PER_E, DEPTH_LEAST, SHARE_LEAST, SHARES_PER_E
+from mapweave.sim.camera import CAMERAS
+from mapweave.sim.imager import Imager
+from mapweave.sim.scene import Scene
+from mapweave.sim.world import PanelSet
+from mapweave.sim.worlds.catalog import make_world
 
 SEED = 20090628
 PRINTED_PAGES = 12
@@ -52,6 +58,11 @@ WHITENING = 0.5
 
 FLOOR = 0.1
 """Share of the mean variance of change that is added to every direction: so much is not known of it."""
+
+UNUSED = 6
+"""Random numbers."""
+CLEARANCE, LEAST_DEPTH, MEDIAN_DEPTH = 0.3, 0.4, (1.2, 4.5)
+"""m, of the views of rooms: around the robot, and what they show at least and in the median."""
 
 SAME_PX, SAME_DISTANCE = 3.0, 0.75
 """Features this near to each other are the same one, if they look alike at all."""
@@ -94,10 +105,30 @@ def warped_descriptors() -> tuple[NDArray[np.float32], Array]:
     return np.concatenate(every), np.concatenate(changes).astype(np.float64)
 
 
+def room_view(rng: np.random.Generator) -> Image:
+    """(H, W) grey, what a robot sees of a simulated building through one of the simulator's cameras."""
+    kind, lens = str(rng.choice(WORLDS)), str(rng.choice(LENSES))
+    world, setup = make_world(kind, int(rng.integers(1 << 20))), CAMERAS[lens]
+    # The tables that are shipped were made when further numbers were drawn here.
+    rng.random(UNUSED)
+    surfaces = Surfaces(world)
+    grid = np.stack(np.meshgrid(np.arange(20, 320, 20.0), np.arange(20, 160, 20.0)), -1).reshape(-1, 2)
+    while True:
+        pose = world.plan.random_free_pose(rng, CLEARANCE)
+        depths = surfaces.see(pose, setup.intrinsics, grid).depths
+        if depths.min() > LEAST_DEPTH and MEDIAN_DEPTH[0] < np.median(depths) < MEDIAN_DEPTH[1]:
+            break
+    imager = Imager(setup, world.background, [int(rng.integers(1 << 30))])
+    rotation = np.eye(3)
+    rotation[:2, :2] = pose.rotation
+    stands = np.array([pose.x, pose.y, 0.0]), rotation
+    return imager.picture(Scene([PanelSet.of(world.panels)]), stands, 1.0, 0.0, 0.1)
+
+
 def room_descriptors() -> NDArray[np.float32]:
     """SIFT (N, 128) of views of simulated rooms."""
     rng = np.random.default_rng(SEED + 1)
-    views = [room_drive(rng, 1).images[0] for _ in track(range(ROOMS), "rooms")]
+    views = [room_view(rng) for _ in track(range(ROOMS), "rooms")]
     return np.concatenate([sift_of(view)[1] for view in views])
 
 
@@ -180,7 +211,7 @@ def bits_of(codes: NDArray[np.uint8], tables: LandmarkTables) -> float:
 def compared(tables: LandmarkTables) -> dict[str, Any]:
     """What trained tables cost, and how far they are from the shipped ones."""
     rng = np.random.default_rng(SEED + 2)
-    rooms = np.concatenate([sift_of(room_drive(rng, 1).images[0])[1] for _ in range(10)])
+    rooms = np.concatenate([sift_of(room_view(rng))[1] for _ in range(10)])
     held_out = np.concatenate([sift_of(load(name))[1] for name in HELD_OUT])
     trained = np.concatenate([sift_of(load(name))[1] for name in TRAINED_ON])
     bits = {

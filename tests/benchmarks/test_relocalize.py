@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,11 @@ from benchmarks.fit_belief.benchmark import fit, reliability
 from benchmarks.relocalize import pictures as relocalize_pictures
 from benchmarks.relocalize.distractors import Differences, Distractors
 from benchmarks.relocalize.exhaustive import Exhaustive, asked_of, lost
-from benchmarks.relocalize.peer import Vocabulary, WordIndex
 from benchmarks.relocalize.pictures import Disturbance, Photographer, Picture, Wish, taken
 from benchmarks.relocalize.places import Place, placed, spread_out, twin_lookouts
 from benchmarks.relocalize.queries import Query, beside
 from benchmarks.relocalize.score import Reply, ask, figures, judged, spent
-from mapweave.hybridmap.descriptor import decode, root_sift
+from mapweave.hybridmap.descriptor import root_sift
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
@@ -27,7 +25,7 @@ from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import MatchSettings, match_vectors
 from mapweave.sim.worlds.catalog import make_world
-from synthetic.world import CAMERA, room, take_map, take_view
+from synthetic.world import CAMERA, room, take_map
 
 
 def picture_of(sift: np.ndarray) -> Picture:
@@ -59,27 +57,6 @@ def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match(monkeypatch: py
     matches = [len(match_vectors(root_sift(p.sift), root_sift(asked.sift), MatchSettings())) for p in places]
     assert max(matches) > 20 and min(matches) < max(matches)
     assert (counts >= matches).all()
-
-
-def test_the_bag_of_words_is_tf_idf_and_cosine() -> None:
-    nodes = nodes_of(2, 8)
-    vocabulary = Vocabulary(np.concatenate([decode(node.landmarks.codes) for node in nodes]), 3)
-    bags = [Counter(vocabulary.words(decode(node.landmarks.codes)).tolist()) for node in nodes]
-    idf = {word: math.log(len(nodes) / sum(word in bag for bag in bags)) for bag in bags for word in bag}
-    view, _ = take_view(
-        room(0, 0, 5, 4, 400, np.random.default_rng(2)), Pose2(2.5, 2, 0.7), np.random.default_rng(4)
-    )
-    asked = Counter(vocabulary.words(decode(view.codes)).tolist())
-    expected = {}
-    for node, bag in zip(nodes, bags, strict=True):
-        norm = math.sqrt(sum((n * idf[word]) ** 2 for word, n in bag.items()))
-        expected[node.id] = (
-            sum(n * idf.get(w, 0.0) * bag[w] * idf.get(w, 0.0) for w, n in asked.items()) / norm
-        )
-    nearest = WordIndex(nodes, vocabulary).query(view, 5)
-    best = sorted(expected.items(), key=lambda item: -item[1])[:5]
-    assert [node for node, _ in nearest] == [node for node, _ in best]
-    assert [score for _, score in nearest] == pytest.approx([score for _, score in best])
 
 
 def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
