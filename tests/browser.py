@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-import http.client
-import json
 import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
 
 from tests.waiting import eventually, free_port
+from tests.webdriver import ask
 
 PROGRAMS = ("chromium", "chromedriver")
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
@@ -108,15 +107,7 @@ class Browser:
             return False
 
     def _ask(self, method: str, path: str, body: object = None) -> Any:
-        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=60)
-        try:
-            connection.request(method, path, None if body is None else json.dumps(body))
-            value = json.loads(connection.getresponse().read())["value"]
-        finally:
-            connection.close()
-        if isinstance(value, dict) and "error" in value:
-            raise RuntimeError(f"{value['error']}: {value['message']}")
-        return value
+        return ask(self._port, method, path, body)
 
     def _end(self) -> None:
         self._driver.terminate()

@@ -6,7 +6,6 @@ display of its own. Debian's packages: firefox-esr; webkit2gtk-driver and xvfb.
 
 from __future__ import annotations
 
-import http.client
 import itertools
 import json
 import os
@@ -21,6 +20,7 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from tests.waiting import eventually, free_port
+from tests.webdriver import ask
 
 SIZE = 1280, 800
 MINI_BROWSERS = "/usr/lib", "*/webkit2gtk-4.*/MiniBrowser"
@@ -115,27 +115,23 @@ class _WebKit:
     def __init__(self, port: int, binary: Path) -> None:
         self._port = port
         options = {"webkitgtk:browserOptions": {"binary": str(binary), "args": ["--automation"]}}
-        session = self.ask("POST", "/session", {"capabilities": {"alwaysMatch": options}})
-        self.session = f"/session/{session['sessionId']}"
+        session = ask(port, "POST", "/session", {"capabilities": {"alwaysMatch": options}})
+        self._session = f"/session/{session['sessionId']}"
 
     def open(self, address: str) -> None:
-        self.ask("POST", f"{self.session}/url", {"url": address})
+        self._ask("POST", "/url", {"url": address})
 
     def run(self, script: str) -> Any:
-        return self.ask("POST", f"{self.session}/execute/sync", {"script": script, "args": []})
+        return self._ask("POST", "/execute/sync", {"script": script, "args": []})
 
     def click(self, x: float, y: float) -> None:
-        self.ask("POST", f"{self.session}/actions", {"actions": _click(x, y)})
+        self._ask("POST", "/actions", {"actions": _click(x, y)})
 
-    def ask(self, method: str, path: str, body: object = None) -> Any:
-        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=60)
-        try:
-            connection.request(method, path, None if body is None else json.dumps(body))
-            value = json.loads(connection.getresponse().read())["value"]
-        finally:
-            connection.close()
-        assert not (isinstance(value, dict) and "error" in value), value
-        return value
+    def close(self) -> None:
+        self._ask("DELETE", "")
+
+    def _ask(self, method: str, path: str, body: object = None) -> Any:
+        return ask(self._port, method, self._session + path, body)
 
 
 @contextmanager
@@ -182,7 +178,7 @@ def webkit(folder: Path) -> Iterator[Page]:
         yield opened[0]
     finally:
         for page in opened:
-            page.ask("DELETE", page.session)
+            page.close()
         for process in (driver, display):
             process.terminate()
             process.wait(30)
