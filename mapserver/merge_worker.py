@@ -76,6 +76,7 @@ class MergeWorker:
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False
+        self._read_all = self._begun = False
         self._plight = ""
         self._merger.suspect(self._history.set_apart)
         self._waiting: FairQueue[Change] = FairQueue(0, 0)
@@ -92,6 +93,11 @@ class MergeWorker:
     def event(self) -> str:
         """What holds up merging; else the newest event of the history, with its reason."""
         return (self._plight or self._history.newest)[:MOST_WORDS]
+
+    @property
+    def begun(self) -> bool:
+        """Whether it has merged what it has read, or tried to; until then maps lie apart."""
+        return self._begun
 
     @property
     def settled(self) -> bool:
@@ -231,7 +237,7 @@ class MergeWorker:
         self._save()
 
     def _end_reading(self, taken: threading.Event) -> None:
-        self._reading = False
+        self._reading, self._read_all, self._begun = False, True, not self._dirty
         if self._merger.uncompared:
             self._publish_parts()
         taken.set()
@@ -315,7 +321,7 @@ class MergeWorker:
             self._history.failed(self._plight)
             return
         finally:
-            self._done = self._applied
+            self._done, self._begun = self._applied, self._read_all
             self._observe(self._schedule.monotonic() - began)
         self._curious, self._plight = True, ""
         try:

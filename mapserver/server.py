@@ -257,6 +257,7 @@ class MapServer:
             "damaged": self._lost,
             "event": failure or self._worker.event,
             "settled": self._worker.settled,
+            "merged": self._worker.begun,
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,
             "summary": merged.summary(),

@@ -7,20 +7,26 @@
 from __future__ import annotations
 
 import math
+import time
+from contextlib import closing
 from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.http.live_map import LiveMap
-from mapweave.mapserver.http.loading import write_shown
-from mapweave.mapserver.merging.merger import Merger
-from mapweave.merge.outlier_rejection.link_probability import link_probabilities
-from mapweave.recorded_fleet.fleet import split
-from mapweave.recorded_fleet.recording import DEMO_PAGE, RECORDING, recorded_maps
+from mapweave.mapserver.http.last_shown import NOTHING, LastShown, write_shown
+from mapweave.mapserver.http.reply import PATIENCE
+from mapweave.mapserver.http.web import Questions
+from mapweave.mapserver.server import MapServer
+from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
+from mapweave.recorded_fleet.recording import DEMO_PAGE, RECORDING
 from mapweave.storage.map_file import MapFile, write_map_file
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.world import Sensing, World, room, take_map
 
 SEED = 7
@@ -84,14 +90,24 @@ def recorded_fleet() -> list[ChangeBody]:
     return changes
 
 
-def page() -> str:
-    """What a map server shows of the recording once it has merged it: the message `map` of the page."""
-    merger = Merger()
-    for map_id, changes in recorded_maps().items():
-        merger.read((map_id, change) for change in split(map_id, changes)[0])
-    merged, shown = merger.merged(), LiveMap()
-    shown.show(merged, link_probabilities(merged), {})
-    return shown.message(0)
+def page() -> LastShown:
+    """What a map server shows of the recording once it has merged it, and its robots have set out."""
+    with TemporaryDirectory() as path, closing(MemoryBus(MemoryHub())) as bus:
+        folder, keys = Path(path), Keys("demo")
+        prepare(folder, folder / "store", NOTHING)
+        with MapServer(bus, keys, folder / "store", "s0") as server:
+            live, end = Questions(server, PATIENCE).live, time.monotonic() + 60.0
+            server.settle(60.0)
+            with RecordedFleet(bus, keys, "s0", folder):
+                while sum(robot.merged_from_robot is not None for robot in server.robots().robots) < len(
+                    TOURS
+                ):
+                    if time.monotonic() > end:
+                        raise TimeoutError("the robots are not on the merged map")
+                    time.sleep(0.01)
+                live.look()
+                live.rate()
+                return live.shown()
 
 
 if __name__ == "__main__":

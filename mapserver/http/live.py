@@ -12,9 +12,9 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -26,6 +26,7 @@ from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.http.json_values import json_values
+from mapweave.mapserver.http.last_shown import NOTHING, LastShown
 from mapweave.mapserver.http.live_map import LiveMap, Pair
 from mapweave.mapserver.http.login import Access, Person
 from mapweave.mapserver.http.reply import refusal
@@ -47,11 +48,9 @@ EXPECTED = 5.0
 """s in which a browser that has asked for the page opens its WebSocket."""
 MOST_VIEWERS = 64
 """More are refused."""
-LONGEST_HOLD = 10.0
-"""s for which the map of before is shown at most once the server is there, while it merges its own."""
 LOADING = "loading"
-HELD = f"{LOADING}; the map is that of before"
-"""What is said of the fleet meanwhile."""
+NOT_THERE, NOT_MERGED = f"{LOADING}; all is as last shown", "merging; the map is as last shown"
+"""What is said meanwhile: until the server is there, and until it has merged."""
 SERVER_FIELDS = ("summary", "settled", "event", "loading")
 """Of the server's status, which are sent along."""
 
@@ -82,16 +81,16 @@ class Shown(Protocol):
 class Live:
     """Looks at the server as long as there are viewers."""
 
-    def __init__(self, server: Shown, access: Access, before: str = "") -> None:
+    def __init__(self, server: Shown, access: Access, before: LastShown = NOTHING) -> None:
         """Begin with no viewer.
 
         Args:
             server: what viewers see.
             access: who may see it.
-            before: the message with the map that is shown until the server has merged its own; see `message`.
+            before: what is shown until the server has merged a map of its own; see `shown`.
         """
         self._server, self._access = server, access
-        self._before, self._hold_until = before, math.inf
+        self._before = before
         self._turn = threading.Lock()
         self._map = LiveMap()
         self._shown: MergedMap | None = None
@@ -144,7 +143,7 @@ class Live:
         await viewer.send_text(json_bytes(hello).decode())
         version, events, state = 0, 0, ""
         if before := self._before:
-            await viewer.send_text(before)
+            await viewer.send_text(before.map)
         while True:
             looked = self._looked
             if not self._access.holds(person):
@@ -173,25 +172,23 @@ class Live:
     async def _look_on(self) -> None:
         while self._viewers or time.monotonic() < self._expected_until:
             try:
-                fresh = await run_in_threadpool(self._look)
+                fresh = await run_in_threadpool(self.look)
             except MapweaveError as error:
                 log.warning("nothing new is shown: %s", error)
             except Exception:  # viewers keep what they have; the next look may succeed
                 log.exception("nothing new is shown")
             else:
                 if fresh and (self._rating is None or self._rating.done()):
-                    self._rating = asyncio.create_task(run_in_threadpool(self._rate))
+                    self._rating = asyncio.create_task(run_in_threadpool(self.rate))
             looked, self._looked = self._looked, asyncio.Event()
             looked.set()
             await asyncio.sleep(EVERY)
 
-    def _look(self) -> bool:
+    def look(self) -> bool:
         """Take over what is new; returns whether the links' probabilities are due."""
         status = self._server.status()
         if self._holds(status):
-            summary = HELD if self._before else LOADING
-            content = {"kind": "state", "server": {"summary": summary, "loading": True}, "robots": []}
-            self._state = json_bytes(content).decode()
+            self._hold(bool(status.get("loading")))
             return False
         merged, floors = self._server.merged(), self._server.annotations().floors
         with self._turn:
@@ -199,31 +196,47 @@ class Live:
                 self._shown, self._floors = merged, floors
                 self._map.show(merged, self._probabilities, floors)
         self._count(dict.fromkeys(self._server.history()))
-        content = {
-            "kind": "state",
-            "server": {name: status[name] for name in SERVER_FIELDS if name in status},
-            **json_values(self._server.robots()),
-        }
-        self._state = json_bytes(content).decode()
+        self._tell(
+            {name: status[name] for name in SERVER_FIELDS if name in status},
+            json_values(self._server.robots())["robots"],
+        )
         return merged is not self._rated and time.monotonic() >= self._rest_until
 
     def _holds(self, status: Mapping[str, Scalar]) -> bool:
         """Whether the map of before is shown still, or none: maps that are not merged yet lie apart."""
         if status.get("loading"):
             return True
-        self._hold_until = min(self._hold_until, time.monotonic() + LONGEST_HOLD)
-        if status.get("settled") or time.monotonic() >= self._hold_until:
-            self._before = ""
+        if status.get("merged", True):
+            self._before = NOTHING
         return bool(self._before)
 
-    def message(self) -> str:
-        """The message with the newest merged map, whole; empty if it is not shown yet. From any thread."""
+    def _hold(self, loading: bool) -> None:
+        """Show what was there before, with the robots and events that are known by now."""
+        before, summary = self._before, LOADING
+        robots, history = before.unheard, before.history
+        if before:
+            summary = NOT_THERE if loading else NOT_MERGED
+        if not loading:
+            robots, history = (
+                before.fleet(self._server.robots(), self._server.merged()),
+                self._server.history(),
+            )
+        self._count(dict.fromkeys(history))
+        self._tell({"summary": summary, "loading": True}, robots)
+
+    def _tell(self, server: Mapping[str, Scalar], robots: Sequence[Mapping[str, Any]]) -> None:
+        self._state = json_bytes({"kind": "state", "server": server, "robots": robots}).decode()
+
+    def shown(self) -> LastShown:
+        """What is shown at present; nothing until the server has merged. From any thread."""
         if self._before or self._server.status().get("loading") or not self._server.merged().maps:
-            return ""
+            return NOTHING
         merged = self._server.merged()
         with self._turn:
             self._map.show(merged, self._probabilities, self._server.annotations().floors)
-            return self._map.message(0)
+            message = self._map.message(0)
+        robots = json_values(self._server.robots())["robots"]
+        return LastShown(message, tuple(robots), self._server.history())
 
     def _count(self, history: Mapping[MapEvent, None]) -> None:
         """Number what is new. What the server keeps no longer is not kept here either."""
@@ -233,7 +246,7 @@ class Live:
             if event not in known:
                 self._events[event], self._counted = self._counted, self._counted + 1
 
-    def _rate(self) -> None:
+    def rate(self) -> None:
         """Work out the links' probabilities, which takes long in a large map."""
         began = time.monotonic()
         merged = self._rated = self._shown

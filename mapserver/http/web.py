@@ -63,6 +63,7 @@ from mapweave.mapserver.http.constraint_request import read_request
 from mapweave.mapserver.http.explain_request import read_questions
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
+from mapweave.mapserver.http.last_shown import NOTHING, LastShown
 from mapweave.mapserver.http.live import Live
 from mapweave.mapserver.http.login import PERSON, PUBLIC, Access, address_of
 from mapweave.mapserver.http.nodes import node_answers
@@ -114,7 +115,7 @@ class Web(HttpThread):
     """The map server for people. Listens from the start until closed.
 
     Attributes:
-        shown: gives the message with the map that the page shows; see `Live.message`.
+        shown: gives what the page shows; see `Live.shown`.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class Web(HttpThread):
         limits: Limits | None = None,
         logins: Logins | None = None,
         tls: ssl.SSLContext | None = None,
-        before: str = "",
+        before: LastShown = NOTHING,
     ) -> None:
         """Open the port and serve on a thread of its own.
 
@@ -145,7 +146,7 @@ class Web(HttpThread):
         check_reach(address, logins is not None, tls is not None)
         hosts = () if logins is None else logins.hosts
         questions = Questions(server, patience, logins, before=before)
-        self.shown = questions.live.message
+        self.shown = questions.live.shown
         app = SameSite(questions.app, address[0], hosts)
         try:
             super().__init__(app, address, limits, tls=tls)
@@ -188,7 +189,7 @@ class Questions:
         patience: float,
         logins: Logins | None = None,
         rates: Rates | None = None,
-        before: str = "",
+        before: LastShown = NOTHING,
     ) -> None:
         """Make the application.
 

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.identities.logins import Logins
     from mapweave.mapserver.http.answering import Answering
+    from mapweave.mapserver.http.last_shown import LastShown
     from mapweave.mapserver.http.web import Web
     from mapweave.wire.credentials import Credentials
 
@@ -35,16 +36,17 @@ class HttpAccess:
         scheme = "http" if self.tls is None else "https"
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
 
-    def serve(self, server: Answering, before: str = "") -> Web:
+    def serve(self, server: Answering, before: LastShown | None = None) -> Web:
         """Open the port.
 
         Args:
             server: answers.
             before: what the page shows until the server has merged; see `mapserver.http.live.Live`.
         """
+        from mapweave.mapserver.http.last_shown import NOTHING
         from mapweave.mapserver.http.web import Web
 
-        return Web(self.address, server, logins=self.logins, tls=self.tls, before=before)
+        return Web(self.address, server, logins=self.logins, tls=self.tls, before=before or NOTHING)
 
     def renew(self, own: Credentials) -> None:
         """Go on with another certificate."""

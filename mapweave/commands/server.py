@@ -122,12 +122,14 @@ def run(arguments: argparse.Namespace) -> int:
         people, http = None, arguments.http or (DEMO_HTTP if arguments.demo else None)
         if http is not None:
             from mapweave.commands.http_access import http_access
-            from mapweave.mapserver.http.loading import SUFFIX, LoadingServer, read_shown, write_shown
+            from mapweave.mapserver.http.last_shown import SUFFIX, read_shown, write_shown
+            from mapweave.mapserver.http.loading import LoadingServer
             from mapweave.recorded_fleet.recording import DEMO_PAGE
 
             people, loading = http_access(http, folder, name), LoadingServer()
             shown = path.with_name(path.name + SUFFIX)
-            web = people.serve(loading, read_shown(DEMO_PAGE if arguments.demo else shown))
+            before = read_shown(DEMO_PAGE if arguments.demo else shown)
+            web = people.serve(loading, before)
             stack.enter_context(web)
             print(stamped(f"for people: {people.url}"), flush=True)
 
@@ -151,7 +153,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.demo:
             from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
 
-            prepare(data, path)
+            prepare(data, path, before)
         if arguments.store is None and path.exists() and path.stat().st_size > LARGE:
             print(stamped(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ..."), flush=True)
         base = None

@@ -11,12 +11,15 @@ from types import TracebackType
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.http.last_shown import LastShown
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.log.store import HISTORY
 from mapweave.recorded_fleet.recording import recorded_maps
 from mapweave.recorded_fleet.robot import RecordedRobot
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
+from mapweave.wire.messages import KeptHistory, encode
 
 EVERY = 0.5
 """Between two statuses of a robot, s, as with agents."""
@@ -24,12 +27,13 @@ MAPPING, STILL = "cy", 12
 """This robot maps so many nodes before the viewer's eyes. Each is a node and the edge that leads to it."""
 
 
-def prepare(folder: Path, store: Path) -> None:
+def prepare(folder: Path, store: Path, shown: LastShown) -> None:
     """Make the robots' journals, and a store that has what they have: a server shows the maps at once.
 
     Args:
         folder: for the journals.
         store: of the server.
+        shown: by the server that recorded them; its history goes on.
 
     Raises:
         MapweaveError: the disk does not take it.
@@ -42,6 +46,8 @@ def prepare(folder: Path, store: Path) -> None:
                 rows = journal.rows(map_id, 1, journal.head(map_id))
                 entries = [Entry(*row, change) for row, change in zip(rows, written, strict=True)]
                 filled.apply(map_id, journal.log_id(map_id), entries)
+        if shown:
+            filled.put_result(HISTORY, encode(KeptHistory(shown.history, tuple(shown.parts))))
 
 
 class RecordedFleet:

@@ -14,8 +14,10 @@ from pathlib import Path
 from urllib.request import Request, urlopen
 
 import pytest
+from websockets.sync.client import connect
 
 from mapweave.hybridmap.change import NodePut
+from mapweave.mapserver.http.live import NOT_THERE
 from mapweave.recorded_fleet.recording import RECORDING, recorded_maps
 from mapweave.wire.codec import encode_body
 from tests.browser import PROGRAMS, Browser, there_is_none
@@ -159,6 +161,34 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
             eventually(lambda: page.run("return mapweave.model.order.length") > 60)
         refused = [words for words in page.errors() if "ERR_CONNECTION_REFUSED" not in words]
         assert all("WebSocket" in words for words in refused), refused
+
+
+@pytest.mark.slow
+def test_robots_events_and_links_are_there_before_the_server_is_loaded() -> None:
+    http = free_port()
+    with demo(http, free_port()):
+        messages: dict[str, dict] = {}
+
+        def received() -> bool:
+            try:
+                with connect(f"ws://127.0.0.1:{http}/live", proxy=None) as socket:
+                    while "state" not in messages:
+                        message = json.loads(socket.recv(timeout=20))
+                        messages[message["kind"]] = message
+            except OSError:
+                return False
+            return True
+
+        eventually(received, 60)
+        assert messages["state"]["server"] == {"summary": NOT_THERE, "loading": True}
+        robots = messages["state"]["robots"]
+        assert [robot["robot"] for robot in robots] == ["ada", "bo", "cy", "dee"]
+        assert all(robot["before"] and robot["component"] >= 0 for robot in robots)
+        assert len(messages["events"]["history"]) == 2 and len(messages["map"]["components"]) == 2
+        # The history of before goes on: nothing comes apart while the maps are read, nothing is said twice.
+        eventually(lambda: get(http, "status").get("merged") is True, 90)
+        history = get(http, "history")["history"]
+        assert history == messages["events"]["history"]
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ import pytest
 from websockets.sync.client import connect
 
 from mapweave.hybridmap.node import MapId
-from mapweave.mapserver.http.live import HELD, LOADING
+from mapweave.mapserver.http.live import LOADING, NOT_THERE
 from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.maps import looking_around, map_tours
 from synthetic.world import room
@@ -78,7 +78,7 @@ def test_the_page_shows_the_map_of_before_while_the_server_loads(tmp_path: Path)
         eventually(settled, 60)
     with server(http, *data):
         again = first_messages(http)
-        assert again["state"]["server"] == {"summary": HELD, "loading": True}
+        assert again["state"]["server"] == {"summary": NOT_THERE, "loading": True}
         (component,) = again["map"]["components"]
         assert component["maps"] == ["r0.1"]
         eventually(settled, 60)

@@ -33,7 +33,7 @@ const moved = () => painter.ask();
 const selection = new Selection(model), drawing = new Drawing(viewport, corners => selection.enclose(corners));
 const planEditor = new PlanEditor(model, viewport, moved);
 const panel = new EditPanel(model, selection, drawing, { moved, planning: openPlan });
-const page = { robots: [], commands: false, whyNot: "", node: "", robot: "", photo: [], places: [], readOnly: false };
+const page = { robots: [], commands: false, whyNot: "", node: "", robot: "", photo: [], places: [], readOnly: false, loading: true };
 // For tests and measurements.
 window.mapweave = { model, viewport, painter, page, selection, drawing, planEditor };
 
@@ -193,6 +193,7 @@ watch({
     page.whyNot = why_not;
     if (name) panel.sign(name);
     page.readOnly = read_only;
+    page.loading = true;
     permit(commands, why_not);
     byId("connection").textContent = read_only ? "map file" : "live";
     clearEvents();
@@ -217,8 +218,10 @@ watch({
     byId("summary").textContent = server.summary + (server.settled === false ? ", still merging" : "");
     listRobots(robots, name => selectRobot(name));
     updateRobot(robots);
+    if (page.loading && !server.loading) listCorrections();
+    page.loading = Boolean(server.loading);
     // Lists are shown once they are filled, so that nothing jumps.
-    if (!server.loading) byId("fleet").classList.remove("waiting");
+    if (!server.loading || robots.length) byId("fleet").classList.remove("waiting");
     if (!page.readOnly) byId("connection").textContent = server.loading ? server.summary : "live";
     painter.ask();
   },
@@ -226,7 +229,7 @@ watch({
     addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name));
     if (page.heard) byId("announcement").textContent = history.at(-1)?.words || "";
     page.heard = true;
-    listCorrections();
+    if (!page.loading) listCorrections();
   },
 }, up => {
   if (!up) permit(false, "The map server does not answer: nothing can be changed until it does. What you have typed stays.");

@@ -18,7 +18,7 @@ function ellipseOf(covariance) {
   return { major: Math.sqrt(middle + reach), minor: Math.sqrt(Math.max(middle - reach, 0)),
     angle: Math.atan2(2 * xy, xx - yy) / 2 };
 }
-const life = robot => !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["silent", "warn"] : ["alive", "good"];
+const life = robot => robot.before ? ["as last shown", "soft"] : !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["silent", "warn"] : ["alive", "good"];
 function missionWords(mission) {
   if (!mission) return "";
   const { order, state, progress, reason } = mission, goal = order.goal || order.node || "";
@@ -87,7 +87,7 @@ export function updateRobot(robots) {
   facts(panel.facts, [
     ["state", word, kind],
     ["held against it", robot.accusation, "bad"],
-    ["last heard", `${seconds(robot.age)} ago`],
+    ["last heard", robot.before ? "before the server began" : `${seconds(robot.age)} ago`],
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
     ["on the map", pose ? `${pose[0].toFixed(2)}, ${pose[1].toFixed(2)} m, ${degrees(pose[2])}${spread}` : "not known"],
