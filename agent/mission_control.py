@@ -168,13 +168,15 @@ class MissionControl:
             if report is None:
                 return None
             order = report.order
-            wanted = as_mission(order) if self._active(order) else Idle()
+            wanted = ordered = as_mission(order) if self._active(order) else Idle()
             gone = now - self._linked_at > GONE and not isinstance(wanted, Carried)
             self._interruption = ""
             if gone and self._alone is WithoutServer.HOME and home is not None:
                 wanted, self._interruption = GoTo(home), f"goes home: no map server for {GONE:g} s"
             elif gone and self._alone is not WithoutServer.GO_ON:
                 wanted, self._interruption = Idle(), f"stands: no map server for {GONE:g} s"
+            if wanted == ordered:
+                self._interruption = ""
             if (order.id, wanted) == self._applied:
                 return None
             self._applied = order.id, wanted
@@ -233,6 +235,20 @@ class MissionControl:
             self._note(report)
         self._defer(self.save)
         return True
+
+    def explained(self, status: Status) -> Status:
+        """The status for others: also why the robot does something else than its mission says."""
+        with self._lock:
+            what, _, why = self._interruption.partition(": ")
+        if not what:
+            return status
+        if status.doing != "idle":
+            return replace(
+                status, detail="; ".join(part for part in (f"{what}: {why}", status.detail) if part)
+            )
+        # The first words are that there is no mission.
+        _, _, more = status.detail.partition("; ")
+        return replace(status, doing="standing", detail="; ".join(part for part in (why, more) if part))
 
     def _active(self, order: MissionOrder) -> bool:
         """Whether the pipeline is still to do it. A goal that was reached is held, and not sought again."""

@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
@@ -109,6 +110,7 @@ class Runner:
         now = self._ticks % REPORT_EVERY == 0 and self._due()
         now = now or bool(step.questions) or changed
         self._reported = self._clock() if now else self._reported
+        step = replace(step, status=self._missions.explained(step.status))
         status = self._monitor.explained(step.status)
         self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
         self._ticks += 1

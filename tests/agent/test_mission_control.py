@@ -283,6 +283,42 @@ def test_a_robot_whose_server_is_gone_does_as_it_is_set(setting, home, does, rea
     assert control.report.reason == ""
 
 
+NO_MISSION = Status("idle", "no mission; no camera", 0, 0, Pose2(), False)
+DRIVING = Status("driving", "to r0.1.4", 0, 0, Pose2(), False, "goto")
+
+
+@pytest.mark.parametrize(
+    ("setting", "status", "doing", "detail"),
+    [
+        (WithoutServer.STAND, NO_MISSION, "standing", "no map server for 10 s; no camera"),
+        (WithoutServer.HOME, DRIVING, "driving", "goes home: no map server for 10 s; to r0.1.4"),
+        (WithoutServer.GO_ON, DRIVING, "driving", "to r0.1.4"),
+    ],
+)
+def test_a_robot_that_stands_or_goes_home_says_that_it_is_for_the_server(
+    setting, status, doing, detail
+) -> None:
+    control = Disk().robot(setting)
+    control.take(order(1))
+    control.next(True, 0.0, HOME)
+    assert control.explained(DRIVING) == DRIVING
+    control.next(False, GONE + 0.1, HOME)
+    said = control.explained(status)
+    assert (said.doing, said.detail) == (doing, detail)
+    control.next(True, GONE + 0.2, HOME)
+    assert control.explained(DRIVING) == DRIVING
+
+
+def test_a_robot_that_was_stopped_stands_for_that_and_not_for_the_server() -> None:
+    control = Disk().robot(WithoutServer.STAND)
+    control.take(order(1, MissionKind.STOP))
+    control.next(True, 0.0, HOME)
+    control.next(False, GONE + 0.1, HOME)
+    assert control.explained(NO_MISSION) == NO_MISSION
+    control.follow(NO_MISSION)
+    assert control.report is not None and control.report.reason == "no mission; no camera"
+
+
 def test_a_recording_takes_no_orders() -> None:
     control = MissionControl("r0", refusal="a recording takes no orders")
     control.begin(MissionKind.CARRIED)
