@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         console.print(f"Written to {file}: `mapweave agent {name}` and `mapweave replay` use it.")
     if arguments.json:
         print(json.dumps(_figures(found, written=not worse)))
-    return 0
+    return NO if worse else 0
 
 
 def _recorded(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapweave.agent.calibration import recorded_drive
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.cli import main
@@ -97,6 +98,22 @@ def test_a_robot_is_watched_while_it_is_driven(
     assert forward["estimated"] == pytest.approx(TRUE.forward, abs=0.06)
     assert read_geometry(tmp_path / "r7.toml")["forward"] == pytest.approx(forward["estimated"], rel=1e-4)
     assert "too short" in complaint(capfd, "calibrate", "drive", *given[:-1], 3, status=NO)
+
+
+@pytest.mark.slow
+def test_an_estimate_that_predicts_worse_is_not_written_and_the_exit_status_says_so(
+    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worse(*arguments: Any) -> recorded_drive.DriveCalibration:
+        found = calibrate(*arguments)
+        return replace(found, estimated_px=found.declared_px + 1.0)
+
+    calibrate = recorded_drive.calibrate
+    monkeypatch.setattr(recorded_drive, "calibrate", worse)
+    command = ["calibrate", "drive", str(recording), "--calibration", str(tmp_path), "--json"]
+    assert main(command) == NO
+    assert json.loads(capfd.readouterr().out.splitlines()[-1])["written"] is False
+    assert not list(tmp_path.glob("*.toml"))
 
 
 @pytest.mark.slow
