@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.calibration.camera_motions import WheelTrack
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, frame_change, geometry_of
+from mapweave.agent.calibration.counted_wheels import CountedWheels
 from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.floor_tiles import FloorTiles
@@ -48,6 +48,8 @@ PARTS = 2
 MOST_PAIRS = 150
 KEPT_NEW = 40
 """Of these the newest stay; of the others those go that turn least."""
+MARGIN_S = 2.0
+"""Before and after a pair the wheels' readings are kept for so long, s: a delay asks for them."""
 STEPS = 1
 """Gauss-Newton steps of a solution."""
 SETTLED = 0.5
@@ -89,8 +91,7 @@ class OnlineCalibration:
         self._correction = OdometryCorrection()
         self._plain = Lens(description.camera, description.distortion)
         self._estimator = Estimator(self._geometry, sigma_of(description.camera))
-        self._stamps: list[float] = []
-        self._counts: list[tuple[float, float]] = []
+        self._counted = CountedWheels()
         self._turns: list[float] = []
         self._source: object = None
         self._first_s = self._first_way = 0.0
@@ -121,12 +122,12 @@ class OnlineCalibration:
         """Count what the wheels report, and correct it by the geometry in use. Once a tick, first of all."""
         wheels = observation.odometry
         stamp = 1e-9 * observation.stamp_ns
-        if self._stamps and stamp <= self._stamps[-1]:
+        if stamp <= self._counted.stamp:
             # A clock that stands or goes back: what was seen before cannot be tied to the wheels any more.
             self._forget()
-        way, turn = self._counts[-1] if self._counts else (0.0, 0.0)
-        self._stamps.append(stamp)
-        self._counts.append((way + wheels.forward, turn + wheels.turn))
+        if self._counted.full:
+            self._trim()
+        self._counted.add(stamp, wheels)
         self._ranger_scale.step(wheels, observation.proximity)
         return self._correction.step(observation, self._geometry)
 
@@ -141,7 +142,7 @@ class OnlineCalibration:
             ids: (N,) of the tracks.
             raw: (N, 2) px in the real image.
         """
-        now = self._stamps[-1]
+        now = self._counted.stamp
         found = self._solve()
         if source is not self._source or now - self._first_s > 3.0 * LONGEST_S:
             self._start(image, source, now, ids, raw)
@@ -154,7 +155,7 @@ class OnlineCalibration:
         )
         camera = self._declared.camera
         due = now - self._first_s >= LONGEST_S or moved > ENOUGH * camera.width
-        way = abs(self._counts[-1][0] - self._first_way)
+        way = abs(self._counted.way - self._first_way)
         leaving = len(common) < LEAST_LEFT * len(self._ids) or way > ENOUGH_HEIGHTS * camera.mount_height
         if not (due or leaving):
             self._refresh()
@@ -186,16 +187,12 @@ class OnlineCalibration:
         self, image: NDArray[np.uint8], source: object, now: float, ids: NDArray[np.int64], raw: Array
     ) -> None:
         self._source, self._first_s, self._ids, self._begin = source, now, ids.copy(), raw.copy()
-        self._first_way = self._counts[-1][0]
+        self._first_way = self._counted.way
         self._floor = self._tiles.part(image)
-
-    def _wheels(self) -> WheelTrack:
-        counts = np.array(self._counts)
-        return WheelTrack(np.array(self._stamps), counts[:, 0], counts[:, 1])
 
     def _take(self, pair: ImagePair, floor: NDArray[np.float32]) -> None:
         estimator = self._estimator
-        wheels = self._wheels()
+        wheels = self._counted.track()
         at = estimator.add(pair, wheels).at
         estimator.add_floor(self._tiles.match(floor, self._floor, at))
         turned = np.interp([pair.first_s, pair.last_s], wheels.stamps, wheels.turn)
@@ -205,7 +202,6 @@ class OnlineCalibration:
             old = int(np.argmin(self._turns[:-KEPT_NEW]))
             estimator.drop(old)
             del self._turns[old]
-            self._trim()
         self._since_solution += 1
         if len(estimator.pairs) >= FEWEST_PAIRS and self._since_solution >= SOLVE_EVERY:
             self._since_solution, self._parts_left = 0, PARTS
@@ -219,7 +215,7 @@ class OnlineCalibration:
             self._estimator.find_floor()
             self._estimator.ranged = self._ranger_scale.scale()
             return ()
-        estimate = self._estimator.solve(self._wheels(), STEPS)
+        estimate = self._estimator.solve(self._counted.track(), STEPS)
         before, self._last = self._last, estimate
         if before is None:
             return ()
@@ -269,17 +265,17 @@ class OnlineCalibration:
         if self._last is not None and len(estimator.pairs) > 1:
             self._stale = (self._stale + 1) % len(estimator.pairs)
             if estimator.stale(self._stale):
-                estimator.refresh(self._stale, self._wheels())
+                estimator.refresh(self._stale, self._counted.track())
 
     def _trim(self) -> None:
-        """Forget what the wheels counted before the first pair."""
-        first = min(pair.first_s for pair in self._estimator.pairs) - 2.0
-        gone = int(np.searchsorted(self._stamps, first))
-        if gone > 1000:
-            del self._stamps[:gone], self._counts[:gone]
+        """Forget what the wheels counted between the pairs."""
+        now, pairs = self._counted.stamp, self._estimator.pairs
+        begins = [*(pair.first_s for pair in pairs), max(self._first_s, now - 3.0 * LONGEST_S)]
+        ends = [*(pair.last_s for pair in pairs), now]
+        self._counted.forget_between(np.array(begins) - MARGIN_S, np.array(ends) + MARGIN_S)
 
     def _forget(self) -> None:
-        self._stamps, self._counts, self._turns = [], [], []
+        self._counted, self._turns = CountedWheels(), []
         vector = self._estimator.vector
         self._estimator = Estimator(geometry_of(self._declared), sigma_of(self._declared.camera))
         self._estimator.vector = vector

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -153,7 +154,7 @@ def test_no_tick_does_two_of_the_costly_things(monkeypatch: pytest.MonkeyPatch):
         do: Callable[..., object] = getattr(Estimator, name)
 
         def noted(self: Estimator, *arguments: object) -> object:
-            done.append((online._stamps[-1], name))
+            done.append((online._counted.stamp, name))
             return do(self, *arguments)
 
         monkeypatch.setattr(Estimator, name, noted)
@@ -165,3 +166,14 @@ def test_no_tick_does_two_of_the_costly_things(monkeypatch: pytest.MonkeyPatch):
     watched(run, TRUE, 1, online=online)
     assert [name for _, name in done].count("solve") >= 3
     assert len({stamp for stamp, _ in done}) == len(done)
+
+
+@pytest.mark.parametrize("forward", [0.0, 0.02], ids=["standing", "driving in the dark"])
+def test_hours_without_pairs_take_no_memory(forward: float):
+    online = OnlineCalibration(RobotDescription(CAMERA, geometry=TRUE))
+    tracemalloc.start()
+    for k in range(20_000):
+        online.correct(Observation((k + 1) * 100_000_000, Odometry(forward, 0.0)))
+    grown, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert grown < 200_000
