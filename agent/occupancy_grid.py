@@ -104,12 +104,15 @@ class OccupancyGrid:
         hits = proximity < self._description.ranger_reach - 0.05
         # A cell counts once, however many beams meet it.
         ended = origin + directions[hits] * ends[hits, None]
-        self._odds.flat[self._numbers(points[along])] -= MISS
-        self._odds.flat[self._numbers(ended)] += HIT + MISS
+        odds = self._odds.reshape(-1)
+        passed, met = self._numbers(points[along]), self._numbers(ended)
+        odds[passed] -= MISS
+        odds[met] += HIT + MISS
         # The robot's own footprint is free.
         own = self.cells(origin + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
         self._odds[own[:, 0], own[:, 1]] = -MOST
-        np.clip(self._odds, -MOST, MOST, out=self._odds)
+        for changed in (passed, met):
+            odds[changed] = np.clip(odds[changed], -MOST, MOST)
 
     def _numbers(self, points: Array) -> NDArray[np.int64]:
         """Numbers of the cells, row by row, in which (N, 2) m in map lie, each once."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ class MappingState:
         """At the anchor with certainty (the paper's P_0^r = 0), without landmarks."""
         return MappingState(np.zeros(3), np.zeros((0, 3)), np.zeros((3, 3)))
 
-    @property
+    @cached_property
     def pose(self) -> PoseGaussian:
         """`anchor_from_robot`, perturbed on the right as everywhere outside the filter."""
         pose_vector = Pose2.from_vector(self.pose_vector)

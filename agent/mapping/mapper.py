@@ -66,6 +66,7 @@ class Mapper:
         self._keyframes = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
         self._retirement = NodeRetirement(self._keyframes.map, released)
         self._trajectory = TrajectoryRecorder(description)
+        self._composed = HERE, HERE, HERE
         self._anchor: View | None = None
         self._leaves: list[View] = []
         # A thread extracts features. Those of a further view are used in the next tick, which begins by
@@ -130,7 +131,11 @@ class Mapper:
     @property
     def map_from_robot(self) -> PoseGaussian:
         """Pose in the agent's map."""
-        return self._keyframes.map_from_anchor @ self._tracking.pose
+        anchor, moved = self._keyframes.map_from_anchor, self._tracking.pose
+        if self._composed[0] is not anchor or self._composed[1] is not moved:
+            # Many ask for it in a tick.
+            self._composed = anchor, moved, anchor @ moved
+        return self._composed[2]
 
     @property
     def description(self) -> RobotDescription:

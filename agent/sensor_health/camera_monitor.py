@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -67,7 +68,8 @@ class CameraMonitor:
         else:
             self._image, self._moved, self.frozen = image, Pose2(), False
         self._stale = self._stale + self._tick if self.frozen else 0.0
-        mean, spread = float(image.mean()), float(image.std())
+        means, spreads = cv2.meanStdDev(image)
+        mean, spread = float(means[0, 0]), float(spreads[0, 0])
         empty = spread < EVEN and not BLACK <= mean <= WHITE
         self._empty = self._empty + self._tick if empty else 0.0
 
