@@ -106,20 +106,20 @@ def _fields(data: bytes, limit: Limit) -> dict[str, Any]:
 
 def _check(fields: dict[str, Any]) -> None:
     """Refuse text that is not printable and numbers that are not finite, at any depth."""
-    left: list[Any] = [fields]
-    while left:
-        value = left.pop()
+    values: list[Any] = [fields]
+    for value in values:  # it grows meanwhile
         kind = type(value)
-        if kind is list:
-            left += value
-        elif kind is dict:
-            left += value
-            left += value.values()
-        elif kind is str:
+        if kind is str:
             if not value.isprintable():
                 raise InvalidMessage("text must be one printable line")
-        elif kind is float and not math.isfinite(value):
-            raise InvalidMessage(f"{value:g} is not finite")
+        elif kind is float:
+            if not math.isfinite(value):
+                raise InvalidMessage(f"{value:g} is not finite")
+        elif kind is dict:
+            values += value
+            values += value.values()
+        elif kind is list:
+            values += value
 
 
 def _exceeds(data: bytes, most: int) -> bool:

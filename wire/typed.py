@@ -133,39 +133,52 @@ def packed(value: Any, packers: Packers = PACKERS) -> Any:
     Raises:
         InvalidValue: a number is out of the range of messages.
     """
-    kind = type(value)
+    kind: Any = type(value)
     if (pack_value := packers.get(kind)) is not None:
         return pack_value(value)
-    if kind in PLAIN:
-        return value
-    if is_dataclass(kind):
-        tag, names = _layout(kind)
-        return tag | {name: packed(getattr(value, name), packers) for name in names}
-    match value:
-        case msgspec.Struct():
-            return msgspec.to_builtins(value, builtin_types=(bytes,))
-        case Enum():
-            return value.value
-        case float():
-            return min(max(float(value), -MAX_FLOAT), MAX_FLOAT)
-        case np.generic():
-            return value.item()
-        case Mapping() if any(isinstance(key, tuple) for key in value):
-            return [[packed(key, packers), packed(element, packers)] for key, element in value.items()]
-        case Mapping():
-            return {key: packed(element, packers) for key, element in value.items()}
-        case tuple() | list():
-            return [packed(element, packers) for element in value]
-        case frozenset():
-            return [packed(element, packers) for element in sorted(value)]
-    return value
+    return value if kind in PLAIN else _packer(kind)(value, packers)
 
 
 @cache
-def _layout(kind: type) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The tag of a dataclass, if it has one, and the names of its fields."""
+def _packer(kind: Any) -> Callable[[Any, Packers], Any]:
+    """What makes plain data of the values of a type that has no form of its own."""
+    if is_dataclass(kind):
+        return _fields_packer(kind)
+    if issubclass(kind, msgspec.Struct):
+        return lambda value, packers: msgspec.to_builtins(value, builtin_types=(bytes,))
+    if issubclass(kind, Enum):
+        return lambda value, packers: value.value
+    if issubclass(kind, float):
+        return lambda value, packers: min(max(float(value), -MAX_FLOAT), MAX_FLOAT)
+    if issubclass(kind, np.generic):
+        return lambda value, packers: value.item()
+    if issubclass(kind, Mapping):
+        return _packed_map
+    if issubclass(kind, tuple | list):
+        return lambda value, packers: [packed(element, packers) for element in value]
+    if issubclass(kind, frozenset):
+        return lambda value, packers: [packed(element, packers) for element in sorted(value)]
+    return lambda value, packers: value
+
+
+def _fields_packer(kind: Any) -> Callable[[Any, Packers], dict[str, Any]]:
+    """What packs a dataclass: the tag, if it has one, and the fields."""
     tag = {"kind": kind.TAG} if hasattr(kind, "TAG") else {}
-    return tag, tuple(field.name for field in fields(kind))
+    names = [field.name for field in fields(kind)]
+
+    def pack_fields(value: Any, packers: Packers) -> dict[str, Any]:
+        out: dict[str, Any] = tag.copy()
+        for name in names:
+            out[name] = packed(getattr(value, name), packers)
+        return out
+
+    return pack_fields
+
+
+def _packed_map(value: Mapping[Any, Any], packers: Packers) -> Any:
+    if any(isinstance(key, tuple) for key in value):
+        return [[packed(key, packers), packed(element, packers)] for key, element in value.items()]
+    return {key: packed(element, packers) for key, element in value.items()}
 
 
 def encode(value: Any, limit: Limit) -> bytes:
@@ -261,27 +274,31 @@ def _convert(plain: Any, kind: Any) -> Any:
 
 def _read(opaque: Any, plain: Any) -> Any:
     try:
-        return _value(opaque.kind, plain)
+        return _reader(opaque)(plain)
     except (msgspec.ValidationError, MapweaveError) as error:
         # msgspec adds the path to a ValueError.
         raise ValueError(str(error).splitlines()[0]) from None
 
 
-def _value(kind: Any, plain: Any) -> Any:
+@cache
+def _reader(opaque: Any) -> Callable[[Any], Any]:
+    """What makes values of an opaque type of plain data."""
+    kind = opaque.kind
     if kind in FORMS:
         form = FORMS[kind]
-        return form.read(_convert(plain, form.plain))
+        return lambda plain: form.read(_convert(plain, form.plain))
     if get_origin(kind) in (Union, UnionType):
-        kind = _tagged(kind, plain)
+        return lambda plain: _reader(_opaque(_tagged(kind, plain)))(plain)
     if is_dataclass(kind):
         make: Any = kind
-        read = _convert(plain, _fields(make))
-        return make(**{name: getattr(read, name) for name in read.__struct_fields__})
+        struct = _fields(make)
+        return lambda plain: make(**msgspec.structs.asdict(_convert(plain, struct)))
     if get_origin(kind) is np.ndarray:
-        return _array(np.dtype(get_args(get_args(kind)[1])[0]), *_convert(plain, _Array))
-    pair: Any = tuple[tuple(map(_schema, get_args(kind)))]  # type: ignore[misc]
+        dtype = np.dtype(get_args(get_args(kind)[1])[0])
+        return lambda plain: _array(dtype, *_convert(plain, _Array))
     # An empty map is packed as a map: the type of its keys is unknown.
-    return dict(_convert(plain, list[pair] | _EmptyMap))
+    pairs: Any = list[tuple[tuple(map(_schema, get_args(kind)))]] | _EmptyMap  # type: ignore[misc]
+    return lambda plain: dict(_convert(plain, pairs))
 
 
 def _tagged(kind: Any, plain: Any) -> Any:

@@ -25,6 +25,7 @@ from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.node import MapId
@@ -188,6 +189,7 @@ def main() -> None:
     """Connect, wait for the start, map, and say how long acknowledgements took."""
     orders = Orders(**json.loads(sys.argv[1]))
     stops = 2 + int(orders.seconds / INTERVAL) + -(-orders.burst // 2 // orders.agents)
+    jit.load()  # as a robot does before it maps
     agents = [Agent(orders, orders.first + k, stops) for k in range(orders.count)]
     for agent in agents:
         agent.map_on()
