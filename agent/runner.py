@@ -52,7 +52,7 @@ class Runner:
         """Put the parts together.
 
         Args:
-            pipeline: the mind.
+            pipeline: decides what the robot does.
             fleet: questions and status.
             replicator: where changes go: to the own disk, then to the server.
             missions: what the pipeline shall do.
@@ -129,7 +129,7 @@ class Runner:
         self._print(step.fault.words if step.fault is not None else f"believes its {before} again")
 
     @property
-    def curious(self) -> bool:
+    def has_questions(self) -> bool:
         """Whether the last tick had questions."""
         return bool(self._questions)
 
@@ -157,7 +157,7 @@ class Runner:
             step = self._think(observation)
             robot.act(step.command)
             self._hand_over(observation, step)
-            if self.curious:
+            if self.has_questions:
                 self.exchange()
             self.busy = self._clock() - began
             self._previous = observation.stamp_ns, self.busy

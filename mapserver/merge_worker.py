@@ -75,9 +75,9 @@ class MergeWorker:
         self._merger = Merger(places, merge, compare, schedule.pause)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
-        self._dirty = self._reading = self._curious = False
+        self._dirty = self._reading = self._unprepared = False
         self._read_all = self._begun = False
-        self._plight = ""
+        self._problem = ""
         self._merger.suspect(self._history.set_apart)
         self._waiting: FairQueue[Change] = FairQueue(0, 0)
         self._counting = threading.Lock()
@@ -92,7 +92,7 @@ class MergeWorker:
     @property
     def event(self) -> str:
         """What holds up merging; else the newest event of the history, with its reason."""
-        return (self._plight or self._history.newest)[:MOST_WORDS]
+        return (self._problem or self._history.newest)[:MOST_WORDS]
 
     @property
     def begun(self) -> bool:
@@ -216,7 +216,7 @@ class MergeWorker:
     def _idle(self) -> float | None:
         """A piece of the work that can wait: compare nodes, merge, prepare answers."""
         # What comes in pieces is merged when it is whole.
-        if self._reading or not (self._dirty or self._curious):
+        if self._reading or not (self._dirty or self._unprepared):
             return None
         if self._merger.uncompared:
             self._search_pairs()
@@ -286,7 +286,7 @@ class MergeWorker:
 
     def _search_pairs(self) -> None:
         """A part of the work before the first merge, which must not hold up new changes."""
-        self._plight = f"{self._merger.uncompared} nodes are still to be compared with others"
+        self._problem = f"{self._merger.uncompared} nodes are still to be compared with others"
         try:
             self._merger.search_pairs(SEARCHES_AT_ONCE)
         except Exception:  # the merge tries again, and reports if it cannot
@@ -302,9 +302,9 @@ class MergeWorker:
 
     def _prepare(self, most: int) -> None:
         """Evaluate the aliasing of nodes in advance, so that relocalization need not wait for it."""
-        self._curious = False
+        self._unprepared = False
         try:
-            self._curious = self._answers.relocalizer.prepare(most) > 0
+            self._unprepared = self._answers.relocalizer.prepare(most) > 0
         except Exception:  # it is evaluated with the next question
             log.exception("the aliasing of nodes could not be evaluated in advance")
 
@@ -317,13 +317,13 @@ class MergeWorker:
             self._answers = made[-1] if made else self._answers_from(merged)
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("merging failed")
-            self._plight = "merging failed: see the server's log"
-            self._history.failed(self._plight)
+            self._problem = "merging failed: see the server's log"
+            self._history.failed(self._problem)
             return
         finally:
             self._done, self._begun = self._applied, self._read_all
             self._observe(self._schedule.monotonic() - began)
-        self._curious, self._plight = True, ""
+        self._unprepared, self._problem = True, ""
         try:
             self._history.follow(merged)
         except Exception:  # a defect here must not end all merging

@@ -129,7 +129,7 @@ class KeyframeBuilder:
     def place(
         self,
         anchor: View,
-        leaves: list[View],
+        further: list[View],
         estimate: EpisodeEstimate,
         trajectory: TrajectoryRecorder,
         moved: PoseGaussian,
@@ -140,7 +140,7 @@ class KeyframeBuilder:
 
         Args:
             anchor: the view where the episode began.
-            leaves: further views of the episode.
+            further: further views of the episode.
             estimate: what it is known by.
             trajectory: trajectory since the last node; it goes with the anchor, if that becomes a node.
             moved: `old_anchor_from_new`, by the filter.
@@ -160,24 +160,24 @@ class KeyframeBuilder:
             self.map_from_anchor = here
             placed = AnchoredKeyframe(self._node(anchor, landmarks, here, segment), tracks)
             self.join(placed)
-            for leaf in reversed(leaves):
+            for view in reversed(further):
                 self._pending.appendleft(
-                    partial(self._place_beside, placed, leaf, estimate, self.map_from_anchor)
+                    partial(self._place_beside, placed, view, estimate, self.map_from_anchor)
                 )
             self.move_anchor(moved)
 
         self._pending.append(make)
-        self.map_from_anchor = here @ self._sober(moved)
+        self.map_from_anchor = here @ self._with_floor(moved)
         return landmarks
 
     def _place_beside(
-        self, placed: AnchoredKeyframe, leaf: View, estimate: EpisodeEstimate, map_from_anchor: PoseGaussian
+        self, placed: AnchoredKeyframe, view: View, estimate: EpisodeEstimate, map_from_anchor: PoseGaussian
     ) -> None:
         """Make a node of a further view of an episode whose anchor has become a node."""
-        landmarks, tracks = self._landmarks(leaf, estimate)
+        landmarks, tracks = self._landmarks(view, estimate)
         if len(landmarks) >= LEAST_LANDMARKS:
-            beside = AnchoredKeyframe(self._node(leaf, landmarks, map_from_anchor), tracks)
-            self._write(beside.node, self._edge(placed, beside, self._sober(leaf.anchor_from_view)))
+            beside = AnchoredKeyframe(self._node(view, landmarks, map_from_anchor), tracks)
+            self._write(beside.node, self._edge(placed, beside, self._with_floor(view.anchor_from_view)))
 
     def join(self, placed: AnchoredKeyframe) -> None:
         """Put the node of an episode into the map, with edges to the one before and to places known already.
@@ -242,7 +242,7 @@ class KeyframeBuilder:
 
     def move_anchor(self, moved: PoseGaussian) -> None:
         """Begin the next episode at another anchor: `old_anchor_from_new`, by the filter."""
-        self._move(self._sober(moved))
+        self._move(self._with_floor(moved))
 
     def _move(self, moved: PoseGaussian) -> None:
         self.map_from_anchor = self.map_from_anchor @ moved
@@ -352,7 +352,7 @@ class KeyframeBuilder:
         self.map_from_anchor = self.map.nodes[best.a].map_from_robot @ best.a_from_b
         placed.node = replace(placed.node, map_from_robot=self.map_from_anchor)
 
-    def _sober(self, moved: PoseGaussian) -> PoseGaussian:
+    def _with_floor(self, moved: PoseGaussian) -> PoseGaussian:
         """A pose of the filter with the uncertainty that the filter cannot know."""
         way, turn = float(np.hypot(moved.mean.x, moved.mean.y)), abs(moved.mean.heading)
         position = EDGE_FLOOR[0] + EDGE_SHARE[0] * way

@@ -68,7 +68,7 @@ class Mapper:
         self._trajectory = TrajectoryRecorder(description)
         self._composed = HERE, HERE, HERE
         self._anchor: View | None = None
-        self._leaves: list[View] = []
+        self._further: list[View] = []
         # A thread extracts features. Those of a further view are used in the next tick, which begins by
         # waiting for them: no result depends on speed. The next anchor's are needed at once: episodes that
         # begin a tick later cost a robot a quarter of its nodes.
@@ -244,7 +244,7 @@ class Mapper:
             case EpisodeRequest.BEGIN:
                 self.begin(observation)
             case EpisodeRequest.ADD_VIEW:
-                self.leaf(observation)
+                self.add_view(observation)
             case EpisodeRequest.FINISH:
                 self.finish(observation)
 
@@ -262,7 +262,7 @@ class Mapper:
         self._keyframes.lose(self._tracking.pose)
         self._take_up_pending()
         self._tracking = Tracking(self._description, self._lens, self._settings)
-        self._anchor, self._leaves = None, []
+        self._anchor, self._further = None, []
         self._extracting = None
 
     def resume(
@@ -289,7 +289,7 @@ class Mapper:
         self._trajectory.clear(anchor.stamp_ns)
         self._tracking.follow(anchor, self.typical_depth)
 
-    def leaf(self, observation: Observation) -> None:
+    def add_view(self, observation: Observation) -> None:
         """Keep the current image as a further node, for example at the far end of a drive."""
         if observation.image is None:
             return
@@ -297,7 +297,7 @@ class Mapper:
         self._tracking.remember(force=True)
 
         def take(features: Features) -> None:
-            self._leaves.append(self._tracking.take(observation, features, pose))
+            self._further.append(self._tracking.take(observation, features, pose))
 
         self._use_extracted()
         self._extracting = self._extract(observation.image, observation.left_out), take
@@ -315,14 +315,14 @@ class Mapper:
         self._tracking.remember(force=True)
         estimate = self._tracking.estimate
         moved = self._tracking.reanchor()
-        landmarks = self._keyframes.place(self._anchor, self._leaves, estimate, self._trajectory, moved)
+        landmarks = self._keyframes.place(self._anchor, self._further, estimate, self._trajectory, moved)
         anchor = self._tracking.take(observation, features.result(), HERE)
         if landmarks is None:
             self._trajectory.move_anchor(moved.mean)
         else:
             self.typical_depth = float(np.median(landmarks.depths))
             self._trajectory.clear(anchor.stamp_ns)
-        self._anchor, self._leaves = anchor, []
+        self._anchor, self._further = anchor, []
         if self._take_up_pending():
             # Tracks and features of another lens are of no use to a filter of this one.
             self._tracking = Tracking(self._description, self._lens, self._settings)

@@ -124,7 +124,7 @@ class Drive:
         self.clearance = min(self.clearance, float(free) - self.simulation.describe(ROBOT).radius)
         self.step = self.agent.tick(self.simulation.observe(ROBOT))
         self._command = self.step.command
-        if self.agent.runner.curious:
+        if self.agent.runner.has_questions:
             self.agent.runner.exchange()
 
     @property

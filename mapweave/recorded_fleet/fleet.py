@@ -24,7 +24,7 @@ from mapweave.wire.messages import KeptHistory, encode
 EVERY = 0.5
 """Between two statuses of a robot, s, as with agents."""
 MAPPING, STILL = "cy", 12
-"""This robot maps so many nodes before the viewer's eyes. Each is a node and the edge that leads to it."""
+"""This robot maps so many nodes while the viewer looks on. Each is a node and the edge that leads to it."""
 
 
 def prepare(folder: Path, store: Path, shown: LastShown) -> None:

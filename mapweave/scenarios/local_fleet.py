@@ -89,7 +89,7 @@ class LocalFleet:
             self._commands = dict(zip(names, map(self._tick, names), strict=True))
             asked = time.perf_counter()
             for agent in self._agents.values():
-                if agent.runner.curious:
+                if agent.runner.has_questions:
                     agent.runner.exchange()
             self._thinking += asked - began
             self._asking += time.perf_counter() - asked

@@ -112,7 +112,7 @@ def two_nodes(walls) -> HybridMap:
         if not mapper.started:
             mapper.begin(observation)
         if tick == len(there) - 1:
-            mapper.leaf(observation)
+            mapper.add_view(observation)
         before = Pose2(x)
     mapper.finish(observation)
     for nodes in (1, 2):

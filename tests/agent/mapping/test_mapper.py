@@ -71,7 +71,7 @@ def test_what_is_left_of_an_episode_is_made_at_the_end_of_the_process(walls, des
     mapper = Mapper(MapId("r0", 1), description)
     there = np.arange(0.0, 0.6, 0.025)
     last = drive(mapper, walls, there)
-    mapper.leaf(last)
+    mapper.add_view(last)
     last = drive(mapper, walls, there[::-1], start=50)
     assert mapper.finish(last)
     assert mapper.take_changes() == (), "no tick does all of it"
