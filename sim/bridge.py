@@ -45,7 +45,6 @@ class SimBridge:
         bus: Bus,
         fleet: str,
         patience: float = 20.0,
-        expected: int | None = None,
         farewell: float = 2.0,
         held: bool = False,
     ) -> None:
@@ -56,7 +55,6 @@ class SimBridge:
             bus: the connection.
             fleet: which fleet.
             patience: how long the other robots wait for one that does not ask, s.
-            expected: how many robots must have asked before the first tick; all if not given.
             held: let no time pass until a client asks for it (see SimControl.advance).
             farewell: how long `close` waits for agents that do not know of the end yet, s.
         """
@@ -64,16 +62,13 @@ class SimBridge:
         self._keys = keys
         self._simulation = simulation
         self._farewell = farewell
-        self._lockstep = Lockstep(simulation.robots, patience, expected)
+        self._lockstep = Lockstep(simulation.robots, patience)
         self._wall = dict.fromkeys(("waiting", "replying", "control"), 0.0)
-        self._ground_truth = GroundTruthService(
-            simulation, lambda: self._lockstep.active, self._wall, self._stop
-        )
+        self._ground_truth = GroundTruthService(simulation, lambda: self._lockstep.active, self._wall)
         self._changed = threading.Condition()
         self._inbox: deque[Callable[[], None]] = deque()
         self._limit: int | None = 0 if held else None
         self._advancing: Request | None = None
-        self._stopping = False
         self._ended = False
         self._announced: set[str] = set()
         self._declared = [bus.watch(keys.robot_drivers(), self._presence)]
@@ -85,13 +80,13 @@ class SimBridge:
         self._declared.append(bus.announce(keys.sim_alive()))
 
     def run(self, stop: threading.Event) -> None:
-        """Simulate until stopped, here or by a control message; then refuse further questions.
+        """Simulate until stopped; then refuse further questions.
 
         Raises:
             MapweaveError: the simulation fails.
         """
         try:
-            while not (self._stopping or stop.is_set()):
+            while not stop.is_set():
                 self._read_inbox()
                 seats = self._lockstep.due(time.monotonic())
                 asking = [seat for seat in seats if isinstance(seat.step, Rendezvous)]
@@ -168,9 +163,6 @@ class SimBridge:
                 request.reply(self._ground_truth.answer(request.payload))
             except MapweaveError as error:
                 request.refuse(str(error))
-
-    def _stop(self) -> None:
-        self._stopping = True
 
     def _end(self) -> None:
         with self._changed:

@@ -28,7 +28,6 @@ from mapweave.sim.ground_truth_messages import (
     Kidnap,
     Question,
     SimStatus,
-    Stop,
     Trajectory,
 )
 from mapweave.sim.keys import SimKeys
@@ -109,10 +108,6 @@ class SimControl:
     def snapshot(self) -> Snapshot:
         """What a bird sees, and what the robots saw last."""
         return self._ask(AskSnapshot(), Snapshot)
-
-    def stop(self) -> None:
-        """End the simulation and notify its agents."""
-        self._ask(Stop(), Done)
 
     def _ask(self, question: Question, answer: type[Answer]) -> Answer:
         fields: dict[str, Any] = packed(question)

@@ -70,11 +70,7 @@ class AskPlan(_Question, tag="plan"):
     """What stands where?"""
 
 
-class Stop(_Question, tag="stop"):
-    """End the simulation."""
-
-
-Question = Kidnap | Apply | Advance | AskSnapshot | AskStatus | AskTruth | AskTrajectory | AskPlan | Stop
+Question = Kidnap | Apply | Advance | AskSnapshot | AskStatus | AskTruth | AskTrajectory | AskPlan
 
 
 @dataclass(frozen=True)

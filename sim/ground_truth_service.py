@@ -28,7 +28,6 @@ from mapweave.sim.ground_truth_messages import (
     Question,
     RobotStatus,
     SimStatus,
-    Stop,
     Trajectory,
 )
 from mapweave.sim.simulation_interface import Simulated
@@ -44,7 +43,6 @@ class GroundTruthService:
         simulation: Simulated,
         active: Callable[[], set[str]],
         wall: Mapping[str, float],
-        stop: Callable[[], None],
     ) -> None:
         """Serve the ground truth of a simulation.
 
@@ -52,12 +50,10 @@ class GroundTruthService:
             simulation: whose truth is served.
             active: names of the robots that take part now.
             wall: s by part, in addition to the simulation's own, kept by the caller.
-            stop: ends the run.
         """
         self._simulation = simulation
         self._active = active
         self._wall = wall
-        self._stop = stop
 
     def answer(self, question: bytes) -> bytes:
         """Answer a question.
@@ -99,8 +95,6 @@ class GroundTruthService:
                 return Trajectory(*simulation.trajectory(self._robot(question.robot)))
             case AskPlan():
                 return simulation.world.plan
-            case Stop():
-                self._stop()
         return Done()
 
     def _robot(self, name: str) -> str:

@@ -53,24 +53,22 @@ class Seat:
 class Lockstep:
     """Collects the robots' steps and says when a tick is due. Times are of any clock that only grows, s."""
 
-    def __init__(self, robots: Sequence[str], patience: float, expected: int | None = None) -> None:
+    def __init__(self, robots: Sequence[str], patience: float) -> None:
         """Start before the first question.
 
         Args:
             robots: names.
             patience: how long the others wait for a robot that does not ask, s.
-            expected: how many robots must have asked before the first tick; all if not given.
 
         Raises:
-            InvalidValue: robots of the same name, or an expectation that cannot come true.
+            InvalidValue: robots of the same name.
         """
         # Sorted: nothing may depend on the order in which robots ask.
         self._seats = {name: Seat(name) for name in sorted(robots)}
         self._patience = patience
-        self._expected = len(self._seats) if expected is None else expected
         self._begun = self._reported = False
-        if len(self._seats) != len(robots) or not 0 <= self._expected <= len(robots):
-            raise InvalidValue(f"lock-step: {expected} of the robots {', '.join(robots)} cannot be expected")
+        if len(self._seats) != len(robots):
+            raise InvalidValue(f"lock-step: two robots have the same name: {', '.join(robots)}")
 
     @property
     def active(self) -> set[str]:
@@ -154,7 +152,7 @@ class Lockstep:
 
     def _may_begin(self, waited: float) -> bool:
         missing = [seat.name for seat in self._seats.values() if not seat.asked]
-        if len(self._seats) - len(missing) >= self._expected:
+        if not missing:
             return True
         if waited < self._patience:
             if waited >= SOON and not self._reported:

@@ -65,7 +65,7 @@ class LocalFleet:
         sim_bus = MemoryBus(self._hub)
         self._buses["sim"] = sim_bus
         # The service answers in the bus's thread while this one waits: never during a tick.
-        ground_truth = GroundTruthService(simulation, lambda: set(self._agents), {}, lambda: None)
+        ground_truth = GroundTruthService(simulation, lambda: set(self._agents), {})
 
         def answer(request: Request) -> None:
             try:

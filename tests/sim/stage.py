@@ -120,10 +120,9 @@ class Stage:
         self,
         simulation: Simulated,
         patience: float = 20.0,
-        expected: int | None = None,
         farewell: float = 0.02,
     ) -> SimControl:
-        self.bridge = SimBridge(simulation, self.join(), "test", patience, expected, farewell)
+        self.bridge = SimBridge(simulation, self.join(), "test", patience, farewell)
         self.thread = threading.Thread(target=self.bridge.run, args=(self.stop,))
         self.thread.start()
         return SimControl(self.join(), "test")

@@ -65,15 +65,15 @@ def test_a_kidnapped_robot_is_elsewhere_in_the_next_tick_without_odometry(stage:
     assert simulation.truth("r0") == Pose2(2.0, 2.0, 0.0)
 
 
-def test_stop_ends_the_run_and_notifies_every_agent(stage: Stage) -> None:
+def test_every_agent_is_notified_of_the_end(stage: Stage) -> None:
     simulation = FakeSimulation()
-    control = stage.start(simulation, farewell=2.0)
+    stage.start(simulation, farewell=2.0)
     waiting = Driver(stage.robot("r0"), 10**6, lambda _: 0.0)
     thinking = Driver(stage.robot("r1"), 10**6, lambda k: 0.3 if k == 4 else 0.0)
     waiting.start()
     thinking.start()
     eventually(lambda: simulation.tick == 5)
-    control.stop()
+    stage.stop.set()
     assert stage.thread is not None
     assert stage.bridge is not None
     stage.thread.join(30.0)
