@@ -56,6 +56,10 @@ SIGMAS = 2.0
 """Of the ellipsoids."""
 LARGEST = 3.0
 """m; larger ellipsoids, of landmarks that were just begun, would hide all others."""
+IMAGE_AT = 0.5
+"""m before the camera, where its image hangs: farther away it hides the map."""
+SIDES, LIMIT = {"left": [60, 150, 230], "right": [50, 170, 90]}, [200, 60, 60]
+"""Colours of the outermost bearings, and of their limits."""
 QUALITY = 80
 """Of the JPEG images, %."""
 STEP = 0.02
@@ -212,10 +216,14 @@ class RerunLog:
             self._log(path, rr.Transform3D(translation=at, mat3x3=axes))
             size = (camera.width, camera.height)
             focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
-            lens = rr.Pinhole(focal_length=focal, principal_point=middle, resolution=size)
+            lens = rr.Pinhole(
+                focal_length=focal, principal_point=middle, resolution=size, image_plane_distance=IMAGE_AT
+            )
             self._log(path, lens)
-            for side in ("left", "right"):
-                limit = rr.SeriesLines(colors=[200, 60, 60], names=f"limit {side}")
+            for side, colour in SIDES.items():
+                outermost = rr.SeriesLines(colors=colour, names=f"outermost {side}")
+                self._log(f"bearings/outermost_{side}", outermost, static=True)
+                limit = rr.SeriesLines(colors=LIMIT, names=f"limit {side}")
                 self._log(f"bearings/limit_{side}", limit, static=True)
         if moment.image is not None:
             self._log(path, rr.Image(moment.image).compress(jpeg_quality=QUALITY))
@@ -359,7 +367,7 @@ def _layout(robot: str) -> rrb.Blueprint:
                     rrb.TextDocumentView(origin=f"{robot}/now", name="now"),
                     rrb.TextLogView(origin=f"{robot}/status", name="status"),
                 ),
-                row_shares=[4, 2, 2, 1],
+                row_shares=[4, 2, 2, 2],
             ),
         ),
         collapse_panels=True,

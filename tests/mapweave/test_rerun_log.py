@@ -127,6 +127,10 @@ def test_a_replay_is_read_back_as_it_was(
     assert set(sides[0]) == {-sides[3][0]} and sides[3][0] == pytest.approx(limit)
     assert all(right < left for right, left in zip(sides[1], sides[2], strict=True))
     assert max(sides[2]) <= limit + 0.2 and min(sides[1]) >= -limit - 0.2
+    # They are told from their limits, and from each other.
+    colours = {str(rows[f"/walk/bearings/{w}:colors"][-1][1]) for w in
+               ("limit_left", "outermost_left", "outermost_right")}  # fmt: skip
+    assert len(colours) == 3
     # Landmarks: on the walls, which are ahead of the robot.
     seen = np.array(rows["/walk/map/robot/landmarks:positions"][-1][1])
     assert len(seen) > 10 and (seen[:, 0] > 0.1).all()
