@@ -93,17 +93,11 @@ def readable_sigmas(estimate: Estimate) -> Array:
     return sigmas
 
 
-def causes(estimate: Estimate, declared: Array | None = None) -> list[Cause]:
-    """Which parameters that the drive shows are declared wrongly, the surest first.
-
-    Args:
-        estimate: of the drive.
-        declared: (10,) instead of what the estimate began with.
-    """
-    declared = estimate.declared if declared is None else declared
-    off = np.abs(estimate.vector - declared)
+def causes(estimate: Estimate) -> list[Cause]:
+    """Which parameters that the drive shows are declared wrongly, the surest first."""
+    off = np.abs(estimate.vector - estimate.declared)
     wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > useful(estimate.declared))
-    value, was, sigma = readable(estimate.vector), readable(declared), readable_sigmas(estimate)
+    value, was, sigma = readable(estimate.vector), readable(estimate.declared), readable_sigmas(estimate)
     lengths = estimate.lengths
     found = [
         Cause(p, float(was[p]), float(value[p]), float(sigma[p]), float(off[p] / estimate.sigmas[p]), lengths)

@@ -41,6 +41,8 @@ def _compass() -> tuple[NDArray[np.intp], Array]:
 
 _STEPS, _HEADINGS = _compass()
 _COUNT = len(_STEPS)
+_MOST_POINTS = 26
+"""Points of a way that is shortened."""
 
 
 def lattice_plan(
@@ -210,16 +212,16 @@ def _descend(
     return states
 
 
-def _thin(points: Array, most: int = 26) -> Array:
+def _thin(points: Array) -> Array:
     """At most so many of a way's points: first its corners, then points between, evenly."""
     moved = np.append(True, np.abs(np.diff(points, axis=0)).sum(axis=1) > 0)
     points = points[moved]
-    if len(points) <= most:
+    if len(points) <= _MOST_POINTS:
         return points
     steps = np.diff(points, axis=0)
     corner = np.abs(np.diff(steps, axis=0)).sum(axis=1) > 1e-9
     keep = np.flatnonzero(np.concatenate([[True], corner, [True]]))
-    extra = np.linspace(0, len(points) - 1, max(most - len(keep), 0)).round().astype(int)
+    extra = np.linspace(0, len(points) - 1, max(_MOST_POINTS - len(keep), 0)).round().astype(int)
     chosen: Array = points[np.union1d(keep, extra)]
     return chosen
 

@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.pose import Array, Pose2
 
 
+CELL = 0.05
+"""Two points in one square of this size are one, m."""
+LIFE_TICKS = 600
+"""How long a point that is not seen again is kept."""
+MOST = 400
+"""Points kept; the oldest go first."""
+
+
 class ObstacleMemory:
     """Obstacle points in one fixed frame, one a cell, forgotten after a while."""
 
-    def __init__(self, cell: float = 0.05, life_ticks: int = 600, most: int = 400) -> None:
-        """Start with no map.
-
-        Args:
-            cell: m, two points in one square of this size are one.
-            life_ticks: how long a point that is not seen again is kept.
-            most: points kept; the oldest go first.
-        """
-        self._cell, self._life, self._most = cell, life_ticks, most
+    def __init__(self) -> None:
+        """Start with no map."""
         self._points: dict[tuple[int, int], tuple[float, float, int]] = {}
         self._tick = 0
         self._array: Array = np.zeros((0, 2))
@@ -43,13 +44,13 @@ class ObstacleMemory:
         points_in_frame = frame_from_robot.apply(np.asarray(points_in_robot, dtype=np.float64).reshape(-1, 2))
         fresh = False
         for x, y in points_in_frame.tolist():
-            key = (round(x / self._cell), round(y / self._cell))
+            key = (round(x / CELL), round(y / CELL))
             fresh |= key not in self._points
             self._points.pop(key, None)
             self._points[key] = (x, y, self._tick)
         while self._points:
             oldest = next(iter(self._points))
-            if len(self._points) <= self._most and self._tick - self._points[oldest][2] <= self._life:
+            if len(self._points) <= MOST and self._tick - self._points[oldest][2] <= LIFE_TICKS:
                 break
             del self._points[oldest]
         if len(points_in_frame) or len(self._points) != before:

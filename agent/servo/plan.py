@@ -155,9 +155,9 @@ class Surroundings:
         return bool(distance.min() >= min(self.clearance, float(distance[0]) - 0.005))
 
 
-def arc(pose: Pose2, forward: float, turn: float, seconds: float, count: int = 4) -> Array:
-    """(count, 3) poses from a pose on, under constant speeds (m/s, rad/s)."""
-    times = np.linspace(0.0, seconds, count)
+def arc(pose: Pose2, forward: float, turn: float, seconds: float) -> Array:
+    """(4, 3) poses from a pose on, under constant speeds (m/s, rad/s)."""
+    times = np.linspace(0.0, seconds, 4)
     turned = turn * times
     chord = forward * times * np.sinc(0.5 * turned / math.pi)
     middle = pose.heading + 0.5 * turned

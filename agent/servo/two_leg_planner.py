@@ -13,6 +13,8 @@ _SPACING = 0.06
 """rad between candidate headings."""
 
 _REACH = 1.5
+_LONGEST = 4.0
+"""Longest leg, m."""
 """rad to either side in which headings are searched."""
 
 _ALONG: Array = np.linspace(0.0, 1.0, 9)[1:]
@@ -35,7 +37,7 @@ def headings_around(surroundings: Surroundings, pose: Pose2, margin: float) -> A
 
 
 def two_leg_plan(
-    surroundings: Surroundings, start: Pose2, margin: float, price: Price, longest: float = 4.0
+    surroundings: Surroundings, start: Pose2, margin: float, price: Price
 ) -> Plan | None:
     """The cheapest admissible plan of at most two legs.
 
@@ -47,7 +49,6 @@ def two_leg_plan(
         start: pose in goal.
         margin: slack to keep, rad.
         price: of turns and legs.
-        longest: m, longest leg.
 
     Returns:
         The plan, or None if no pair of headings will do.
@@ -64,7 +65,7 @@ def two_leg_plan(
     cost = np.abs(d1) + np.abs(d2)
     cost += price.turn * (np.abs(h1 - start.heading) + np.abs(h2 - h1) + np.abs(h2))
     cost += price.leg * ((np.abs(d1) > 1e-6).astype(float) + (np.abs(d2) > 1e-6))
-    usable = np.isfinite(cost) & (np.maximum(np.abs(d1), np.abs(d2)) <= longest)
+    usable = np.isfinite(cost) & (np.maximum(np.abs(d1), np.abs(d2)) <= _LONGEST)
     order = np.flatnonzero(usable)[np.argsort(cost[usable], kind="stable")]
     done, size = 0, 24
     while done < len(order):
