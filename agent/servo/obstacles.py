@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array, Pose2
 
-
 CELL = 0.05
 """Two points in one square of this size are one, m."""
 LIFE_TICKS = 600

@@ -36,9 +36,7 @@ def headings_around(surroundings: Surroundings, pose: Pose2, margin: float) -> A
     return poses[low : high + 1, 2]
 
 
-def two_leg_plan(
-    surroundings: Surroundings, start: Pose2, margin: float, price: Price
-) -> Plan | None:
+def two_leg_plan(surroundings: Surroundings, start: Pose2, margin: float, price: Price) -> Plan | None:
     """The cheapest admissible plan of at most two legs.
 
     For headings h1 and h2 the lengths follow from d1 e(h1) + d2 e(h2) = -start; a negative one is driven
