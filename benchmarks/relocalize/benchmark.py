@@ -3,12 +3,10 @@
     python -m benchmarks.relocalize [--nodes N ...] [--queries N] [--seed N] [--json]
 
 A thousand places are real: simulated buildings (offices, a warehouse, a ring corridor, rooms with twins)
-looked at with the robot's camera and eyes and made into nodes as uncertain as a robot's. Beyond these, places
+looked at with the robot's camera and made into nodes as uncertain as a robot's. Beyond these, places
 are made of real views of other buildings (benchmarks.relocalize.distractors). Asked are views near mapped
 poses, then disturbed ones, views of twin rooms, and views of unmapped buildings: to the last
-two "here" is always a false answer. The ceiling compares views with every node by whole SIFT descriptors,
-up to 10 000 nodes (of a larger fleet the first so many), every so manyth view where that is much; what the
-index has lost is measured on the same views.
+two "here" is always a false answer.
 
 With `--nodes 1000 10000 100000 --queries 200` it takes about a quarter of an hour on one core, and the first
 time of a seed some minutes more for its pictures, which it keeps in the folder for temporary files.
@@ -41,7 +39,6 @@ from rich.table import Table
 
 from benchmarks.command_line import command_line
 from benchmarks.relocalize.fleet import Bench
-from benchmarks.relocalize.queries import KINDS
 from benchmarks.relocalize.score import figures, recall_by_kind, spent, wrong_by_kind
 from mapweave.hybridmap.node import Node
 from mapweave.mapserver.relocalization.candidates import MOST_COMPARED
@@ -86,7 +83,7 @@ def resident() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
-def measured(bench: Bench, size: int, ceilings: list[str]) -> dict[str, Any]:
+def measured(bench: Bench, size: int) -> dict[str, Any]:
     """Everything at one size."""
     index, before, began = PlaceIndex(), resident(), spent() - bench.making
     with bench.task(f"{size} nodes: index", size) as step:
@@ -109,8 +106,6 @@ def measured(bench: Bench, size: int, ceilings: list[str]) -> dict[str, Any]:
         "index_bytes_per_node": round(1e6 * grown / size), "recall": recall_by_kind(replies),
         "wrong": wrong_by_kind(replies),
     }  # fmt: skip
-    if ceilings:
-        out |= bench.ceiling(ceilings, size, relocalizer, replies)
     return out
 
 
@@ -120,7 +115,7 @@ def table(sizes: dict[str, dict[str, Any]]) -> Table:
     for name, value in first.items():
         if not isinstance(value, dict):
             out.add_row(name, *(f"{one.get(name, math.nan):g}" for one in sizes.values()))
-    for name, words in (("recall", "recall"), ("wrong", '"here", wrongly'), ("exhaustive", "exhaustive")):
+    for name, words in (("recall", "recall"), ("wrong", '"here", wrongly')):
         for kind in first.get(name, {}):
             out.add_row(f"{words}, {kind}", *(f"{one[name][kind]:g}" for one in sizes.values()))
     return out
@@ -133,7 +128,6 @@ def main() -> None:
         "--nodes", type=int, nargs="+", default=[1000, 10_000], help="sizes of the fleet's map"
     )
     parser.add_argument("--queries", type=int, default=200, help="of each kind (default 200)")
-    parser.add_argument("--ceilings", nargs="*", default=["near"], choices=list(KINDS), help="kinds of views")
     arguments = parser.parse_args()
     if min(arguments.nodes) < REAL or arguments.queries < 4:
         parser.error(f"at least {REAL} nodes and 4 queries are needed")
@@ -142,7 +136,7 @@ def main() -> None:
     with Progress(console=console) as bar:
         bench = Bench(arguments.seed, REAL, arguments.queries, bar)
         hard = bench.hardness()
-        found = {str(size): measured(bench, size, arguments.ceilings) for size in sizes}
+        found = {str(size): measured(bench, size) for size in sizes}
     console.print(table(found))
     console.print(f"load of the machine {os.getloadavg()[0]:.1f}")
     console.print(f"votes of the best wrong node: {hard}")
