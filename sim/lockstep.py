@@ -59,16 +59,11 @@ class Lockstep:
         Args:
             robots: names.
             patience: how long the others wait for a robot that does not ask, s.
-
-        Raises:
-            InvalidValue: robots of the same name.
         """
         # Sorted: nothing may depend on the order in which robots ask.
         self._seats = {name: Seat(name) for name in sorted(robots)}
         self._patience = patience
         self._begun = self._reported = False
-        if len(self._seats) != len(robots):
-            raise InvalidValue(f"lock-step: two robots have the same name: {', '.join(robots)}")
 
     @property
     def active(self) -> set[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import http.client
+import json
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
+from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -85,3 +88,14 @@ class House:
 
 def replace_agent(name: str):
     return ROBOT._replace(agent=name)
+
+
+def ask(web: Web, method: str, path: str, body: object = None, **headers: str) -> tuple[int, dict]:
+    """Status and JSON of an answer over HTTP, to a question without a body, with bytes or with JSON."""
+    connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=20)
+    data = body if isinstance(body, bytes) else json.dumps(body).encode() if body is not None else None
+    connection.request(method, path, data, {"Content-Type": "application/json", **headers})
+    reply = connection.getresponse()
+    content = reply.read()
+    connection.close()
+    return reply.status, json.loads(content)

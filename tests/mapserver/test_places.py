@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import sqlite3
 from collections.abc import Callable
@@ -41,7 +40,7 @@ from mapweave.wire.messages import decode, encode, encode_view
 from synthetic.maps import looking_around, map_tours, write_store
 from synthetic.world import room, take_view
 from tests.mapserver.conftest import MappedRoom
-from tests.mapserver.house import KEYS, House
+from tests.mapserver.house import KEYS, House, ask
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)
@@ -94,16 +93,6 @@ def link_status():
     from mapweave.hybridmap.agent_status import Status
 
     return Status("standing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "explore", located=True)
-
-
-def ask(web: Web, method: str, path: str, body: object = None) -> tuple[int, dict]:
-    connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=20)
-    data = body if isinstance(body, bytes) else json.dumps(body).encode() if body is not None else None
-    connection.request(method, path, data, {"Content-Type": "application/json"})
-    reply = connection.getresponse()
-    content = reply.read()
-    connection.close()
-    return reply.status, json.loads(content)
 
 
 def test_a_long_reason_is_no_error_of_what_is_kept(house: House) -> None:

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from mapweave.agent.drivers.messages import AGAIN, StepRequest
 from mapweave.agent.observation import Command
-from mapweave.hybridmap.errors import InvalidValue
 from mapweave.sim.lockstep import Lockstep
 
 
@@ -186,11 +185,6 @@ def test_the_end_refuses_everyone_once() -> None:
     assert table.steps.refuse_all("over") == {"b"}
     assert table.steps.refuse_all("over") == set()
     assert question.refusals == ["over"]
-
-
-def test_robots_of_the_same_name_are_refused() -> None:
-    with pytest.raises(InvalidValue, match="same name"):
-        Lockstep(["a", "a"], 20.0)
 
 
 @given(st.permutations(["a", "b", "c", "d"]), st.lists(st.permutations(["a", "b", "c", "d"]), max_size=5))
