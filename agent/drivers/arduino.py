@@ -99,7 +99,10 @@ class ArduinoBase:
             line = self._port.line()
             newest = parse_state(line) or newest
             if newest is None and time.monotonic() >= end:
-                raise DeviceError(f"{self._options.port}: {line!r} is not 'S left right bumped cm ...'")
+                raise DeviceError(
+                    f"{self._options.port}: {line!r} is not 'S left right bumped cm ...'; "
+                    f"is {self._options.baud} the baud rate of the sketch?"
+                )
         left, right, bumped, *centimetres = newest
         if len(centimetres) != self._rangers:
             raise DeviceError(

@@ -33,6 +33,7 @@ class SerialPort:
             DeviceError: the port is missing or in use.
         """
         self.path = path
+        self._baud = baud
         self._rest = b""
         try:
             self._serial: Any = serial.serial_for_url(
@@ -75,7 +76,7 @@ class SerialPort:
         with self._failing():
             data = bytes(self._serial.read(count))
         if len(data) < count:
-            raise self._silent()
+            raise self._unanswered(len(data))
         return data
 
     def line(self) -> str:
@@ -91,7 +92,7 @@ class SerialPort:
                 self._rest = rest.lstrip(b" \n")
                 return line.decode("ascii", "replace").strip()
             if time.monotonic() >= end or len(self._rest) > LONGEST_LINE:
-                raise self._silent()
+                raise self._unanswered(len(self._rest))
             self._take(1)
 
     def line_waiting(self) -> bool:
@@ -106,7 +107,12 @@ class SerialPort:
         # Empty lines are skipped.
         self._rest = (self._rest + came).replace(b"\r", b"\n").lstrip(b" \n")
 
-    def _silent(self) -> DeviceError:
+    def _unanswered(self, came: int) -> DeviceError:
+        if came:
+            return DeviceError(
+                f"{self.path}: {came} bytes came, and no whole answer for {TIMEOUT:g} s; "
+                f"is the robot at this port, and {self._baud} its baud rate?"
+            )
         return DeviceError(
             f"{self.path}: no answer for {TIMEOUT:g} s; is the robot switched on, and at this port?"
         )

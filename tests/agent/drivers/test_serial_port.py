@@ -57,6 +57,21 @@ def test_lines_end_by_either_character_and_empty_ones_are_skipped(ends: tuple[in
         port.line()
 
 
+@pytest.mark.parametrize(
+    "read", [lambda port: port.line(), lambda port: port.read(50)], ids=["line", "bytes"]
+)
+def test_bytes_that_are_no_answer_ask_for_the_baud_rate(
+    ends: tuple[int, SerialPort], read: Callable[[SerialPort], object]
+) -> None:
+    """A wrong baud rate, or a mouse at the port, is no robot that is switched off."""
+    master, port = ends
+    os.write(master, bytes(range(128, 140)))
+    with pytest.raises(
+        DeviceError, match=r"12 bytes came, and no whole answer .* and 115200 its baud rate\?$"
+    ):
+        read(port)
+
+
 def test_a_port_is_opened_once(ends: tuple[int, SerialPort]) -> None:
     with pytest.raises(DeviceError, match="is in use by another process"):
         SerialPort(ends[1].path, 115200)
