@@ -1,7 +1,7 @@
 """How much floor a fleet maps in a minute: the paper's way by chance, ours, and ours with what others know.
 
     python -m benchmarks.explore [--seed N] [--minutes M] [--robots 1 2 3] [--rooms R]
-                                [--spread] [--out DIR] [--json]
+                                [--spread] [--json]
 
 Whole fleets (agents, journals, map server, in lock-step) explore the same office from the same places. They
 are set down together, or, with --spread, each robot in a room of its own:
@@ -212,7 +212,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=5.0, help="simulated (default: 5)")
     parser.add_argument("--rooms", type=int, default=6, help="of the office, 3 to 12 (default: 6)")
     parser.add_argument("--spread", action="store_true", help="each robot begins in a room of its own")
-    parser.add_argument("--out", type=Path, default=Path("out/explore"), help="folder for the picture")
     arguments = parser.parse_args()
     if arguments.minutes <= 0.0 or min(arguments.robots) < 1:
         parser.error("--minutes and --robots must be positive")
@@ -223,13 +222,7 @@ def main() -> None:
     except MapweaveError as error:
         parser.error(str(error))
     result = figures(done, minutes, seed)
-    from benchmarks.explore.picture import draw
-
-    mapped = {name: {count: e.floor for count, e in fleets.items()} for name, fleets in done.items()}
-    picture = draw(mapped, minutes, seed, arguments.out)
     if arguments.json:
         print(json.dumps(result))
     else:
-        console = Console()
-        console.print(table(result))
-        console.print(f"area over time: {picture}")
+        Console().print(table(result))
