@@ -62,6 +62,7 @@ def measure(drive: Path, folder: Path, endpoint: str, seed: int) -> dict[str, fl
     import_s = time.perf_counter() - began
 
     from benchmarks.agent.drive import NAME, RenderedDrive
+    from benchmarks.process_usage import peak_mb
     from mapweave.agent.observation import Observation
 
     times: list[float] = []
@@ -113,12 +114,6 @@ def measure(drive: Path, folder: Path, endpoint: str, seed: int) -> dict[str, fl
         "ticks": len(times),
         "late_ticks": int((ms > 1e3 * robot.describe().tick).sum()),
     }
-
-
-def peak_mb() -> float:
-    """Largest resident memory of this process so far, MB. (`ru_maxrss` may be that of the parent.)"""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1024 / 1e6
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ from benchmarks.fleet import floor_process
 from benchmarks.fleet.agents_process import FLEET, INTERVAL, PATIENCE, Orders
 from benchmarks.fleet.disturbance import KINDS, THAW_BEFORE, Freeze
 from benchmarks.fleet.drives import drive, name_of
-from benchmarks.fleet.process_usage import Usage, resident_mb, total
+from benchmarks.process_usage import Usage, resident_mb, total
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.query import View
 from mapweave.processes import parent_watchdog

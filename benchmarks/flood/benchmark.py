@@ -34,6 +34,7 @@ from rich.table import Table
 from benchmarks.command_line import command_line
 from benchmarks.flood.fleet import FLEET, NODES, PATIENCE, HonestRobot, Waits
 from benchmarks.flood.flooder import KINDS, flood
+from benchmarks.process_usage import resident_mb
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
@@ -68,13 +69,6 @@ def figures(waits: Waits) -> dict[str, float]:
         "answer_p95_ms": round(float(np.percentile(answers, 95)), 1),
         "lost": waits.lost,
     }
-
-
-def resident_mb(process: int) -> float:
-    """Memory of a process."""
-    lines = Path(f"/proc/{process}/status").read_text().splitlines()
-    (kilobytes,) = (line.split()[1] for line in lines if line.startswith("VmRSS:"))
-    return round(int(kilobytes) / 1024, 1)
 
 
 def merged_nodes(asker: ZenohBus) -> int:
@@ -126,7 +120,10 @@ def measure(seconds: float, rate: float, seed: int, folder: Path) -> dict[str, d
                     flooders[-1].start()
                     time.sleep(2.0)
                 waits = work(robots, seconds)
-                parts[part] = figures(waits) | {"rss_mb": resident_mb(server), "nodes": merged_nodes(asker)}
+                parts[part] = figures(waits) | {
+                    "rss_mb": round(resident_mb(server), 1),
+                    "nodes": merged_nodes(asker),
+                }
                 end(flooders)
                 children.check()
                 progress.advance(step)

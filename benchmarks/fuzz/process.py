@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.process_usage import peak_mb
+
 try:
     import atheris
 except ImportError:
@@ -81,10 +83,7 @@ class Fuzzing:
     def write(self) -> None:
         """Keep the counts."""
         self._written = time.monotonic()
-        # The peak of getrusage is at least that of the parent, as it was when it started this process.
-        status = Path("/proc/self/status").read_text()
-        peak = int(status.split("VmHWM:")[1].split()[0]) / 1024
-        (self._folder / "counts.json").write_text(json.dumps({**self.counts, "peak_rss_mb": peak}))
+        (self._folder / "counts.json").write_text(json.dumps({**self.counts, "peak_rss_mb": peak_mb()}))
 
     def _found(self, what: str, data: bytes, error: Exception) -> None:
         """Keep a finding; the same place is one finding."""

@@ -21,11 +21,8 @@ Memory is that of the process, less what it was before the first drive.
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import json
 import math
-import resource
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -41,6 +38,7 @@ from rich.table import Table
 
 from benchmarks.command_line import command_line
 from benchmarks.life.house import House
+from benchmarks.process_usage import held_bytes
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
@@ -136,7 +134,7 @@ def run(
     truth: dict[NodeId, Pose2] = {}
     folder = TemporaryDirectory()
     path, early = Path(folder.name) / "store.db", SqliteStore(Path(folder.name) / "early.db")
-    at_first = resident()
+    at_first = held_bytes()
     for epoch in track(range(1, drives + 1), "driving", console=console):
         if epoch > 1 and moved:
             house = house.refurnished(moved, rng)
@@ -163,7 +161,7 @@ def run(
                 store.prune(plan.nodes, plan.edges, merger.pruning.records(plan))
                 merger.prune(plan)
         counts = len(merged.poses) - old, old, len(merged.pruned), len(merged.components)
-        curve.append(Drive(*counts, node_ms, spent, resident() - at_first, path.stat().st_size))
+        curve.append(Drive(*counts, node_ms, spent, held_bytes() - at_first, path.stat().st_size))
         if epoch <= EARLY[-1]:
             early.apply(map_id, 1, entries)
         console.print(
@@ -212,13 +210,6 @@ def driven_through(store: Store, drives: int) -> Merger:
             merger.on_change(change)
         merger.merged()
     return merger
-
-
-def resident() -> int:
-    """Memory of this process, bytes, without garbage and without what the allocator holds in reserve."""
-    gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def in_the_long_run(curve: Sequence[Drive]) -> dict[str, float | list[float]]:

@@ -12,11 +12,11 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from rich.progress import Progress, TaskID
 
+from benchmarks.process_usage import resident_mb
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import MapId, NodeId
@@ -81,7 +81,7 @@ def at_size(nodes: int, seed: int, progress: Progress, measured: int = MEASURED)
             else:
                 coming[number][-1].append((map_id, body))
         progress.advance(task, NODES_A_MAP)
-    before = _resident_mb()
+    before = resident_mb()
     merger = Merger()
     began = time.perf_counter()
     merger.read(read, *building.knowledge(active_nodes))
@@ -107,7 +107,7 @@ def at_size(nodes: int, seed: int, progress: Progress, measured: int = MEASURED)
         "verified_per_node": round(merger.counters.verified / len(by_node), 2),
         "read_s": round(read_s, 2),
         "first_merge_s": round(first_s, 2),
-        "rss_mb": round(_resident_mb(), 1),
+        "rss_mb": round(resident_mb(), 1),
         "rss_before_mb": round(before, 1),
         "components": float(len(merged.components)),
         "links": float(len(merged.links)),
@@ -165,10 +165,3 @@ def _error(building: Building, merged: MergedMap, sample: int = 2000) -> float:
     turn = float(np.arctan2(cross[0, 1] - cross[1, 0], cross[0, 0] + cross[1, 1]))
     aligned = Pose2(0.0, 0.0, turn).apply(found - middle) + true_middle
     return float(np.median(np.hypot(*(aligned - true).T)))
-
-
-def _resident_mb() -> float:
-    """Memory that this process holds, MB."""
-    with Path("/proc/self/status").open(encoding="ascii") as status:
-        line = next(line for line in status if line.startswith("VmRSS"))
-    return int(line.split()[1]) / 1024.0

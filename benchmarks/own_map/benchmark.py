@@ -28,8 +28,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from benchmarks.life.benchmark import APART, resident
+from benchmarks.life.benchmark import APART
 from benchmarks.life.house import House
+from benchmarks.process_usage import held_bytes
 from mapweave.agent.localization.place_recognition import recognise_places
 from mapweave.agent.mapping.node_retirement import NodeRetirement
 from mapweave.agent.replication.journal import Journal
@@ -122,9 +123,9 @@ def run(
                 journal.acknowledge(SERVER, map_id, journal.head(map_id))
                 journal.prune(map_id, [SERVER])
             # Libraries are loaded with the first drive.
-            at_first = at_first or resident()
+            at_first = at_first or held_bytes()
             counts = len(own.map.nodes), len(own.map.edges), retired
-            sizes = path.stat().st_size, resident() - at_first
+            sizes = path.stat().st_size, held_bytes() - at_first
             waits = 1e3 * max(own.times[before:], default=0.0), 1e3 * max(ticks)
             curve.append(Drive(*counts, *sizes, *waits))
     views = [house.look(rng)[0] for _ in range(queries)]

@@ -17,16 +17,12 @@ time for that is not counted, neither in an answer's nor in the index's.
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import gc
 import json
 import math
 import os
 import resource
 from collections.abc import Iterable, Iterator
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 # Small matrices gain nothing from more threads, and wait for each other where other programs run.
@@ -38,6 +34,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.command_line import command_line
+from benchmarks.process_usage import held_bytes
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.score import figures, recall_by_kind, spent, wrong_by_kind
 from mapweave.hybridmap.node import Node
@@ -75,17 +72,9 @@ def searched(bench: Bench, index: PlaceIndex) -> dict[str, float]:
     return found
 
 
-def resident() -> float:
-    """MB of memory that the process holds now; what it has freed is given back first, where that can be."""
-    gc.collect()
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
-
-
 def measured(bench: Bench, size: int) -> dict[str, Any]:
     """Everything at one size."""
-    index, before, began = PlaceIndex(), resident(), spent() - bench.making
+    index, before, began = PlaceIndex(), held_bytes(), spent() - bench.making
     with bench.task(f"{size} nodes: index", size) as step:
         for some in chunks(bench.nodes(size), AT_ONCE):
             index.extend(some)
@@ -93,7 +82,7 @@ def measured(bench: Bench, size: int) -> dict[str, Any]:
                 step()
         index.settle()
     built = spent() - bench.making - began
-    grown = resident() - before
+    grown = (held_bytes() - before) / 1e6
     searches = searched(bench, index)
     relocalizer = Relocalizer(index, bench.node, bench.merged)
     prepared = bench.prepared(relocalizer)

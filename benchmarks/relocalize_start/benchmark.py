@@ -28,6 +28,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.command_line import command_line
+from benchmarks.process_usage import peak_mb, used_by
 from benchmarks.relocalize.distractors import gather
 from benchmarks.relocalize.places import Place, mapped, mapped_sites
 from benchmarks.relocalize.queries import Query, known
@@ -74,7 +75,7 @@ def start(folder: Path, queries: Sequence[Query], places: Sequence[Place], bar: 
                 if time.monotonic() - began > LONGEST:
                     raise SystemExit(f"no answer within {LONGEST:g} s")
                 time.sleep(0.05)
-            out = {"answer_s": time.monotonic() - began, "answer_cpu_s": _cpu(pid)}
+            out = {"answer_s": time.monotonic() - began, "answer_cpu_s": used_by(pid)}
             took, replies, framed = [], [], 0
             for query in queries:
                 asked = time.monotonic()
@@ -93,7 +94,7 @@ def start(folder: Path, queries: Sequence[Query], places: Sequence[Place], bar: 
                 "right_share": share(here, lambda reply: reply.near),
                 "in_frame_share": framed / max(sum(math.isfinite(r.error_m) for r in replies), 1),
                 "p50_ms": 1e3 * float(np.median(took)), "p95_ms": 1e3 * float(np.percentile(took, 95)),
-                "settled": float(bool(status["settled"])), "peak_mb": _peak_mb(pid),
+                "settled": float(bool(status["settled"])), "peak_mb": peak_mb(pid),
             }  # fmt: skip
         finally:
             bus.close()
@@ -108,18 +109,6 @@ def _ask(bus: ZenohBus, query: Query) -> RelocalizeAnswer | None:
     replies = bus.ask(Keys(FLEET).any_relocalize(), encode_view(query.picture.view), PATIENCE)
     good = [reply for reply in replies if not reply.error]
     return decode(good[0].payload, RelocalizeAnswer) if good else None
-
-
-def _cpu(pid: int) -> float:
-    """Seconds of processors that a process has used."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _peak_mb(pid: int) -> float:
-    """Most memory that a process has held."""
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
 
 
 def main() -> None:

@@ -1,13 +1,15 @@
-"""Processor time of a process whose threads end, against what it burns by its own clock."""
+"""Processor time of a process whose threads end, by its own clock; memory that is taken and given back."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
-from benchmarks.fleet.process_usage import Usage, total
+from benchmarks.process_usage import Usage, held_bytes, peak_mb, resident_mb, total
 
 BURN = """
 import ctypes, sys, threading, time
@@ -47,3 +49,14 @@ def test_threads_that_have_ended_still_count_where_they_belong() -> None:
         assert 0.15 < own_after - own < 0.6, "with what Python itself takes to start"
         assert total([process.pid]) == pytest.approx(own_after + zenoh_after, abs=0.03)
         print(file=process.stdin, flush=True)
+
+
+def test_memory_is_counted_in_millions_of_bytes() -> None:
+    before, resident = held_bytes(), resident_mb(os.getpid())
+    block = np.ones(100_000_000, np.uint8)
+    assert held_bytes() - before == pytest.approx(1e8, rel=0.05)
+    assert resident_mb() - resident == pytest.approx(100.0, rel=0.1)
+    assert peak_mb() >= resident_mb() - 1.0
+    del block
+    assert held_bytes() - before < 2e7
+    assert peak_mb() > resident_mb() + 80.0

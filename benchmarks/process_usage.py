@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import gc
 import os
 import re
+import resource
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -47,10 +51,30 @@ def _stat(path: Path) -> tuple[str, float, int]:
     return name, (int(fields[11]) + int(fields[12])) / HZ, int(fields[19])
 
 
-def resident_mb(pid: int) -> float:
-    """Memory that a process has now, MB."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.split("VmRSS:")[1].split()[0]) / 1024
+def resident_mb(pid: int | None = None) -> float:
+    """Memory that a process has now, this one by default, MB."""
+    return _memory_mb(pid, "VmRSS")
+
+
+def peak_mb(pid: int | None = None) -> float:
+    """Most memory that a process has had, this one by default, MB.
+
+    The peak of `getrusage` is at least that of the parent, as it was when it started the process.
+    """
+    return _memory_mb(pid, "VmHWM")
+
+
+def _memory_mb(pid: int | None, which: str) -> float:
+    status = Path(f"/proc/{pid or 'self'}/status").read_text()
+    return int(status.split(f"{which}:")[1].split()[0]) * 1024 / 1e6
+
+
+def held_bytes() -> int:
+    """Memory of this process, without garbage and what the allocator holds in reserve."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def total(pids: Iterable[int]) -> float:
