@@ -8,8 +8,9 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from functools import cache
-from typing import Any
+from typing import Any, NoReturn
 
 from mapweave.commands import (
     agent,
@@ -72,6 +73,19 @@ class CommandParser(argparse.ArgumentParser):
             which = f"{option[0]} {arg_string}" if option else f"{action.dest} {arg_string!r}"
             raise UsageError(f"{which}: {error}") from None
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a command that is none with the nearest one, rather than with all forty."""
+        if not isinstance(action, argparse._SubParsersAction) or value in action.choices:
+            super()._check_value(action, value)
+            return
+        near = get_close_matches(value, action.choices, 1)
+        meant = f"did you mean `{self.prog} {near[0]}`?" if near else f"`{self.prog} --help` lists them"
+        raise UsageError(f"no command `{self.prog} {value}`; {meant}")
+
+    def error(self, message: str) -> NoReturn:
+        """End with status 2: in one line, as every error."""
+        self.exit(USAGE, f"{self.prog}: {message}; see `{self.prog} --help`\n")
+
 
 class PrintVersion(argparse.Action):
     """Print the version and exit; it is looked up only when it is asked for."""
@@ -127,7 +141,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _complain(str(error))
         return USAGE
     if unknown:
-        # The usage of the command that was given says more than that of `mapweave`.
+        # The help of the command that was given says more than that of `mapweave`.
         arguments.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     try:
         return int(arguments.run(arguments))

@@ -27,16 +27,28 @@ def test_every_command_has_help(command, capfd):
 
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["fly"], ["agent"], ["agent", "r0", "--mission", "fly"], ["demo", "--robots", "many"], ["map"],
+    [[], ["agent"], ["agent", "r0", "--mission", "fly"], ["demo", "--robots", "many"], ["map"],
      ["replay"], ["relocalize"], ["server", "--port", "1"]],
 )  # fmt: skip
-def test_a_wrong_use_shows_how_to_use_it(arguments, capfd):
+def test_a_wrong_use_is_one_line_that_names_the_help(arguments, capfd):
     with pytest.raises(SystemExit) as ended:
         main(arguments)
-    assert ended.value.code == 2
-    err = capfd.readouterr().err
-    assert err.startswith("usage: mapweave")
-    assert "Traceback" not in err
+    assert ended.value.code == USAGE
+    command = " ".join(["mapweave", *arguments[:1]])
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"{command}: ") and line.endswith(f"; see `{command} --help`")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        ("serve", "did you mean `mapweave server`?"),
+        ("map shw office.mapweave", "did you mean `mapweave map show`?"),
+        ("fly", "`mapweave --help` lists them"),
+    ],
+)
+def test_a_command_that_is_none_is_refused_with_the_nearest(arguments, meant, capfd):
+    assert complaint(capfd, *arguments.split(), status=USAGE).endswith(meant)
 
 
 # Names and numbers
