@@ -298,6 +298,10 @@ def _listen(address: tuple[str, int]) -> socket.socket:
     except (OSError, OverflowError) as error:
         listening.close()
         number = getattr(error, "errno", None)
-        reason = "the port is taken" if number == errno.EADDRINUSE else getattr(error, "strerror", None)
+        reason = (
+            "the port is taken; choose another one"
+            if number == errno.EADDRINUSE
+            else getattr(error, "strerror", None)
+        )
         raise NotConnected(str(reason or error)) from None
     return listening

@@ -42,7 +42,7 @@ def test_a_port_that_is_taken(capfd, port, tmp_path):
 
 def test_a_port_for_people_that_is_taken(capfd, port, closed, tmp_path):
     output = complaint(capfd, "server", "--listen", closed, "--data", tmp_path / "a", "--http", port)
-    assert f"cannot listen at http 127.0.0.1:{port}: the port is taken" in output
+    assert f"cannot listen at http 127.0.0.1:{port}: the port is taken; choose another one" in output
     output = complaint(
         capfd, "server", "--listen", closed, "--data", tmp_path / "b", "--http", "here", status=USAGE
     )

@@ -216,7 +216,7 @@ watch({
     page.robots = robots;
     painter.robots = robots.map(robot => poseOf(robot, model)).filter(Boolean);
     byId("summary").textContent = server.summary + (server.settled === false ? ", still merging" : "");
-    listRobots(robots, name => selectRobot(name));
+    listRobots(robots, name => selectRobot(name), page.readOnly ? "A map file has none." : "None has been heard of.");
     updateRobot(robots);
     if (page.loading && !server.loading) listCorrections();
     page.loading = Boolean(server.loading);

@@ -25,10 +25,10 @@ function missionWords(mission) {
   const share = state === "running" && progress ? ` ${percent(progress)}` : "", why = reason ? `: ${reason}` : "";
   return `${order.kind}${goal ? " to " + goal : ""}, ${state}${share}${why} (by ${order.by})`;
 }
-export function listRobots(robots, select) {
+export function listRobots(robots, select, none) {
   const list = byId("robots"), focus = document.activeElement?.dataset?.robot;
   list.textContent = "";
-  if (!robots.length) add(list, "li", "None has been heard of.", "soft");
+  if (!robots.length) add(list, "li", none, "soft");
   for (const robot of robots) {
     const item = add(list, "li"), [word, kind] = life(robot), status = robot.status;
     const choice = button(item, robot.robot, () => select(robot.robot));
