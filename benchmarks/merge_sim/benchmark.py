@@ -229,10 +229,6 @@ def _median(values: Sequence[float]) -> float | None:
     return statistics.median(values) if values else None
 
 
-def _share(parts: Sequence[int], wholes: Sequence[int]) -> float | None:
-    return sum(parts) / sum(wholes) if sum(wholes) else None
-
-
 def _arguments() -> argparse.Namespace:
     parser = command_line("merge_sim", __doc__, "run k has the seed 1000 * SEED + k", whole=True)
     parser.add_argument("--runs", type=int, default=10, help="of each scenario (default 10)")
