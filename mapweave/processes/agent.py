@@ -357,8 +357,12 @@ class Agent:
             self._say(f"the map file written before is kept as {aside}")
 
     def _unknown_goal(self, node: NodeId) -> str:
-        on_own_map = node.map == self.map_id and node not in self.pipeline.map.nodes
-        return f"there is no node {node}" if on_own_map else ""
+        known = self.pipeline.map.nodes
+        if node.map != self.map_id or node in known:
+            return ""
+        # A copy, since the loop may add one meanwhile.
+        nearest = min(list(known), key=lambda one: abs(one.number - node.number), default=None)
+        return f"there is no node {node}" + (f"; the nearest is {nearest}" if nearest is not None else "")
 
     def _placed(self) -> int:
         return self.merged_poses.count(self.map_id)

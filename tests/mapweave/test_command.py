@@ -117,7 +117,7 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
             assert "r0.7.1 is not in the merged map" in refused
             complaint(capfd, "go", "r.0", "r0.7.1", *network, status=USAGE)
             code, printed = shell("go", "r0", "r0.1.999")
-            assert code == NO and "refused: there is no node r0.1.999" in printed
+            assert code == NO and "refused: there is no node r0.1.999; the nearest is r0.1." in printed
             code, printed = shell("status")
             assert code == 0 and "r0" in printed and "go to r0.1.1" in printed
             code, printed = shell("stop", "--all")
