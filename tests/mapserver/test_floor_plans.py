@@ -53,7 +53,7 @@ def pairs_of(
     for node in sorted(merged.poses)[:count]:
         beside = rng.uniform(-0.5, 0.5, 2)
         point = merged.pose(node).apply(beside) + rng.normal(0.0, off, 2)
-        u, up = truth.inverse().apply(point)
+        u, up = Pose2(truth.x, truth.y, truth.heading).inverse().apply(point) / truth.scale
         out.append(PlanPair(node, float(beside[0]), float(beside[1]), float(u), IMAGE.height - float(up)))
     return out
 
