@@ -14,6 +14,7 @@ from mapweave.agent.edge_measurement.driven_edge import driven_edge
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.triangulation import triangulate
 from mapweave.agent.mapping.anchored_keyframe import HERE, AnchoredKeyframe
+from mapweave.agent.mapping.loop_closures import LoopClosures
 from mapweave.agent.mapping.tracking import EpisodeEstimate
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import RawImage, View
@@ -24,7 +25,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
-from mapweave.registration.recognition import Recognition, register
+from mapweave.registration.recognition import Recognition
 from mapweave.registration.selection import SelectionSettings, choose, worth
 
 MOST_LANDMARKS = 150
@@ -42,21 +43,6 @@ EDGE_FLOOR = (0.002, 0.004)
 for which pixels err independently, does not know."""
 EDGE_SHARE = (0.005, 0.01)
 """What is added to that, as a share of the way and of the turn: wheels are never quite round."""
-LOOP_REACH = 1.2
-"""Nodes of the own map nearer than this are tried for a loop closure, m."""
-LOOP_TURN = 0.7
-"""Nodes turned by less than this are tried for a loop closure, rad."""
-LOOP_TRIES = 4
-"""Nodes that are tried for loop closures of a new node, nearest first."""
-LOOP_SIGMA = 0.12
-"""A loop closure known no better than this is left to the server, m."""
-LOOP_GATE = 25.0
-"""Chi-square with 3 degrees of freedom by which a loop closure may differ from the robot's own
-measurement between the two nodes: places may look the same."""
-LOOP_FLOOR = (0.05, 0.03)
-"""Error of that measurement beyond its covariance, m and rad."""
-
-
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
 
@@ -97,7 +83,7 @@ class KeyframeBuilder:
         self._new: list[ChangeBody] = []
         self._images: list[tuple[NodeId, RawImage]] = []
         self._pending: deque[Callable[[], None]] = deque()
-        self._rng = np.random.default_rng(0)
+        self._loops = LoopClosures(self.map, self.new_id)
 
     def recalibrate(self, description: RobotDescription, old_from_new: Pose2) -> None:
         """Make nodes with another camera from now on; those made before keep theirs.
@@ -188,7 +174,7 @@ class KeyframeBuilder:
         self.finish_pending()
         last = self._last
         if last is not None and last.evidence:
-            loops = self._loops(placed.node, None)
+            loops = self._loops.edges(placed.node)
             if loops:
                 self._settle(placed, loops)
             joined = loops or [self._edge(last, placed, last.node_from_anchor)]
@@ -214,8 +200,18 @@ class KeyframeBuilder:
             self.continue_pending()
 
     def _close_loops(self, node: Node, before: NodeId | None) -> None:
-        if node.id in self.map.nodes:
-            self._write(*self._loops(node, before))
+        """Try earlier places one after the other, a tick each: a comparison takes as long as the tracks."""
+        if node.id not in self.map.nodes:
+            return
+        tries = [partial(self._close_loop, earlier, node) for earlier in self._loops.nearby(node, before)]
+        self._pending.extendleft(reversed(tries[1:]))
+        for attempt in tries[:1]:
+            attempt()
+
+    def _close_loop(self, earlier: Node, node: Node) -> None:
+        loop = self._loops.edge(earlier, node)
+        if loop is not None:
+            self._write(loop)
 
     def recognise(self, node: Node, view_tracks: NDArray[np.int64], recognition: Recognition) -> None:
         """The next episode begins at a view that shows a node of this map, however the robot came there.
@@ -359,43 +355,3 @@ class KeyframeBuilder:
         heading = EDGE_FLOOR[1] + EDGE_SHARE[1] * turn
         more = np.diag([position**2, position**2, heading**2])
         return PoseGaussian(moved.mean, moved.covariance + more)
-
-    def _loops(self, node: Node, before: NodeId | None) -> list[Edge]:
-        """Recognise earlier places of the own map (paper, section 5): each gives a new edge.
-
-        Args:
-            node: from which.
-            before: an earlier node to which it has an edge already.
-        """
-        nearby = []
-        for candidate in self.map.nodes.values():
-            between = candidate.map_from_robot.mean.inverse() @ node.map_from_robot.mean
-            reach = float(np.hypot(between.x, between.y))
-            earlier = candidate.id < node.id and candidate.id != before
-            if earlier and reach < LOOP_REACH and abs(between.heading) < LOOP_TURN:
-                nearby.append((reach, candidate))
-        edges: list[Edge] = []
-        for _, candidate in sorted(nearby, key=lambda pair: pair[0])[:LOOP_TRIES]:
-            recognition = register(candidate, node, None, self._rng)
-            if recognition is None or recognition.evidence["sigma_xy"] >= LOOP_SIGMA:
-                continue
-            if self._credible(candidate, node, recognition.node_from_robot):
-                pose, pairs, evidence = recognition.node_from_robot, recognition.pairs, recognition.evidence
-                edges.append(Edge(self.new_id(), candidate.id, node.id, pose, EdgeKind.LOOP, pairs, evidence))
-        return edges
-
-    def _credible(self, earlier: Node, later: Node, measured: PoseGaussian) -> bool:
-        """Whether a recognition agrees with the robot's own way from the earlier node to the later one.
-
-        The later pose is the earlier one and the way, L = E W; so the way's covariance is
-        W = L - Ad(w^-1) E Ad(w^-1)^T. Where the map was gone on with elsewhere in between, that is not so and
-        the difference may have no meaning: what is negative of it counts as nothing.
-        """
-        way = earlier.map_from_robot.mean.inverse() @ later.map_from_robot.mean
-        ad = way.inverse().adjoint
-        grown = later.map_from_robot.covariance - ad @ earlier.map_from_robot.covariance @ ad.T
-        values, vectors = np.linalg.eigh(0.5 * (grown + grown.T))
-        grown = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        xy, heading = LOOP_FLOOR
-        spread = grown + measured.covariance + np.diag([xy**2, xy**2, heading**2])
-        return PoseGaussian(measured.mean, spread).mahalanobis2(way) < LOOP_GATE

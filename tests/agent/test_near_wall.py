@@ -7,15 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mapweave.agent.mapping import keyframe_builder
-from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
+from mapweave.agent.mapping import loop_closures
+from mapweave.agent.mapping.loop_closures import LoopClosures
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Command, RobotDescription
+from mapweave.agent.observation import Command
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.registration.selection import SelectionSettings
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 
@@ -55,18 +55,12 @@ def test_a_loop_must_agree_with_the_way_there(monkeypatch, off, closed):
     earlier = PoseGaussian.from_sigmas(Pose2(2.0, 1.0, -0.7), 0.3, 0.1)
     back = PoseGaussian.from_sigmas(along.mean.inverse() @ Pose2(0.4, 0.1, 0.1), 0.05, 0.02)
     later = earlier @ along @ back
-    made = KeyframeBuilder(
-        MapId("r0", 1),
-        RobotDescription(camera=CAMERA),
-        SelectionSettings(),
-        [NodePut(node(1, earlier))],
-        next_number=2,
-    )
+    closures = LoopClosures(HybridMap([NodePut(node(1, earlier))]), lambda: NodeId("r0", 1, 9))
     way = earlier.mean.inverse() @ later.mean
     result = PoseGaussian.from_sigmas(Pose2(way.x - off, way.y, way.heading), 0.02, 0.005)
     recognition = SimpleNamespace(
         node_from_robot=result, pairs=np.zeros((0, 2), np.int64), evidence={"sigma_xy": 0.02, "inliers": 29.0}
     )
-    monkeypatch.setattr(keyframe_builder, "register", lambda *arguments: recognition)
-    edges = made._loops(node(5, later), None)
+    monkeypatch.setattr(loop_closures, "register", lambda *arguments: recognition)
+    edges = closures.edges(node(5, later))
     assert bool(edges) == closed

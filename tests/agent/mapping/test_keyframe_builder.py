@@ -1,0 +1,38 @@
+"""Keyframes: what is left of an episode is made in pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mapweave.agent.mapping import loop_closures
+from mapweave.agent.mapping.anchored_keyframe import AnchoredKeyframe
+from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.registration.selection import SelectionSettings
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
+
+
+def node(number: int) -> Node:
+    pose = PoseGaussian.from_sigmas(Pose2(0.1 * number, 0.0, 0.0), 0.01, 0.01)
+    return Node(NodeId("r0", 1, number), number, pose, CAMERA, Landmarks.empty())
+
+
+def test_a_piece_compares_a_node_with_one_earlier_place(monkeypatch: pytest.MonkeyPatch):
+    """A comparison takes as long as following the tracks: four in one tick were a late tick."""
+    compared: list[int] = []
+    monkeypatch.setattr(loop_closures, "register", lambda earlier, *_: compared.append(earlier.id.number))
+    earlier = [NodePut(node(number)) for number in (1, 2, 3)]
+    builder = KeyframeBuilder(MapId("r0", 1), RobotDescription(CAMERA), SelectionSettings(), earlier, 4)
+    builder.join(AnchoredKeyframe(node(4), np.zeros(0, np.int64)))
+    by_piece = []
+    for _ in range(4):
+        compared.clear()
+        builder.continue_pending()
+        by_piece.append(tuple(compared))
+    assert by_piece == [(3,), (2,), (1,), ()]
