@@ -127,7 +127,7 @@ def test_a_replay_is_read_back_as_it_was(
     assert set(sides[0]) == {-sides[3][0]} and sides[3][0] == pytest.approx(limit)
     assert all(right < left for right, left in zip(sides[1], sides[2], strict=True))
     assert max(sides[2]) <= limit + 0.2 and min(sides[1]) >= -limit - 0.2
-    # They are told from their limits, and from each other.
+    # Their colours differ from that of the limits, and from each other.
     colours = {str(rows[f"/walk/bearings/{w}:colors"][-1][1]) for w in
                ("limit_left", "outermost_left", "outermost_right")}  # fmt: skip
     assert len(colours) == 3
