@@ -247,10 +247,10 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
     """Why a consistent set does not suffice; empty if it does."""
     if not kept:
         return "no links"
-    telling = [link for link in kept if link.telling]
-    if not telling or not place_distinct(kept):
+    if not _identify(kept) and not any(_identify(rest) for rest in _without_each_robot(kept)):
         agree = "the link shows" if len(kept) == 1 else f"the {len(kept)} links that agree show"
         return f"most of what {agree} is found at other places too"
+    telling = [link for link in kept if link.telling]
     independent = independent_links(telling, s.least_links)
     if independent >= s.least_links:
         return ""
@@ -259,6 +259,20 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
         if link.weight >= OVERWHELMING_INLIERS and share >= OVERWHELMING_SHARE:
             return ""
     return f"no {s.least_links} links that share no node agree with each other, as they must"
+
+
+def _identify(links: Sequence[Link]) -> bool:
+    """Whether links that agree identify a place."""
+    return any(link.telling for link in links) and place_distinct(links)
+
+
+def _without_each_robot(links: Sequence[Link]) -> list[list[Link]]:
+    """The links without those of one robot, for each robot. Of links between two robots nothing is left.
+
+    What one robot alone shows at two places takes nothing from the links between others.
+    """
+    robots = sorted({node.agent for link in links for node in link.pair})
+    return [[link for link in links if robot not in (link.a.agent, link.b.agent)] for robot in robots]
 
 
 def group_links(

@@ -1,5 +1,6 @@
 """Which links are kept: planted false links, similar rooms, cliques against brute force."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapweave.hybridmap.explanation import ALIASED
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
@@ -190,3 +192,19 @@ def test_greedy_clique_finds_a_planted_one() -> None:
     agree = np.triu(agree, 1)
     agree = agree | agree.T
     assert set(planted) <= set(best_clique(agree, np.full(120, 20)))
+
+
+def test_what_one_robot_shows_twice_takes_nothing_from_links_between_others() -> None:
+    """Links of three robots that agree are sorted together; most landmarks of one robot's are aliased."""
+    two = Two(9)
+    joined = two.b.graph
+    names = {node: NodeId("c", 1, node.number) if node.number >= 6 else node for node in joined.nodes}
+    steps = [replace(step, a=names[step.a], b=names[step.b]) for step in two.b.measurements]
+    two.b = Fragment(joined.anchor, solve_graph(joined.anchor, Pose2(), steps), tuple(steps))
+    links = [two.true_link(k, k, inliers=22 if k < 6 else 60) for k in range(12)]
+    aliased = [
+        replace(one, evidence={**one.evidence, ALIASED: 50.0}) if one.b.agent == "c" else one for one in links
+    ]
+    assert {one.pair for one in sort_links(aliased, two.a, two.b).kept} == {one.pair for one in links}
+    alone = sort_links([one for one in aliased if one.b.agent == "c"], two.a, two.b)
+    assert not alone.kept and {"found at other places too" in r.reason for r in alone.refused} == {True}
