@@ -10,27 +10,13 @@ Others are not asked, so no robot makes a map of another one seem torn.
 
 from __future__ import annotations
 
-import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 
-import numpy as np
-
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, Node, NodeId
-from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.collision import is_exclusion
-from mapweave.merge.outlier_rejection.bent_maps import AGREEING
-from mapweave.merge.outlier_rejection.wrong_geometry import (
-    MOST_NEAR,
-    MOST_SIGMA_HEADING,
-    MOST_SIGMA_XY,
-    REACH,
-    UNSOLVABLE,
-    link_sets,
-    more_than_usual,
-    seen_through,
-)
+from mapweave.merge.outlier_rejection.wrong_geometry import UNSOLVABLE, is_torn
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
@@ -42,8 +28,6 @@ MOST_OF_A_NODE = 2
 """Links of each node that are tested, those with most landmarks: so many confirm each other."""
 MOST_NODES = 100
 """Nodes of a map that are tested, evenly chosen."""
-LEAST_COMPARED = 20
-"""Landmarks of a node that others of its map confirm or refute, at least."""
 Excluded = dict[tuple[int, int], dict[str, list[Link]]]
 """Refused links from one component to another, by the robot at their far end."""
 
@@ -87,16 +71,7 @@ class TornMapSearch:
         pieces = Fragment(placed.anchor, placed, ()), Fragment(fixed.anchor, fixed, ())
         nodes = [merged.maps[node.map].nodes[node] for node in placed.nodes]
         try:
-            best = link_sets(links, *pieces, self._s)[0]
-            if len(best) >= AGREEING * len(links):
-                return False  # a place that looks the same, as a whole
-            first = sorted({link.a for link in best})
-            second = sorted({link.a for link in links}.difference(first))
-            across, within = (
-                np.concatenate([_shares(placed, nodes, *pair) for pair in pairs])
-                for pairs in (((first, second), (second, first)), ((first, first), (second, second)))
-            )
-            return more_than_usual(across, within)
+            return is_torn(links, *pieces, nodes, self._s)
         except UNSOLVABLE:
             return False
 
@@ -125,40 +100,6 @@ def _excluded(merged: MergedMap) -> Excluded:
         if len(against) >= 2:
             out[pair] = against
     return out
-
-
-def _shares(
-    graph: PoseGraph, nodes: Sequence[Node], which: Sequence[NodeId], others: Sequence[NodeId]
-) -> Array:
-    """Of each node that can be compared: the share of its landmarks that other nodes of its map refute.
-
-    Args:
-        graph: of the map.
-        nodes: all of its nodes.
-        which: of these.
-        others: compared with these, where they are near.
-    """
-    out, rows = [], graph.index(others)
-    for node_id in which:
-        row = graph.rows[node_id]
-        away = np.hypot(*(graph.means[rows, :2] - graph.means[row, :2]).T)
-        near = [int(rows[k]) for k in np.argsort(away, kind="stable")[:MOST_NEAR] if away[k] < REACH]
-        near = [k for k in near if k != row]
-        if not near:
-            continue
-        relative = graph.relative([graph.nodes[k] for k in near], [node_id] * len(near))
-        counts = np.zeros(2, np.int64)
-        for k, mean, covariance in zip(near, relative.means, relative.covariances, strict=True):
-            sigma_xy = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-            sigma_heading = math.sqrt(covariance[2, 2])
-            if sigma_xy > MOST_SIGMA_XY or sigma_heading > MOST_SIGMA_HEADING:
-                continue
-            pose = Pose2.from_vector(mean)
-            counts += seen_through(nodes[row], nodes[k], pose, sigma_xy, sigma_heading)
-            counts += seen_through(nodes[k], nodes[row], pose.inverse(), sigma_xy, sigma_heading)
-        if counts[0] >= LEAST_COMPARED:
-            out.append(counts[1] / counts[0])
-    return np.array(out)
 
 
 def _thinned(links: Sequence[Link]) -> list[Link]:

@@ -10,10 +10,12 @@ looks like another room gives such sets too. Consistency cannot distinguish the 
 * If the map bends or jumps, each placement puts a part of it in a wrong place. Others then see through its
   walls, and it sees through theirs: they have landmarks behind them in the same direction.
 
-So a map is wrong if lines of sight refute every placement among several maps that agree with each other.
+So a map is wrong if lines of sight refute every placement among several maps that agree with each other, of
+two other robots or of its own: no robot alone makes the map of another one seem wrong.
 Clutter and wrong depths are seen through at true places too. Their share is measured on the same nodes, each
 placed by its own links. Unobserved placements are not refuted, and the map may be right: it may have a room
-that only looks like theirs.
+that only looks like theirs. If it has their places in another arrangement than theirs, its own nodes see
+through each other, wherever it is placed.
 
 A map that is only a little wrong is seen through nowhere: see `mapweave.merge.outlier_rejection.bent_maps`.
 """
@@ -21,7 +23,8 @@ A map that is only a little wrong is seen through nowhere: see `mapweave.merge.o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -33,6 +36,16 @@ from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
+from mapweave.merge.outlier_rejection.lines_of_sight import (
+    LEAST_NODES,
+    MOST_NEAR,
+    MOST_SIGMA_HEADING,
+    MOST_SIGMA_XY,
+    REACH,
+    more_than_usual,
+    seen_through,
+    tears,
+)
 from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2
 from mapweave.merge.outlier_rejection.shuffled_maps import is_shuffled
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
@@ -45,27 +58,13 @@ from mapweave.registration.pose_arrays import PoseGaussians
 MOST_LINKS = 60
 """Links between two pieces of map that are tested, evenly chosen: pairs of links grow by the square."""
 MOST_PARTNERS = 5
-"""Maps against which one is held: those with which it has most links."""
+"""Maps against which one is held: those with which it has most links, of all robots in turns."""
 LEAST_SHARE = 0.25
 """A set of links is a placement if it has this share of the links of the largest set."""
-RARE = 0.05
-"""Share of nodes, placed by their own links, that are seen through more than usual."""
-REFUTED = 0.001
-"""Chance, at most, that so many nodes are under a true placement (binomial)."""
-LEAST_NODES = 4
-"""Nodes on either side of the comparison, at least."""
-MOST_SIGMA_XY, MOST_SIGMA_HEADING = 0.25, math.radians(5.0)
-"""Nodes whose place is known less well, by the surest link of a placement, are not compared, m and rad."""
 LEAST_LANDMARKS = 50
 """Of a node that others confirm or refute: with fewer its share is chance."""
 SAME_XY, SAME_HEADING = 0.5, math.radians(20.0)
 """Links of one node agree where it is if they differ by less, m and rad."""
-REACH, MOST_NEAR = 5.0, 20
-"""A node is compared with the nearest others within reach, m: depths are poor beyond it."""
-SIGMAS, MARGIN = 3.0, 0.2
-"""What lies behind a landmark by more than so many sigmas, and so many m, is behind it."""
-AROUND = 0.03
-"""Two landmarks are in the same direction if they are so near to each other, rad."""
 
 UNSOLVABLE = (ArithmeticError, RuntimeError, ValueError)
 """What solvers raise for a map whose numbers they cannot take. Nothing is found out about it then."""
@@ -148,13 +147,14 @@ class WrongGeometrySearch:
                 for map_id, partner in (pair, pair[::-1]):
                     ties.setdefault(map_id, {})[partner] = tie
         doubts = {
-            map_id: sum(not tie.agrees for tie in partners.values()) for map_id, partners in ties.items()
+            map_id: _independent(map_id, (k for k, tie in partners.items() if not tie.agrees))
+            for map_id, partners in ties.items()
         }
         out: dict[MapId, WrongGeometry] = {}
         for map_id in sorted(doubts, key=lambda map_id: (-doubts[map_id], map_id)):
             if doubts[map_id] < 2:
                 break
-            agreeing = self._agreeing({k: v for k, v in ties[map_id].items() if k not in out}, ties)
+            agreeing = self._agreeing(map_id, {k: v for k, v in ties[map_id].items() if k not in out}, ties)
             if len(agreeing) < 2:
                 continue
             if (map_id, agreeing) not in self._checked:
@@ -182,14 +182,20 @@ class WrongGeometrySearch:
             self._ties[pair] = _Tie(tuple(inside), tuple(best), len(best) / len(some))
 
     @staticmethod
-    def _agreeing(own: Mapping[MapId, _Tie], ties: Mapping[MapId, Mapping[MapId, _Tie]]) -> tuple[MapId, ...]:
-        """Maps that agree with each other, of those tied to one map; empty unless it disagrees with two."""
-        some = sorted(own, key=lambda other: (-len(own[other].links), other))[:MOST_PARTNERS]
+    def _agreeing(
+        map_id: MapId, own: Mapping[MapId, _Tie], ties: Mapping[MapId, Mapping[MapId, _Tie]]
+    ) -> tuple[MapId, ...]:
+        """Maps that agree with each other, of those tied to one; empty without two robots against it."""
+        some = _in_turns(sorted(own, key=lambda other: (-len(own[other].links), other)))[:MOST_PARTNERS]
         graph: nx.Graph = nx.Graph()
         graph.add_edges_from(
             (a, b) for a in some for b in some if a < b and b in ties[a] and ties[a][b].agrees
         )
-        parts = [part for part in nx.connected_components(graph) if sum(not own[k].agrees for k in part) >= 2]
+        parts = [
+            part
+            for part in nx.connected_components(graph)
+            if _independent(map_id, (k for k in part if not own[k].agrees)) >= 2
+        ]
         return tuple(sorted(max(parts, key=len, default=())))
 
     def _is_wrong(self, map_id: MapId, agreeing: Sequence[MapId], maps: Mapping[MapId, HybridMap]) -> bool:
@@ -208,6 +214,21 @@ class WrongGeometrySearch:
         across = [link for link in across if link.b in graph.rows]
         every = {k: node for which in (map_id, *agreeing) for k, node in maps[which].nodes.items()}
         return all_refuted(across, placed, Fragment(graph.anchor, graph, ()), every, self._s)
+
+
+def _independent(map_id: MapId, others: Iterable[MapId]) -> int:
+    """How many independent maps there are against one: those of another robot count as one, as it may lie."""
+    return len({other if other.agent == map_id.agent else other.agent for other in others})
+
+
+def _in_turns(maps: Sequence[MapId]) -> list[MapId]:
+    """The maps of different robots in turns, those of each robot in their order."""
+    before = Counter[str]()
+    turns: list[tuple[int, int]] = []
+    for k, map_id in enumerate(maps):
+        turns.append((before[map_id.agent], k))
+        before[map_id.agent] += 1
+    return [maps[k] for _, k in sorted(turns)]
 
 
 def thinned(links: Sequence[Link]) -> list[Link]:
@@ -242,6 +263,28 @@ def link_sets(
     return sorted(sets, key=len, reverse=True)
 
 
+def is_torn(
+    links: Sequence[Link], placed: Fragment, fixed: Fragment, nodes: Sequence[Node], s: ConsistencySettings
+) -> bool:
+    """Whether a map shows places of others in another arrangement: its own nodes see through each other.
+
+    In a map that is right they do not, wherever it is, and whatever looks like it elsewhere.
+
+    Args:
+        links: from `placed` to `fixed`, at least one.
+        placed: piece of map.
+        fixed: piece of map that several robots agree on.
+        nodes: of `placed`, in its order.
+        s: when links agree.
+    """
+    best = link_sets(links, placed, fixed, s)[0]
+    if len(best) >= AGREEING * len(links):
+        return False  # a place that looks the same, as a whole
+    first = {link.a for link in best}
+    second = {link.a for link in links} - first
+    return tears(sorted(first), sorted(second), placed.graph, nodes)
+
+
 def all_refuted(
     links: Sequence[Link],
     placed: Fragment,
@@ -261,6 +304,8 @@ def all_refuted(
     if not _nodes_agree(links, fixed):
         return False
     if is_bent(links, placed, fixed) or is_shuffled(links, placed, fixed):
+        return True
+    if is_torn(links, placed, fixed, [nodes[node_id] for node_id in placed.nodes], s):
         return True
     sets = link_sets(links, placed, fixed, s)
     sets = [some_links for some_links in sets if len(some_links) >= LEAST_SHARE * len(sets[0])]
@@ -298,16 +343,6 @@ def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
         for placement in rest
     ]
     return len(agree) >= LEAST_NODES and sum(agree) >= AGREEING * len(agree)
-
-
-def more_than_usual(shares: Array, usual: Array) -> bool:
-    """Whether more nodes than by chance are seen through more than usual."""
-    from scipy.special import bdtrc
-
-    if min(len(shares), len(usual)) < LEAST_NODES:
-        return False
-    many = int((shares > np.quantile(usual, 1.0 - RARE)).sum())
-    return bool(bdtrc(many - 1, len(shares), RARE) < REFUTED)
 
 
 def _seen_through_shares(
@@ -352,36 +387,3 @@ def _seen_through_shares(
         if counts[0] >= LEAST_LANDMARKS:
             out.append(counts[1] / counts[0])
     return np.array(out)
-
-
-def seen_through(
-    node: Node, view: Node, view_from_node: Pose2, sigma_xy: float, sigma_heading: float
-) -> tuple[int, int]:
-    """How many of a node's landmarks a view can confirm or refute, and how many it refutes.
-
-    A view confirms a landmark if it has one at this distance in the same direction. It sees through it, and
-    so refutes it, if it has one only behind it. Landmarks behind everything that the view has there are
-    occluded, and are no evidence: a map placed outside the walls would have too many of them.
-
-    Args:
-        node: whose landmarks.
-        view: another node.
-        view_from_node: relative pose,
-        sigma_xy: standard deviation of that, m,
-        sigma_heading: and rad.
-    """
-    marks, with_depth = (n.landmarks.take(n.landmarks.has_depth) for n in (node, view))
-    points = view_from_node.apply(marks.points_in_robot(node.camera))
-    pixels = view.camera.project(points)
-    inside = view.camera.contains(pixels)
-    if not inside.any() or not len(with_depth):
-        return 0, 0
-    depths, pixels = points[inside, 0] - view.camera.mount_forward, pixels[inside]
-    own = marks.depth_sigmas[inside].astype(np.float64) ** 2 + sigma_xy**2 + (sigma_heading * depths) ** 2
-    sigmas = np.sqrt(own[:, None] + with_depth.depth_sigmas.astype(np.float64)[None] ** 2)
-    further = with_depth.depths.astype(np.float64)[None] - depths[:, None]
-    off = np.linalg.norm(pixels[:, None] - with_depth.pixels[None], axis=2) / view.camera.fx
-    same_direction = off < AROUND + 2.0 * sigma_heading
-    behind = (same_direction & (further > SIGMAS * sigmas + MARGIN)).any(axis=1)
-    about = (same_direction & (np.abs(further) <= SIGMAS * sigmas + MARGIN)).any(axis=1)
-    return int((behind | about).sum()), int((behind & ~about).sum())

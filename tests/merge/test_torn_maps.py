@@ -16,7 +16,8 @@ from mapweave.merge.pose_graph.links import RefusedLink, refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.merge.torn_maps import TornMapSearch
-from mapweave.scenarios.liar.lies import Setting, altered, bodies, chain
+from mapweave.scenarios.liar.lies import Setting, altered, altered_places, bodies, chain
+from mapweave.wire.codec import decode_change
 from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet
 from tests.quick import first_quick
 
@@ -85,8 +86,25 @@ def test_what_did_not_change_is_not_tested_again(fleet: Fleet, monkeypatch: pyte
     merged, search = beside_copies(fleet, TORN, ("r0", "r1")), TornMapSearch(ConsistencySettings())
     assert search.torn(merged)
     tested = []
-    monkeypatch.setattr("mapweave.merge.torn_maps.more_than_usual", lambda *_: tested.append(1))
+    monkeypatch.setattr("mapweave.merge.torn_maps.is_torn", lambda *_: tested.append(1))
     assert search.torn(merged) and not tested
     # Its robot has put a node again.
     maps = {**merged.maps, ODD: HybridMap(merged.maps[ODD].contents())}
     assert not search.torn(replace(merged, maps=maps)) and tested
+
+
+@pytest.mark.slow
+def test_altered_copies_behind_a_true_drive_are_found_out_by_their_arrangement(fleet: Fleet) -> None:
+    """Copies of two robots' places, each robot's in its own frame: their map contradicts those that agree."""
+    sound = {map_id: content for map_id, content in fleet.maps.items() if map_id != ODD}
+    lie = altered_places(Setting(ODD, fleet.maps[ODD], sound, np.random.default_rng(SEED)))
+    merger = Merger()
+    for map_id, content in sound.items():
+        for body in bodies(content):
+            merger.apply(map_id, body)
+    before = merger.merged()
+    for message in lie.logs[ODD]:
+        merger.apply(ODD, decode_change(message).body)
+    merged = merger.merged()
+    assert merged.wrong.keys() == {ODD}
+    assert {link.key for link in merged.links if ODD not in link.maps} == {link.key for link in before.links}

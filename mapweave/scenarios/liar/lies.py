@@ -381,6 +381,6 @@ UNDECIDABLE: dict[str, Callable[[Setting], Lie]] = {
     "places seen from aside": places_from_aside,
 }
 """Maps that are right in themselves and could be of a second building that looks the same: nothing that a
-server knows tells which of the two robots lies. Answers may become ambiguous; copies may
-part the maps of others as well."""
+server knows tells which of the two robots lies. Answers may become ambiguous. Copies of two robots' places in
+an arrangement that is not theirs are found out if both robots contradict the map."""
 EVERY: Mapping[str, Callable[[Setting], Lie]] = {**WAYS, **UNDECIDABLE}

@@ -15,7 +15,8 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection import wrong_geometry
-from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch, seen_through
+from mapweave.merge.outlier_rejection.lines_of_sight import seen_through
+from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.settings import ConsistencySettings
 
@@ -53,9 +54,9 @@ def test_a_view_through_a_wall_is_detected(ahead: float, first: str, second: str
         assert through == (compared if expected == "refuted" else 0)
 
 
-def corridor(agent: str, scale: float = 1.0, gap: float = 0.0, count: int = 18) -> HybridMap:
+def corridor(agent: str, scale: float = 1.0, gap: float = 0.0, count: int = 18, epoch: int = 1) -> HybridMap:
     """A robot that backs away from a wall, by steps that it measures, and once moves without noticing."""
-    map_id, out, at = MapId(agent, 1), HybridMap(), 0.0
+    map_id, out, at = MapId(agent, epoch), HybridMap(), 0.0
     for k in range(count):
         true = 1.5 + STEP * k + (gap if k >= 6 else 0.0)
         out.apply(NodePut(facing_a_wall(map_id, k, true, Pose2(-at, 0.0, 0.0))))
@@ -95,6 +96,19 @@ def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expect
         # Which of two is wrong cannot be decided; retired maps do not count.
         assert not finder.wrong(maps, links.__getitem__, (), [ids[0]])
         assert finder.wrong(maps, links.__getitem__, ()).keys() == wrong.keys()
+
+
+@pytest.mark.parametrize("count", [3, 7])
+def test_no_robot_alone_makes_maps_of_others_seem_wrong(count: int) -> None:
+    """However many maps it sends that agree with each other, also if these come first."""
+    maps = {MapId(agent, 1): corridor(agent) for agent in "yz"}
+    maps |= {MapId("c", k): corridor("c", 1.0, 2.0, 12, k) for k in range(1, count + 1)}
+    ids = sorted(maps)
+    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    finder = WrongGeometrySearch(ConsistencySettings())
+    assert finder.wrong(maps, links.__getitem__, links.keys()).keys() == set(ids[:-2])
+    # Of two robots that contradict each other neither is wrong.
+    assert not finder.wrong(maps, links.__getitem__, (), [ids[-1]])
 
 
 def test_a_map_that_was_left_out_when_its_links_came_is_searched_once_it_is_used() -> None:
