@@ -13,7 +13,8 @@ MEASUREMENTS: dict[str, str] = {
     "navigate": "python -m benchmarks.navigate --runs 10 --seed 705 --json",
     "explore": "python -m benchmarks.explore --robots 1 --minutes 3 --seed 706 --json",
     "landmarks": "python -m benchmarks.landmarks --seed 707 --json",
-    "relocalize": "python -m benchmarks.relocalize --nodes 1000 100000 --seed 708 --json",
+    "relocalize": "python -m benchmarks.relocalize --nodes 1000 100000 --no-peer --ceilings --seed 708 "
+    "--json",
     "merge": "python -m benchmarks.merge --runs 6 --seed 709 --json",
     "merge_scale": "python -m benchmarks.merge --scale 10000 --seed 710 --json",
     "merge_sim": "python -m benchmarks.merge_sim --scenarios office --runs 1 --seed 712 --json",

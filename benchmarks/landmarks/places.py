@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.images.surface_points import Surfaces
+from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.camera import CAMERAS
@@ -58,6 +59,11 @@ class SimulatedPlace:
         lens = Lens(camera, setup.distortion)
         return SimulatedPlace(camera, pose, surfaces, lens, imager, Scene([PanelSet.of(world.panels)]))
 
+    @property
+    def description(self) -> RobotDescription:
+        """Of a robot with this camera, whose features come without distortion."""
+        return RobotDescription(self.camera)
+
     def nearby(self, rng: np.random.Generator) -> Pose2:
         """Another pose, seen from the place."""
         ahead, aside = rng.uniform(-NEAR, NEAR, 2)
@@ -82,3 +88,7 @@ class SimulatedPlace:
         """(N,) m of undistorted pixels seen from the place; NaN for nothing."""
         depths = self._surfaces.see(self.pose, self.camera, pixels).depths
         return np.where(np.isfinite(depths), depths, np.nan)
+
+    def project(self, points: Array, at: Pose2) -> Array:
+        """(N, 2) undistorted px where points in world are seen from beside the place; NaN behind."""
+        return self.camera.project((self.pose @ at).inverse().apply(points))

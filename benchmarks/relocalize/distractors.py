@@ -38,22 +38,34 @@ PIXEL_SIGMA, DEPTH_SIGMA = 1.0, 0.03
 
 
 @dataclass(frozen=True, eq=False)
+class Differences:
+    """What real landmarks' descriptors differed by between two real views.
+
+    Attributes:
+        vectors: (M, 32) float32, of decoded descriptors.
+        sift: (M, 128) int16, of whole ones, in the same order.
+    """
+
+    vectors: NDArray[np.float32]
+    sift: NDArray[np.int16]
+
+
+@dataclass(frozen=True, eq=False)
 class Distractors:
     """As many places as are wanted; number k is always the same.
 
     Attributes:
         donors: places that a robot would make of real views.
-        differences: (M, 32) float32, what real landmarks' decoded descriptors differed by between two real
-            views; they are put upon the descriptors.
+        differences: that are put upon their descriptors.
         seed: of all.
     """
 
     donors: Sequence[Place]
-    differences: NDArray[np.float32]
+    differences: Differences
     seed: int
 
-    def node(self, number: int) -> Node:
-        """A place's node; its true pose is unknown."""
+    def place(self, number: int) -> Place:
+        """A place, with whole descriptors too; its true pose is unknown."""
         rng = np.random.default_rng([self.seed, 0xD157, number])
         i, j = rng.choice(len(self.donors), 2, replace=False).tolist()
         left, right = self.donors[i], self.donors[j]
@@ -62,15 +74,21 @@ class Distractors:
         of_left, of_right = a.pixels[:, 0] < cut, b.pixels[:, 0] >= cut
         a, b = a.take(of_left), b.take(of_right)
         n = len(a) + len(b)
-        chosen = rng.integers(0, len(self.differences), n)
-        vectors = decode(np.concatenate([a.codes, b.codes])) + self.differences[chosen]
+        chosen = rng.integers(0, len(self.differences.vectors), n)
+        vectors = decode(np.concatenate([a.codes, b.codes])) + self.differences.vectors[chosen]
+        sift = np.concatenate([left.sift[of_left], right.sift[of_right]]) + self.differences.sift[chosen]
         pixels = np.concatenate([a.pixels, b.pixels]) + rng.normal(0, PIXEL_SIGMA, (n, 2)).astype(np.float32)
         scales = (1 + rng.normal(0, DEPTH_SIGMA, n)).astype(np.float32)
         landmarks = Landmarks(
             pixels, quantise(vectors), np.concatenate([a.depths, b.depths]) * scales,
             np.concatenate([a.depth_sigmas, b.depth_sigmas]) * scales,
         )  # fmt: skip
-        return Node(NodeId(AGENT, 1, number), 0, left.node.map_from_robot, left.node.camera, landmarks)
+        node = Node(NodeId(AGENT, 1, number), 0, left.node.map_from_robot, left.node.camera, landmarks)
+        return Place(node, left.world_from_node, NO_SITE, np.clip(sift, 0, 255).astype(np.uint8))
+
+    def node(self, number: int) -> Node:
+        """A place's node."""
+        return self.place(number).node
 
 
 def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -> Distractors:
@@ -93,10 +111,10 @@ def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -
     return Distractors(donors, differences(places, seed), seed)
 
 
-def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> NDArray[np.float32]:
-    """(M, 32) of landmarks that two nodes share, by matches that the geometry confirms."""
+def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> Differences:
+    """Of landmarks that two nodes share, by matches that the geometry confirms."""
     rng = np.random.default_rng([seed, 0xD1F])
-    found = list[NDArray[np.float32]]()
+    found, whole = list[NDArray[np.float32]](), list[NDArray[np.int16]]()
     for k in rng.permutation(len(places))[: 4 * pairs].tolist():
         one = places[k]
         near = [
@@ -112,9 +130,11 @@ def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> NDArray
         at = other.node.camera.project(there.inverse().apply(a.points_in_robot(one.node.camera)))
         right = np.linalg.norm(at - b.pixels, axis=1) < 4.0
         found.append((decode(a.codes[right]) - decode(b.codes[right])).astype(np.float32))
+        mine, theirs = matches[right].T
+        whole.append(one.sift[mine].astype(np.int16) - other.sift[theirs].astype(np.int16))
         if len(found) == pairs:
             break
-    return np.concatenate(found)
+    return Differences(np.concatenate(found), np.concatenate(whole))
 
 
 def _alike(a: Place, b: Place) -> bool:

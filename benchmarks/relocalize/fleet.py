@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from rich.progress import Progress
 
 from benchmarks.relocalize.distractors import AGENT, gather
-from benchmarks.relocalize.places import joined, mapped, mapped_sites
+from benchmarks.relocalize.exhaustive import AT_MOST, Exhaustive, asked_of, lost
+from benchmarks.relocalize.peer import Vocabulary
+from benchmarks.relocalize.places import Place, joined, mapped, mapped_sites
 from benchmarks.relocalize.queries import KINDS, Query, known, nowhere, twins
-from benchmarks.relocalize.score import Reply, ask, spent
+from benchmarks.relocalize.score import Reply, ask, judged, share, spent
+from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
@@ -44,6 +49,11 @@ class Bench:
         self.making = np.zeros(2)
         """What was spent on making nodes, see benchmarks.relocalize.score.spent."""
 
+    @cached_property
+    def vocabulary(self) -> Vocabulary:
+        """Of the bag of words, learned from the real places."""
+        return Vocabulary(np.concatenate([decode(p.node.landmarks.codes) for p in self.places]), self.seed)
+
     @contextmanager
     def task(self, name: str, total: int) -> Iterator[Callable[[], None]]:
         """A line of progress."""
@@ -57,6 +67,11 @@ class Bench:
             return self.made(node_id.number)
         place = self.truth.get(node_id)
         return None if place is None else place.node
+
+    def place(self, number: int) -> Place:
+        """A place of the fleet by its number, those that are real first."""
+        real = len(self.places)
+        return self.places[number] if number < real else self.distractors.place(number - real)
 
     def made(self, number: int) -> Node:
         """A node that is not real."""
@@ -83,6 +98,31 @@ class Bench:
                 relocalizer.prepare(1)
                 step()
         return float(1e3 * (spent() - self.making - began)[1] / most)
+
+    def ceiling(
+        self, kinds: list[str], size: int, judge: Relocalizer, replies: list[Reply]
+    ) -> dict[str, Any]:
+        """Recall of the exhaustive search, by kind, and what the index has lost of near views.
+
+        Args:
+            kinds: of views.
+            size: nodes.
+            judge: of what was recognised; it is that of the index.
+            replies: by the index, to all queries.
+        """
+        values: dict[str, Any] = {"exhaustive_nodes": min(size, AT_MOST)}
+        ours = {id(reply.query): reply for reply in replies}
+        for kind in kinds:
+            chosen = asked_of([query for query in self.queries if query.kind == kind], min(size, AT_MOST))
+            exhaustive = Exhaustive(self.place, min(size, AT_MOST), judge)
+            with self.task(f"{size} nodes: exhaustive, {kind}", min(size, AT_MOST) + len(chosen)) as step:
+                answers = exhaustive.answers(chosen, step)
+            theirs = [judged(q, answer, self.truth) for q, answer in zip(chosen, answers, strict=True)]
+            values.setdefault("exhaustive", {})[kind] = share(theirs, lambda r: r.recalled)
+            if kind == "near":
+                values["recall_exhaustive"] = values["exhaustive"][kind]
+                values |= lost([ours[id(query)] for query in chosen], theirs)
+        return values
 
     def hardness(self) -> dict[str, dict[str, float]]:
         """How much the best wrong node looks like a view from nowhere, among real nodes and made ones."""

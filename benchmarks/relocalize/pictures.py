@@ -1,6 +1,6 @@
 """Pictures of simulated buildings with true depths, kept on disk: taken once, used by many runs.
 
-The robot's own camera takes them (lens, exposure, noise) and its own SIFT finds the features; only that it
+The robot's own camera takes them (lens, exposure, noise) and its own eyes find the features; only that it
 drives there is left out. What is kept is named by a digest of the sources that make it, so that nothing stale
 is used.
 """
@@ -26,7 +26,6 @@ from benchmarks.images.surface_points import Surfaces
 from mapweave import sim, vision
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.descriptor import encode
-from mapweave.hybridmap.node import CODE_BYTES
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from mapweave.sim.actors import FIGURES, figure_panels
@@ -41,7 +40,7 @@ from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
 FOLDER = Path(tempfile.gettempdir()) / "mapweave-relocalize"
-VERSION = 2
+VERSION = 1
 """Of what this file does; another version makes all pictures again."""
 
 
@@ -53,14 +52,14 @@ class Picture:
         world_from_robot: where it was truly taken.
         camera: that took it.
         pixels: (N, 2) float32, undistorted px.
-        codes: (N, 32) uint8, descriptors.
+        sift: (N, 128) uint8, whole descriptors.
         depths: (N,) float32 m, true; NaN where a feature is no point of one surface.
     """
 
     world_from_robot: Pose2
     camera: Camera
     pixels: NDArray[np.float32]
-    codes: NDArray[np.uint8]
+    sift: NDArray[np.uint8]
     depths: NDArray[np.float32]
 
     def __len__(self) -> int:
@@ -70,7 +69,7 @@ class Picture:
     @cached_property
     def view(self) -> View:
         """As a robot would ask."""
-        return View(self.pixels, self.codes, self.camera)
+        return View(self.pixels, encode(self.sift), self.camera)
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ class Photographer:
         self.camera = self._setup.intrinsics
         body = RobotSetup("r0", self._setup).describe()
         self._lens = Lens(body.camera, body.distortion)
-        self._sift = Sift(self._lens)
+        self._eyes = Sift(self._lens)
         self._surfaces = Surfaces(world)
         self._still = PanelSet.of(world.panels)
         self._imagers: dict[float, Imager] = {}
@@ -150,15 +149,15 @@ class Photographer:
 
     def take(self, wish: Wish) -> Picture:
         """Take one."""
-        keypoints, descriptors = self._sift.describe(self.image(wish))
+        keypoints, descriptors = self._eyes.describe(self.image(wish))
         pixels = self._lens.undistort(np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2))
-        codes = encode(np.rint(descriptors).astype(np.uint8))
+        sift = np.rint(descriptors).astype(np.uint8)
         depths = np.zeros(0)
         if len(pixels):
             seen = self._surfaces.see(wish.place, self.camera, pixels)
             flat = self._surfaces.flat(wish.place, self.camera, pixels)
             depths = np.where(flat & np.isfinite(seen.depths), seen.depths, np.nan)
-        return Picture(wish.place, self.camera, pixels.astype(np.float32), codes, depths.astype(np.float32))
+        return Picture(wish.place, self.camera, pixels.astype(np.float32), sift, depths.astype(np.float32))
 
     def _imager(self, shutter: float) -> Imager:
         if shutter not in self._imagers:
@@ -221,7 +220,7 @@ def _pack(pictures: Sequence[Picture]) -> dict[str, Any]:
         "counts": np.array([len(one) for one in pictures], np.int64),
         "camera": np.array(astuple(pictures[0].camera) if pictures else ()),
         "pixels": np.concatenate([np.zeros((0, 2), np.float32), *(one.pixels for one in pictures)]),
-        "codes": np.concatenate([np.zeros((0, CODE_BYTES), np.uint8), *(one.codes for one in pictures)]),
+        "sift": np.concatenate([np.zeros((0, 128), np.uint8), *(one.sift for one in pictures)]),
         "depths": np.concatenate([np.zeros(0, np.float32), *(one.depths for one in pictures)]),
     }
 
@@ -233,16 +232,16 @@ def _unpack(wishes: Sequence[Wish], kept: Any) -> list[Picture]:
         return []
     width, height, *rest = kept["camera"].tolist()
     camera = Camera(int(width), int(height), *rest)
-    parts = [np.split(kept[name], ends[:-1]) for name in ("pixels", "codes", "depths")]
+    parts = [np.split(kept[name], ends[:-1]) for name in ("pixels", "sift", "depths")]
     return [
-        Picture(wish.place, camera, pixels, codes, depths)
-        for wish, pixels, codes, depths in zip(wishes, *parts, strict=True)
+        Picture(wish.place, camera, pixels, sift, depths)
+        for wish, pixels, sift, depths in zip(wishes, *parts, strict=True)
     ]
 
 
 @lru_cache(maxsize=1)
 def _sources() -> str:
-    """Digest of all that makes a picture: simulator, SIFT, truth, and the version of this file."""
+    """Digest of all that makes a picture: simulator, eyes, truth, and the version of this file."""
     digest = hashlib.sha256(bytes([VERSION]))
     folders = [Path(package.__path__[0]) for package in (sim, vision)]
     files = [path for folder in folders for path in sorted(folder.rglob("*.py"))]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.relocalize.pictures import Photographer, Picture, Wish, taken
 from mapweave.hybridmap.node import Landmarks, Node, NodeId
@@ -93,6 +94,21 @@ def donor_sites(seed: int) -> tuple[Site, ...]:
 
 
 @dataclass(frozen=True, eq=False)
+class Query:
+    """A question with its answer.
+
+    Attributes:
+        kind: near, far, person, exposure, blur, furniture, camera, nowhere or twins.
+        picture: what is asked.
+        site: number of the mapped building in which it was taken, -1 in an unmapped one.
+    """
+
+    kind: str
+    picture: Picture
+    site: int
+
+
+@dataclass(frozen=True, eq=False)
 class Place:
     """A node and the truth about it.
 
@@ -100,11 +116,13 @@ class Place:
         node: as a robot has made it.
         world_from_node: where it truly is.
         site: number of its building.
+        sift: (N, 128) uint8, whole descriptors of the node's landmarks, in their order.
     """
 
     node: Node
     world_from_node: Pose2
     site: int
+    sift: NDArray[np.uint8]
 
 
 Progress = Callable[[], None]
@@ -197,10 +215,10 @@ def placed(picture: Picture, node_id: NodeId, site: int, rng: np.random.Generato
     landmarks = Landmarks(
         picture.pixels[known], picture.view.codes[known], depths.astype(np.float32), sigmas.astype(np.float32)
     )
-    landmarks, _ = settle(landmarks, picture.camera)
+    landmarks, order = settle(landmarks, picture.camera)
     pose = PoseGaussian.from_sigmas(picture.world_from_robot, 0.01, 0.01)
     node = Node(node_id, node_id.number * 1_000_000_000, pose, picture.camera, landmarks)
-    return Place(node, picture.world_from_robot, site)
+    return Place(node, picture.world_from_robot, site, picture.sift[known][order])
 
 
 def joined(places: Sequence[Place], seed: int) -> MergedMap:

@@ -1,4 +1,4 @@
-"""Two ways to keep a view so that it is recognised: our landmarks, and SIFT in floats."""
+"""Ways to keep a view so that it is recognised: our landmarks, SIFT in floats and bytes, ORB, and JPEG."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,7 @@ from mapweave.hybridmap.node import Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.ranges import Ranges
-from mapweave.registration.matching import match_vectors
+from mapweave.registration.matching import MatchSettings, match_vectors
 from mapweave.registration.selection import FIXED_BYTES
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
@@ -29,9 +30,9 @@ FRAMING = 80
 
 MOST = 150
 POSITION_BYTES = 7
-"""What SIFT in floats spends on pixel, depth and sigma: 2 + 2 + 2 + 1."""
+"""What rivals spend on pixel, depth and sigma: 2 + 2 + 2 + 1, as the first version of ours did."""
 
-FLOAT, OURS = "float sift", "ours"
+JPEG_QUALITY = 80
 TIMES = 5
 DEPTH_FLOOR = (0.01, 0.02)
 """m, and share of the depth: what a robot's depths are off by."""
@@ -113,23 +114,57 @@ def _least_ms(act: Callable[[], object]) -> float:
     return min(times)
 
 
-def matched(pair: Pair, first: Kept, second: Kept, noise: float) -> tuple[int, int]:
+def matched(name: str, pair: Pair, first: Kept, second: Kept) -> tuple[int, int]:
     """How many features match, and how many of those are right: best in both directions, and distinct."""
-    pairs = match_vectors(first.vectors, second.vectors, noise=noise)
+    settings = MatchSettings()
+    if name == "sift 128 bytes":
+        settings = MatchSettings(most_distance=np.inf)
+    elif name == "orb":
+        # Squared distances of bits are Hamming's; the ratio is of those.
+        settings = MatchSettings(ratio=settings.ratio**0.5, most_distance=np.inf)
+    noise = rounding_noise() if name == "ours" else 0.0
+    pairs = match_vectors(first.vectors, second.vectors, settings, noise)
     return len(pairs), pair.right(first.pixels[pairs[:, 0]], second.pixels[pairs[:, 1]])
 
 
-def keep_both(
-    packed: Packed, found: list[tuple[Array, NDArray[np.float32]]]
-) -> dict[str, tuple[list[Kept], float]]:
-    """Both views, kept in either way, and what rounding adds to squared distances.
-
-    Args:
-        packed: the node of the first view.
-        found: features of the two.
-    """
-    floats, own = [], []
+def keep_all(
+    pair: Pair, packed: Packed, found: list[tuple[Array, NDArray[np.float32]]]
+) -> dict[str, list[Kept]]:
+    """Both views, kept in every way; `found` are the features of the two."""
+    kept: dict[str, list[Kept]] = {"float sift": [], "ours": [], "sift 128 bytes": [], "orb": []}
     for pixels, sift in found:
-        floats.append(Kept(pixels, root_sift(sift), FIXED_BYTES + len(pixels) * (512 + POSITION_BYTES)))
-        own.append(Kept(pixels, decode(encode(sift)), packed.size))
-    return {FLOAT: (floats, 0.0), OURS: (own, rounding_noise())}
+        count, roots = len(pixels), root_sift(sift)
+        whole = FIXED_BYTES + count * POSITION_BYTES
+        unit = (np.rint(sift).astype(np.uint8) / 512).astype(np.float32)
+        kept["float sift"].append(Kept(pixels, roots, whole + 512 * count))
+        kept["ours"].append(Kept(pixels, decode(encode(sift)), packed.size))
+        kept["sift 128 bytes"].append(Kept(pixels, unit, whole + 128 * count))
+    for image in (pair.first, pair.second):
+        kept["orb"].append(_orb(image))
+    for name, quality in (("jpeg", JPEG_QUALITY), ("jpeg squeezed", None)):
+        # Only what is kept is squeezed; the view that asks is fresh.
+        pixels, sift = found[1]
+        kept[name] = [_jpeg(pair, packed.size, quality), Kept(pixels, root_sift(sift), 0)]
+    return kept
+
+
+def _orb(image: Image) -> Kept:
+    detector = cv2.ORB_create(nfeatures=MOST)  # type: ignore[attr-defined]
+    keypoints, codes = detector.detectAndCompute(image, None)
+    if codes is None:
+        codes = np.zeros((0, 32), np.uint8)
+    pixels = np.array([k.pt for k in keypoints], np.float64).reshape(-1, 2)
+    size = FIXED_BYTES + len(pixels) * (32 + POSITION_BYTES)
+    return Kept(pixels, np.unpackbits(codes, axis=1).astype(np.float32), size)
+
+
+def _jpeg(pair: Pair, size: int, quality: int | None) -> Kept:
+    """Features of the picture after JPEG; without a quality, as small as our node, or as JPEG gets."""
+    qualities = (quality,) if quality is not None else (*range(95, 0, -5), 3, 1)
+    for one in qualities:
+        data = cv2.imencode(".jpg", pair.first, (cv2.IMWRITE_JPEG_QUALITY, one))[1]
+        if len(data) + FIXED_BYTES <= size:
+            break
+    image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
+    pixels, sift = features(image, pair.camera)
+    return Kept(pixels, root_sift(sift), len(data) + FIXED_BYTES)
