@@ -57,10 +57,10 @@ FLAP = 0.3
 LEAST_SECONDS = 10.0
 ATTACKS = (
     (Kind.KILL, SERVERS[0], 4.0), (Kind.KILL, SERVERS[1], 4.0), (Kind.KILL, ROUTERS[0], 4.0),
-    (Kind.STOP, SERVERS[0], 4.0), (Kind.STOP, ROUTERS[1], 7.0),
+    (Kind.STOP, SERVERS[0], 4.0), (Kind.STOP, ROUTERS[1], 10.0),
 )  # fmt: skip
 """On a fleet in which a robot asks where it is. It is at the second router since the first one was killed.
-The last of each is how long it lasts, s: a connection has a lease of 2.5 s, and a frozen endpoint is tried
+The last of each is how long it lasts, s: a connection has a lease of 5 s, and a frozen endpoint is tried
 for 2 s."""
 
 Done = list[tuple[float, Kind, str]]

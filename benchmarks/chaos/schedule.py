@@ -29,10 +29,10 @@ class Kind(StrEnum):
 KILLS = (Kind.KILL, Kind.LOSE_STORE)
 LINKS = (Kind.CUT, Kind.SLOW, Kind.FROZEN, Kind.FLAP, Kind.HALF)
 LASTING = {
-    Kind.KILL: (0.1, 1.5), Kind.LOSE_STORE: (0.1, 1.5), Kind.STOP: (0.5, 4.0), Kind.CUT: (0.2, 3.0),
-    Kind.SLOW: (1.0, 4.0), Kind.FROZEN: (0.5, 4.0), Kind.FLAP: (1.0, 4.0), Kind.HALF: (0.1, 0.5),
+    Kind.KILL: (0.1, 1.5), Kind.LOSE_STORE: (0.1, 1.5), Kind.STOP: (0.5, 7.0), Kind.CUT: (0.2, 3.0),
+    Kind.SLOW: (1.0, 4.0), Kind.FROZEN: (0.5, 7.0), Kind.FLAP: (1.0, 4.0), Kind.HALF: (0.1, 0.5),
 }  # fmt: skip
-"""Shortest and longest time between beginning and end, s. The lease of a connection is 2.5 s."""
+"""Shortest and longest time between beginning and end, s. The lease of a connection is 5 s."""
 
 
 @dataclass(frozen=True)
