@@ -17,8 +17,8 @@ RETRY_LONGEST = 1.0
 NEXT_ENDPOINT = 2.0
 """s that a client with several endpoints spends on one of them."""
 LEASE = 5.0
-"""After what silence a participant counts as dead, s: clients of a silent router go to another one. With 2.5 s
-the clients of a busy router left it all at once, and came back all at once."""
+"""After what silence a participant counts as dead, s: clients of a silent router go to another one. With
+2.5 s the clients of a busy router left it all at once, and came back all at once."""
 AGENT_LEASE = 10.0
 """The same for agents, s; one whose process ends leaves at once. With 2.5 s a router dropped robots of a busy
 computer, and all that came back at once were dropped again."""
