@@ -82,6 +82,7 @@ def test_a_person_drives_it_and_it_maps(walls, mission: Mission) -> None:
     assert {step.command for step in life.steps[-5:]} == {Command()}, "its mission drives nothing"
 
 
+@pytest.mark.slow
 def test_a_persons_command_comes_before_the_mission_and_behind_the_guard(walls) -> None:
     life = Life(walls, on(Explore(), body=BODY), BODY)
     life.go(5)

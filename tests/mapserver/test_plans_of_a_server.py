@@ -208,6 +208,7 @@ def test_a_plan_is_tried_over_http_before_it_is_kept(house: House) -> None:
         assert house.server.plans().plans == ()
 
 
+@pytest.mark.slow
 def test_plans_and_pins_of_a_map_file_from_the_shell(
     house: House, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -174,6 +174,7 @@ def test_without_a_router_one_line_says_so_and_what_to_do(
         assert time.monotonic() - began < 5.0, "Zenoh's own patience is 10 s, that for an answer 20 s"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("signals")
 def test_a_robot_that_falls_silent_is_named_to_who_waits_for_it(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -264,6 +264,7 @@ class Carried:
         self._nodes += sum(isinstance(change, NodePut) for change in step.changes)
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_after_an_episode_keeps_what_follows_from_it(tmp_path: Path) -> None:
     """Loop closures are made in the ticks after a node. Before, there was none, and they were lost."""
     robot, bus = Carried(), MemoryBus(MemoryHub())

@@ -114,6 +114,7 @@ def test_what_it_is_shows_the_content(folder: Path) -> None:
     assert content_hash(opened["journal"].content) == content_hash(opened["own"].content)
 
 
+@pytest.mark.slow
 def test_every_command_reads_all_three_alike(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

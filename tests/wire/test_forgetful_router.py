@@ -79,6 +79,7 @@ def client_and_router(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[ZenohBu
         router.close()
 
 
+@pytest.mark.slow
 def test_a_client_that_was_forgotten_connects_again(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -80,6 +80,7 @@ def unreachable() -> tuple[socket.socket, list[socket.socket]]:
     return listening, waiting
 
 
+@pytest.mark.slow
 def test_a_dead_first_router_does_not_hold_up_the_start(routers: Routers) -> None:
     alive = free_port()
     routers.router(alive)

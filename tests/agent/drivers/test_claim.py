@@ -15,6 +15,7 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 KEYS = Keys("test")
 
 
+@pytest.mark.slow
 def test_the_second_is_refused_and_the_first_stays(hub: MemoryHub) -> None:
     first, second = MemoryBus(hub), MemoryBus(hub)
     claim = Claim(first, KEYS, "r0")

@@ -218,6 +218,7 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
         assert min(gaps) < 2 * BODY.radius, "without reservations they drive into each other"
 
 
+@pytest.mark.slow
 def test_a_parked_robot_makes_room_in_a_corridor_and_the_other_passes(home, router):  # noqa: F811
     """One has parked in the middle, another one drives from end to end; both by exact wheels."""
     poses, nearby = router.roads.poses, Nearby()

@@ -77,6 +77,7 @@ def test_a_cut_link_breaks_and_accepts_no_connection_until_restored(cable):
         assert talk(three, b"hello") == b"hello"
 
 
+@pytest.mark.slow
 def test_a_bad_network_is_slow_but_loses_nothing(cable):
     cable.worsen(loss=0.5, delay=0.02)
     with socket.create_connection(("127.0.0.1", cable.port), 2) as one:

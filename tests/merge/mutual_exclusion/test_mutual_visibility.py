@@ -57,6 +57,7 @@ def marched(angle: float, place: Array, radius: float, reach: float = 6.0) -> fl
     return float(t[np.argmax(inside)]) if inside.any() else np.inf
 
 
+@pytest.mark.slow
 def test_odds_against_rays_marched_step_by_step() -> None:
     rng = np.random.default_rng(1)
     for _ in range(15):

@@ -104,6 +104,7 @@ def missing(views: list[BoardView]) -> str:
     return "; ".join(coverage_of(views).missing)
 
 
+@pytest.mark.slow
 def test_sets_that_leave_something_out_are_refused_with_what_is_missing() -> None:
     rng = np.random.default_rng(4)
     whole = corner_views(rng, PINHOLE, 40, 0.1)
