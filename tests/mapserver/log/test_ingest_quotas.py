@@ -115,6 +115,8 @@ def test_what_is_held_back_is_fetched_later_in_order(
         clock.now += passed
         allowed = min(at_once + round(10 * clock.now), 300)
         eventually(lambda allowed=allowed: server.store.watermark(MAP) == allowed)
+    # What is committed is handed on a moment later.
+    eventually(lambda: len(server.seen) >= 301)
     assert [c.sequence for c in server.seen if c.map == MAP] == list(range(1, 301))
     assert quotas.over() == {}, "it has kept to its quota for a while"
 
