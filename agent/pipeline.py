@@ -131,9 +131,9 @@ class Pipeline:
         """Where the robot is on its own map; None if it does not know."""
         fix = self.fix
         match self._mission:
-            case Explore() | Carried() if self._map_making.located:
+            case Explore() | Carried() | Idle() if self._map_making.located:
                 return self.mapper.map_from_robot
-            case GoTo() if fix is not None and fix.node in self.map.nodes:
+            case GoTo() | Idle() if fix is not None and fix.node in self.map.nodes:
                 return self.map.nodes[fix.node].map_from_robot @ fix.node_from_robot
         return None
 
@@ -458,7 +458,7 @@ class Pipeline:
             astray=self._map_making.resuming,
             given_up=given_up,
             progress=progress,
-            located=mapping and self._map_making.located,
+            located=not isinstance(self._mission, GoTo) and self._map_making.located,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
             passed=0 if drive is None else drive.passed,
             portal=None if drive is None else drive.portal,

@@ -204,6 +204,24 @@ def test_a_robot_that_was_stopped_on_its_way_says_where_it_stands(walls):
     assert [question for tick in range(100, 200) for question in asked(tick, lifted=True)] == []
 
 
+def test_a_robot_that_was_stopped_while_it_mapped_says_where_it_stands(walls):
+    """Before, it was nowhere on the page from the moment on in which a person stopped it."""
+    pipeline = on(Explore())
+    _, begun, poses = live(walls, pipeline, 120)
+    assert begun[-1].status.located and begun[-1].status.nodes
+    pipeline.set_mission(Idle())
+    last = Odometry(begun[-1].command.forward * BODY.tick, begun[-1].command.turn * BODY.tick)
+    for tick in range(5):
+        moved = Odometry(0.0, 0.0) if tick else last
+        step = pipeline.step(
+            Observation((120 + tick) * 100_000_000, moved, walls.render(poses[-1]), rangers(poses[-1]))
+        )
+    assert step.status.located and step.status.map_from_robot.distance(poses[-1]) < 0.03
+    assert pipeline.map_from_robot.mean == step.status.map_from_robot
+    lifted = replace(still(walls, poses[-1], 126), kidnapped=True)
+    assert not pipeline.step(lifted).status.located and pipeline.map_from_robot is None
+
+
 def test_exploration_that_was_interrupted_goes_on(walls, drive):
     """The robot stops for a while in the middle of its first drive; the rest is as without the stop."""
     _, steps, _ = drive
