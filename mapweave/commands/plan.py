@@ -63,7 +63,8 @@ def add_to(commands: Any) -> None:
         "over it: `mapweave plan show office -o office.png`.",
     )
     show.add_argument("name", nargs="?", metavar="NAME", help="of the plan (default: all)")
-    show.add_argument("-o", "--out", type=values.png, metavar="PNG", help="draw plan and map")
+    # Not `out`, which says where a changed record is written.
+    show.add_argument("-o", "--out", dest="picture", type=values.png, metavar="PNG", help="draw plan and map")
     _add_component(show)
     add_record_options(show, changes=False)
     show.set_defaults(run=run_show)
@@ -147,7 +148,7 @@ def run_show(arguments: argparse.Namespace) -> int:
             print(json.dumps(json_values(PlacedPlans(shown))))
         else:
             print("\n".join(line for placed in shown for line in plan_words(placed)) or "there is no plan")
-        if arguments.out is not None:
+        if arguments.picture is not None:
             if len(shown) != 1:
                 raise UsageError("name the plan to draw: mapweave plan show NAME -o PNG")
             _draw(record, shown[0], arguments)
@@ -220,11 +221,11 @@ def _draw(record: Fleet | OfflineAnnotations, placed: PlacedPlan, arguments: arg
     from mapweave.storage.plan_image import plan_pixels
 
     need("viz")
-    check_place(arguments.out)
+    check_place(arguments.picture)
     part = placed.part(arguments.component)
     pixels = plan_pixels(record.plan_image(placed.plan.image.sha256))
-    draw_plan(placed, part, pixels, _merged(record, arguments), arguments.out)
-    print(arguments.out, file=sys.stderr if arguments.json else sys.stdout)
+    draw_plan(placed, part, pixels, _merged(record, arguments), arguments.picture)
+    print(arguments.picture, file=sys.stderr if arguments.json else sys.stdout)
 
 
 def _merged(record: Fleet | OfflineAnnotations, arguments: argparse.Namespace) -> MergedMap:

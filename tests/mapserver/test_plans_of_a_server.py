@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,20 @@ def test_a_plan_is_tried_over_http_before_it_is_kept(house: House) -> None:
         assert status == 400 and "3 are needed" in answer["error"]
         assert json.loads(ask(served, "GET", "/annotations")[2]) == {"annotations": []}
         assert house.server.plans().plans == ()
+
+
+def test_a_plan_of_a_server_is_drawn(
+    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before, `-o` was taken for where a changed record goes, and refused."""
+    assert house.server.settle(20.0)
+    house.person.put_plan_image(PNG.png)
+    house.person.annotate("plan", "flat", **fields())
+    monkeypatch.setattr("mapweave.commands.missions.fleet_of", lambda _: nullcontext(house.person))
+    picture = tmp_path / "plan.png"
+    assert main(["plan", "show", "flat", "-o", str(picture)]) == 0
+    assert capsys.readouterr().out.endswith(f"{picture}\n")
+    assert cv2.imread(str(picture)).shape[0] > 300
 
 
 @pytest.mark.slow
