@@ -48,6 +48,7 @@ from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA, NO, USAGE
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError, Refused
 from mapweave.json_log import json_line
+from mapweave.storage.os_errors import reason_of
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help, with examples."
 NEGATIVE = re.compile(r"-[0-9.][0-9.,=e+-]*$")
@@ -169,8 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return FAILED
     except OSError as error:
-        # A disk that is full, a folder that may not be written: the system's words say it best, but for one.
-        reason = error.strerror or error
+        reason = reason_of(error)
         if isinstance(error, FileExistsError):
             reason = "is a file; give a folder, or a place where one can be made"
         elif isinstance(error, NotADirectoryError):

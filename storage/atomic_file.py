@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.storage.os_errors import no_permission, reason_of
 
 
 def write_whole(path: Path, data: bytes | memoryview) -> None:
@@ -34,7 +35,7 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
         _sync_folder(path.parent)
     except OSError as error:
         beside.unlink(missing_ok=True)
-        raise _unwritable(path, error.strerror or str(error)) from None
+        raise _unwritable(path, reason_of(error)) from None
     except BaseException:
         # Interrupted: remove the temporary file.
         beside.unlink(missing_ok=True)
@@ -63,7 +64,7 @@ def check_place(path: Path) -> None:
     if not path.parent.is_dir():
         raise _unwritable(path, f"there is no folder {path.parent}")
     if not os.access(path.parent, os.W_OK) and not path.exists():
-        raise _unwritable(path, os.strerror(errno.EACCES))
+        raise _unwritable(path, no_permission())
 
 
 def _unwritable(path: Path, why: str) -> InvalidFile:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_reader import reading
+from mapweave.storage.os_errors import DISK_FULL, READ_ONLY, no_permission
 
 LEAST_FREE = 1 << 16
 """Bytes; a disk with less takes no page of SQLite with its place in the write-ahead log."""
@@ -101,7 +102,7 @@ class Database:
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF
             if code == sqlite3.SQLITE_CORRUPT:
                 raise self._damaged(str(error)) from None
-            if code in DISK_ERRORS and (reason := _disk_trouble(self._file.parent)):
+            if code in DISK_ERRORS and (reason := _disk_trouble(self._file)):
                 raise InvalidFile(f"{self.path}: {self.what}: {reason}") from None
             advice = self._advice if code == sqlite3.SQLITE_NOTADB else ""
             raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error}){advice}") from None
@@ -174,14 +175,17 @@ class Database:
         return InvalidFile(f"{self.path}: {self.what} is damaged ({reason}){self._advice}")
 
 
-def _disk_trouble(folder: Path) -> str:
-    """Why nothing can be written there, where SQLite only says that it failed; empty if that is not why."""
+def _disk_trouble(file: Path) -> str:
+    """Why a file cannot be written, where SQLite only says that it failed; empty if none of this is why."""
     try:
-        disk = os.statvfs(folder)
+        disk = os.statvfs(file.parent)
     except OSError:
         return ""
     if disk.f_flag & os.ST_RDONLY:
-        return "the disk is read-only; a damaged disk becomes so by itself: see the system's log"
+        return READ_ONLY
     if disk.f_bavail * disk.f_frsize < LEAST_FREE:
-        return "the disk is full; make room, and what waits is written"
-    return ""
+        return DISK_FULL
+    # SQLite keeps its write-ahead log beside the file.
+    if not os.access(file.parent, os.W_OK | os.X_OK):
+        return f"{file.parent}: {no_permission()}"
+    return no_permission() if file.exists() and not os.access(file, os.R_OK | os.W_OK) else ""

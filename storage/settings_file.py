@@ -18,6 +18,7 @@ import msgspec
 
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.storage.atomic_file import read_whole
+from mapweave.storage.os_errors import reason_of
 
 T = TypeVar("T")
 MOST_PARTS = 64
@@ -41,12 +42,24 @@ def read_toml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise SettingsError(f"{path}: no such file") from None
     except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror})") from None
+        raise SettingsError(f"{path}: cannot be read ({reason_of(error)})") from None
     except UnicodeDecodeError:
-        raise SettingsError(f"{path}: is not text in UTF-8, as TOML must be") from None
+        raise SettingsError(f"{path}: is not text in UTF-8, as TOML must be; give a text file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(_no_toml(path, str(error))) from None
     except (ValueError, RecursionError) as error:
-        # In addition to invalid TOML: numbers of thousands of digits, tables nested a thousand deep.
+        # Numbers of thousands of digits, tables nested a thousand deep.
         raise SettingsError(f"{path}: {error}") from None
+
+
+def _no_toml(path: Path, error: str) -> str:
+    """The error of the parser, with the place in front and what TOML looks like behind."""
+    found = re.fullmatch(r"(.*) \(at (line \d+, column \d+|end of document)\)", error, re.S)
+    what, place = (found[1], found[2].replace("end of document", "last line")) if found else (error, "")
+    return (
+        f"{path}: {place}{': ' if place else ''}is not TOML: {' '.join(what.split())}; correct it there: "
+        "a table begins with a line [name], a setting is a line name = value, texts are in quotation marks"
+    )
 
 
 def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:

@@ -21,6 +21,7 @@ from mapweave.agent.ros_messages.values import FOOTPRINT as BASE
 from mapweave.agent.ros_messages.values import KIDNAP_TYPE
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
+from mapweave.storage.os_errors import reason_of
 from mapweave.vision.equidistant import Equidistant
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def check_new(folder: Path) -> None:
         if any(folder.iterdir()):
             raise DeviceError(f"{folder}: not empty; a recording overwrites nothing, give another folder")
     except OSError as error:
-        raise DeviceError(f"{folder}: {error.strerror}") from None
+        raise DeviceError(f"{folder}: {reason_of(error)}") from None
 
 
 class McapWriter:

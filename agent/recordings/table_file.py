@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.atomic_file import read_whole
+from mapweave.storage.os_errors import reason_of
 
 SEPARATORS = ";\t|"
 """What programs write in the place of commas."""
@@ -29,8 +30,10 @@ def read_text(path: Path) -> tuple[str, str]:
         data = read_whole(path)
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise DeviceError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    except OSError as error:
+        raise DeviceError(f"{path}: {reason_of(error)}") from None
+    except ValueError as error:
+        raise DeviceError(f"{path}: {error}") from None
     end = data.find(b"\0")
     end = len(data) if end < 0 else end
     try:

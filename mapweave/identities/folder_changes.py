@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from mapweave.hybridmap.errors import SettingsError
+from mapweave.storage.os_errors import reason_of
 
 
 @contextmanager
@@ -25,7 +26,7 @@ def locked(folder: Path) -> Iterator[None]:
     except FileNotFoundError:
         raise SettingsError(f"{folder}: no keys are here; make some with `mapweave keys init`") from None
     except OSError as error:
-        raise SettingsError(f"{folder}: {error.strerror}") from None
+        raise SettingsError(f"{folder}: {reason_of(error)}") from None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield

@@ -10,6 +10,7 @@ from pathlib import Path
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.node import check_name
 from mapweave.storage.atomic_file import write_whole
+from mapweave.storage.os_errors import reason_of
 from mapweave.storage.settings_file import build, read_toml
 from mapweave.wire.credentials import Credentials, Role
 
@@ -57,8 +58,12 @@ def read_key_file(path: Path) -> KeyFile:
     """
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
+    except FileNotFoundError:
+        raise SettingsError(
+            f"{path}: no such key file; `mapweave keys add NAME` at the server makes one: copy it here"
+        ) from None
     except OSError as error:
-        raise SettingsError(f"{path}: no key file: {error.strerror}; see `mapweave keys --help`") from None
+        raise SettingsError(f"{path}: the key file cannot be read: {reason_of(error)}") from None
     try:
         try:
             table = build(_Table, read_toml(path), str(path))

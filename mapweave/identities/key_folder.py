@@ -36,6 +36,7 @@ from mapweave.identities.key_file import (
 )
 from mapweave.identities.tokens import add_token, end_tokens, time_of
 from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.storage.os_errors import reason_of
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Access, Credentials, Member, Role
 
@@ -138,7 +139,9 @@ class KeyFolder:
             raise SettingsError(f"{path}: no keys are here; make some with `mapweave keys init`") from None
         except NotADirectoryError:
             raise SettingsError(f"{path}: is a file; give the folder of `mapweave keys init`") from None
-        except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
+        except OSError as error:
+            raise SettingsError(f"{path / CATALOGUE}: {reason_of(error)}") from None
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise SettingsError(f"{path / CATALOGUE}: {error}") from None
 
     @classmethod
@@ -385,7 +388,9 @@ class KeyFolder:
     def _read(self, name: str) -> str:
         try:
             return read_whole(self.path / name).decode()
-        except (OSError, UnicodeDecodeError) as error:
+        except OSError as error:
+            raise SettingsError(f"{self.path / name}: {reason_of(error)}") from None
+        except UnicodeDecodeError as error:
             raise SettingsError(f"{self.path / name}: {error}") from None
 
 

@@ -17,6 +17,7 @@ import msgspec
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.identities.key_file import write_private
 from mapweave.storage.atomic_file import read_whole
+from mapweave.storage.os_errors import reason_of
 
 TOKENS = "tokens.json"
 PREFIX = "mapweave_"
@@ -81,7 +82,9 @@ def read_tokens(folder: Path) -> tuple[Token, ...]:
         return msgspec.json.decode(read_whole(folder / TOKENS), type=tuple[Token, ...])
     except FileNotFoundError:
         return ()
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise SettingsError(f"{folder / TOKENS}: {reason_of(error)}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{folder / TOKENS}: {error}") from None
 
 

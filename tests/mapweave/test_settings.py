@@ -125,8 +125,15 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("[merge]\nexclusions = 9.0", "merge: no setting 'exclusions'; did you mean 'exclusion'?"),
         ("[merge.exclusion]\ndoubt = 'much'", "merge.exclusion.doubt: expected float, got str"),
         ("[merge.consistency]\nleast_links = 1.5", "merge.consistency.least_links: expected int, got float"),
-        ("[network", "robot.toml: "),
-        ("a = 1\na = 2", "robot.toml: "),
+        ("[network", "robot.toml: last line: is not TOML: Expected ']'"),
+        (
+            "a = 1\na = 2",
+            "robot.toml: last line: is not TOML: Cannot overwrite a value; correct it there",
+        ),
+        (
+            "\n[robot]\ndriver = koala",
+            "robot.toml: line 3, column 10: is not TOML: Invalid value; correct it there",
+        ),
         (b"\xff\xfe", "robot.toml: is not text in UTF-8"),
         ("when = 1979-05-27", "no setting 'when'"),
         ("[agent]\nseed = 1979-05-27", "agent.seed: expected int"),
