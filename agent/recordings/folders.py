@@ -123,16 +123,19 @@ def images_folder(folder: Path, options: RecordingOptions) -> Recording:
     else:
         optics = CameraGiven(read_camera(file))
     times = folder / "times.txt"
-    stamps = stamps_of(times, read_times(times, len(paths)))
+    seconds, lacking = read_times(times, len(paths))
+    stamps = stamps_of(times, seconds)
+    lines: tuple[str, ...] = (f"{lacking}; the first {len(stamps)} images are used",) if lacking else ()
     path = folder / "odometry.csv"
     images = _images(paths, stamps, None if optics.known is None else optics.known[0])
     if options.odometry is not None or _is_poses(path):
-        return complete(folder, kind, optics, images, read_poses(options.odometry or path))
+        return complete(folder, kind, optics, images, read_poses(options.odometry or path), damage=lines)
     if not path.exists():
-        return complete(folder, kind, optics, images, None)
+        return complete(folder, kind, optics, images, None, damage=lines)
     increments, damage = read_increments(path, len(paths))
     images = Images(stamps[: len(increments)], images.read)
-    lines = (f"{damage}; the images before it are used",) if damage else ()
+    increments = increments[: len(images.stamps_ns)]
+    lines += (f"{damage}; the images before it are used",) if damage else ()
     return complete(folder, kind, optics, images, increments, damage=lines)
 
 

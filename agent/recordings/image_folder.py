@@ -44,30 +44,46 @@ def _natural_order(path: Path) -> tuple[list[int], str]:
     return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.name
 
 
-def read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """(count,) s, ascending, of a times.txt; ten images a second without one.
+def read_times(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np.float64]], str]:
+    """Times of the images, of a times.txt; ten images a second without one.
+
+    Args:
+        path: of it.
+        count: how many images there are.
+
+    Returns:
+        (K,) s, ascending, of the first K images, and what is missing, in one line; empty if K is `count`.
 
     Raises:
-        DeviceError: it is wrong.
+        DeviceError: it is wrong, or has no time at all, or more times than there are images: then it is not
+            known which image is missing.
     """
     if not path.exists():
-        return np.linspace(0.0, 0.1 * (count - 1), count)
+        return np.linspace(0.0, 0.1 * (count - 1), count), ""
     text, damage = read_text(path)
     if damage:
         raise DeviceError(damage)
+    words = text.split()
+    given = len(words)
+    # The number that a file without a last line's end ends in may have had more digits.
+    words = words[:-1] if given < count and not text.endswith("\n") else words
     try:
-        times = np.array([float(line) for line in text.split()])
+        times = np.array([float(word) for word in words])
     except ValueError as error:
         raise DeviceError(f"{path}: {error}") from None
-    if len(times) != count:
-        raise DeviceError(f"{path}: {len(times)} times for {count} images; there must be one each")
+    if given > count or not len(times):
+        raise DeviceError(
+            f"{path}: {given} times for {count} images; there must be a line for each image: remove the "
+            "lines of images that are missing, or remove the file (then ten images a second are assumed)"
+        )
+    lacking = f"{path}: {given} times for {count} images" if given < count else ""
     wrong = np.flatnonzero(~(np.isfinite(times) & (np.diff(times, prepend=-np.inf) > 0)))
     if len(wrong):
         line = int(wrong[0])
         raise DeviceError(f"{path}: line {line + 1}: {float(times[line])}: times must be finite and ascend")
     if not 0.0 <= times[0] <= times[-1] <= MAX_STAMP_NS / 1e9:
         raise DeviceError(f"{path}: times are seconds since 1970 or since the start, not {times[0]:g}")
-    return times
+    return times, lacking
 
 
 def read_increments(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np.float64]], str]:

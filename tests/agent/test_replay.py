@@ -262,7 +262,9 @@ WRONG = {
     "odometry of a sheet": (written("odometry.csv", ODOMETRY.replace(",", ";")), "separated by ';'; separ"),
     "poses of a sheet": (written("odometry.csv", POSES.replace(",", "\t")), "separated by '\\t'; separ"),
     "odometry with a huge field": (written("odometry.csv", ODOMETRY + "1" * 200_000), "odometry.csv"),
-    "times too few": (written("times.txt", "1\n2\n"), "2 times for 14 images"),
+    "a single time": (written("times.txt", "1\n"), "1 images are no drive"),
+    "no times": (written("times.txt", ""), "0 times for 14 images; there must be a line for each image"),
+    "times too many": (written("times.txt", "\n".join(map(str, range(15)))), "15 times for 14 images; there"),
     "times go back": (written("times.txt", "\n".join(map(str, [*range(13), 3]))), "line 14: 3.0: times must"),
     "times with text": (written("times.txt", "noon"), "times.txt"),
     "times not finite": (written("times.txt", "nan " * COUNT), "ascend"),
@@ -372,6 +374,27 @@ def test_odometry_that_is_cut_off_anywhere_is_used_up_to_there(original, folder,
     assert len(observations) in (whole, COUNT) and bool(replay.damage) == (len(observations) < COUNT)
     for k, observation in enumerate(observations[:whole]):
         assert (observation.odometry.forward, observation.odometry.turn) == (STEPS[k], TURNS[k])
+
+
+@pytest.mark.parametrize("odometry", ["increments", "poses"])
+@given(share=st.floats(0.0, 1.0))
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_times_that_are_cut_off_anywhere_are_used_up_to_there(folder, odometry, share):
+    """The first images have them; a number that is cut must not be read as another."""
+    text = "".join(f"{100 + 0.2 * k:.6f}\n" for k in range(COUNT - 1))
+    text = text[: round(share * len(text))]
+    (folder / "times.txt").write_text(text)
+    if odometry == "poses":
+        (folder / "odometry.csv").write_text(POSES)
+    whole = text.count("\n")
+    if whole < 2:
+        refused(lambda: Replay(folder))
+        return
+    replay = Replay(folder)
+    stamps = [round((100 + 0.2 * k) * 1e9) for k in range(COUNT)]
+    assert [o.stamp_ns for o in everything(replay)] == stamps[:whole]
+    (words,) = replay.damage
+    assert f"times for 14 images; the first {whole} images are used" in words
 
 
 toml_values = st.one_of(
