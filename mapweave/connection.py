@@ -38,14 +38,17 @@ def reach(settings: BusSettings, advice: str = "give the endpoint of its router 
     if not bus.wait_connected(SOON):
         bus.close()
         where = ", ".join(settings.endpoints)
-        if any(map(_listens, settings.endpoints)):
-            reason = "what listens there does not let this in"
-            advice = (
-                _key_hint(settings.credentials) or "; if the fleet has keys, give a key file (--keys FILE)"
-            )
-            raise NotConnected(f"no router at {where}: {reason}{advice}")
-        raise NotConnected(f"no router at {where}: start `mapweave server`, or {advice}")
+        refused = not_let_in(settings)
+        raise NotConnected(f"no router at {where}: {refused or f'start `mapweave server`, or {advice}'}")
     return bus
+
+
+def not_let_in(settings: BusSettings) -> str:
+    """Why there is no connection though something listens there, and what to do; empty if nothing listens."""
+    if not any(map(_listens, settings.endpoints)):
+        return ""
+    hint = _key_hint(settings.credentials) or "; if the fleet has keys, give a key file (--keys FILE)"
+    return f"what listens there does not let this in{hint}"
 
 
 def _listens(endpoint: str) -> bool:

@@ -17,7 +17,6 @@ from mapweave.agent.drivers.serial_port import TIMEOUT, SerialPort
 from mapweave.agent.drivers.settings import Geometry, Positive, RobotSettings
 from mapweave.agent.drivers.wheeled import WheeledRobot
 from mapweave.hybridmap.errors import DeviceError
-from mapweave.storage.settings_file import build
 
 STATE = re.compile(r"S( -?[0-9]{1,10}){2} [01]( -?[0-9]{1,6}){0,256}")
 BOOT = 3.0
@@ -126,5 +125,5 @@ class Arduino(WheeledRobot):
 
     def __init__(self, settings: RobotSettings) -> None:
         """Connect to the port in the options."""
-        options = build(ArduinoOptions, settings.options, "[robot.options]")
+        options = settings.options_as(ArduinoOptions)
         super().__init__(ArduinoBase(options, settings.geometry), settings)

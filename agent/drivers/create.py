@@ -13,7 +13,6 @@ from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheel_guard import WheelGuard
 from mapweave.agent.drivers.wheeled import WheeledRobot
-from mapweave.storage.settings_file import build
 
 START, SAFE, DRIVE_DIRECT, QUERY_LIST = 128, 131, 145, 149
 BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS = 7, 25, 26, 35, 43, 44
@@ -100,5 +99,5 @@ class Create(WheeledRobot):
 
     def __init__(self, settings: RobotSettings) -> None:
         """Connect to the port in the options."""
-        options = build(CreateOptions, settings.options, "[robot.options]")
+        options = settings.options_as(CreateOptions)
         super().__init__(CreateBase(options.port), settings)

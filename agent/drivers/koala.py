@@ -17,7 +17,6 @@ from mapweave.agent.drivers.wheel_guard import WheelGuard
 from mapweave.agent.drivers.wheeled import WheeledRobot
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
-from mapweave.storage.settings_file import build
 
 NUMBER = re.compile(r"-?[0-9]{1,10}")
 INFRARED_REACH = 0.2
@@ -217,5 +216,5 @@ class Koala(WheeledRobot):
 
     def __init__(self, settings: RobotSettings) -> None:
         """Connect to the port in the options."""
-        options = build(KoalaOptions, settings.options, "[robot.options]")
+        options = settings.options_as(KoalaOptions)
         super().__init__(KoalaBase(options.port), settings)

@@ -24,7 +24,6 @@ from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import BASE, CAMERA_TYPE, IMAGE_TYPES, KIDNAP_TYPE, camera_of
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, SettingsError
-from mapweave.storage.settings_file import build
 from mapweave.wire.ros2.messages import encode, make
 from mapweave.wire.ros2.node import Publisher, Ros2Node
 from mapweave.wire.ros2.settings import Ros2Link
@@ -309,7 +308,7 @@ class Ros2(WheeledRobot):
 
     def __init__(self, settings: RobotSettings) -> None:
         """Join the ROS 2 graph in the options."""
-        options = build(Ros2Options, settings.options, "[robot.options]")
+        options = settings.options_as(Ros2Options)
         self._node = Ros2Node(options, NODE)
         try:
             self._ros = Ros2Base(self._node, options, settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta
 
@@ -13,12 +13,15 @@ from mapweave.agent.drive_geometry import FARTHEST, check_mount
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.storage.settings_file import build
 from mapweave.vision.lens import Distortion, LensModel, lens_of
 
 REMOTE = "remote"
 """The driver of a robot base behind Zenoh keys, for example a simulated one."""
 
 Positive = Annotated[float, Meta(gt=0.0)]
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -123,6 +126,40 @@ class RobotSettings:
     options: Mapping[str, Any] = field(default_factory=dict)
     camera: CameraSettings | None = None
     geometry: Geometry = field(default_factory=Geometry)
+
+    def options_as(self, cls: type[T]) -> T:
+        """The driver's own table as its dataclass.
+
+        Raises:
+            SettingsError: a value is missing or wrong; it says where to write it.
+        """
+        try:
+            return build(cls, self.options, "[robot.options]")
+        except SettingsError as error:
+            words = str(error)
+            if not words.endswith("is missing"):
+                raise
+            found = "; `mapweave find-port` finds it" if words.endswith(" port is missing") else ""
+            raise SettingsError(
+                f"{words}: write it in the robot's settings file, and give that with --settings FILE "
+                f"(docs/drivers.md){found}"
+            ) from None
+
+    def check_remote(self) -> None:
+        """Refuse a table that describes a robot on this computer where no driver is named.
+
+        Raises:
+            SettingsError: it has a camera, options or a geometry, which a base behind Zenoh keys has itself.
+        """
+        tables = {"options": self.options, "camera": self.camera, "geometry": self.geometry != Geometry()}
+        given = [f"[robot.{name}]" for name, there in tables.items() if there]
+        if given:
+            raise SettingsError(
+                f"the settings have {' and '.join(given)}, which the driver {REMOTE}, the default, does not "
+                "use: name the robot's driver by a line `driver = ...` in [robot] (`mapweave robots` lists "
+                "them), or by --robot NAME; for a robot behind the network or a simulated one: "
+                f"--robot {REMOTE}"
+            )
 
     def describe(self, known: Geometry) -> RobotDescription:
         """Description of the robot for the agent.

@@ -16,7 +16,6 @@ from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheeled import WheeledRobot
 from mapweave.hybridmap.errors import DeviceError, SettingsError
-from mapweave.storage.settings_file import build
 
 SPEEDS, FEEDBACK, STREAM, WATCHDOG, INTERVAL, ECHO = 1, 130, 131, 136, 142, 143
 """`T` of the commands."""
@@ -253,7 +252,7 @@ class Waveshare(WheeledRobot):
         Raises:
             SettingsError: the address is none.
         """
-        options = build(WaveshareOptions, settings.options, "[robot.options]")
+        options = settings.options_as(WaveshareOptions)
         if "://" in options.port and not _is_address(options.port):
             raise SettingsError(
                 f"[robot.options]: port {options.port!r} is neither a serial device nor http://ADDRESS[:PORT]"

@@ -14,6 +14,7 @@ from mapweave.commands import values
 from mapweave.commands.network import (
     add_log_format,
     add_network,
+    client_settings,
     connect,
     network_of,
     reach,
@@ -138,7 +139,6 @@ def run(arguments: argparse.Namespace) -> int:
     body, claim = bus, None
     robot: Robot | None = None
     try:
-        warn_without_router(bus, name)
         if arguments.body:
             body, _ = connect(replace(network, endpoints=(arguments.body,), keys=""))
         if body.wait_connected(SOON):
@@ -146,6 +146,8 @@ def run(arguments: argparse.Namespace) -> int:
         robot, synchronization = checked, _ = open_robot(
             arguments, settings.robot, body, network.fleet, name, arguments.lockstep
         )
+        # After what is wrong with settings and driver, which then is the only line.
+        warn_without_router(bus, name, client_settings(network))
         if arguments.record is not None:
             robot = RecordedRobot(robot, arguments.record, print_line=print_error)
         # A stop signal ends the wait for the robot.
@@ -199,12 +201,11 @@ def calibration_of(arguments: argparse.Namespace, name: str) -> Path:
 def ros2_link(arguments: argparse.Namespace, settings: RobotSettings) -> Ros2Link:
     """Where to publish: where the robot's own topics are, if it has any."""
     from mapweave.agent.drivers.ros2 import Ros2Options
-    from mapweave.storage.settings_file import build
     from mapweave.wire.ros2.settings import Ros2Link
 
     link = Ros2Link()
     if (arguments.robot or settings.driver) == "ros2":
-        link = build(Ros2Options, settings.options, "[robot.options]")
+        link = settings.options_as(Ros2Options)
     if arguments.ros2:
         link = replace(link, endpoint=arguments.ros2)
     link.domain_id()
@@ -236,6 +237,8 @@ def open_robot(
     from mapweave.hybridmap.errors import SettingsError
 
     driver = arguments.robot or settings.driver
+    if driver == REMOTE and not arguments.robot:
+        settings.check_remote()
     if driver == REMOTE and not lockstep:
         return CheckedRobot(RemoteRobot(bus, fleet, name)), FreeRunning()
     if driver == REMOTE:
@@ -261,6 +264,8 @@ def bus_of(arguments: argparse.Namespace, settings: RobotSettings, network: Netw
     from mapweave.agent.drivers.settings import REMOTE
 
     remote = (arguments.robot or settings.driver) == REMOTE
+    if remote and not arguments.robot:
+        settings.check_remote()
     return (reach(network) if remote else connect(network))[0]
 
 

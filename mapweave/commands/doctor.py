@@ -106,6 +106,8 @@ def _robot(arguments: argparse.Namespace, settings: Settings, driver: str, buses
 
     if driver != REMOTE:
         return find_driver(driver)(settings.robot)
+    if arguments.robot is None:
+        settings.robot.check_remote()
     network = network_of(arguments, settings)
     bus, _ = connect(network)
     buses.append(bus)

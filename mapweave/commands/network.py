@@ -201,8 +201,9 @@ def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[Zen
     return connection.reach(client_settings(network), advice), Keys(network.fleet)
 
 
-def warn_without_router(bus: ZenohBus, name: str) -> None:
+def warn_without_router(bus: ZenohBus, name: str, settings: BusSettings) -> None:
     """Warn on stderr if no router is reached soon; does not wait."""
+    from mapweave.connection import not_let_in
     from mapweave.terminal import stamped
 
     began = time.monotonic()
@@ -210,8 +211,11 @@ def warn_without_router(bus: ZenohBus, name: str) -> None:
     def look() -> None:
         # A process that ends earlier has not waited long enough to know.
         if not bus.wait_connected(SOON) and time.monotonic() - began >= SOON:
-            advice = "start `mapweave server` or `mapweave router`, or give --connect"
-            line = stamped(f"{name} finds no router: {advice}; it goes on looking")
+            where = ", ".join(settings.endpoints)
+            advice = not_let_in(settings) or (
+                "start `mapweave server` or `mapweave router`, or give --connect"
+            )
+            line = stamped(f"{name} finds no router at {where}: {advice}; it goes on looking")
             print(line, file=sys.stderr, flush=True)
 
     threading.Thread(target=look, name="router", daemon=True).start()

@@ -12,6 +12,7 @@ from mapweave.commands import values
 from mapweave.commands.agent import add_calibration, add_rerun, calibration_of
 from mapweave.commands.network import (
     add_network,
+    client_settings,
     connect,
     network_of,
     settings_of,
@@ -183,7 +184,7 @@ def _bus(network: NetworkSettings, name: str, offline: bool) -> tuple[ZenohBus |
     if offline:
         return MemoryBus(MemoryHub()), Keys(network.fleet)
     bus, keys = connect(network)
-    warn_without_router(bus, name)
+    warn_without_router(bus, name, client_settings(network))
     return bus, keys
 
 

@@ -172,7 +172,7 @@ def run(arguments: argparse.Namespace) -> int:
         where = "listens at " + ", ".join(router.listen)
         if router.mode == "client":
             where = "is at the routers " + ", ".join(router.endpoints)
-            warn_without_router(bus, name)
+            warn_without_router(bus, name, router)
         print(stamped(f"map server {name} of fleet {keys.fleet} {where}"), flush=True)
         if arguments.demo:
             stack.enter_context(RecordedFleet(bus, keys, name, data))

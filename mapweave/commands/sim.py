@@ -223,8 +223,9 @@ def run_serve(arguments: argparse.Namespace) -> int:
     if arguments.listen:
         bus = ZenohBus(BusSettings(mode="router", listen=(arguments.listen,)))
     else:
-        bus = ZenohBus(client_settings(network))
-        warn_without_router(bus, "the simulator")
+        client = client_settings(network)
+        bus = ZenohBus(client)
+        warn_without_router(bus, "the simulator", client)
     try:
         run_sim(bus, network.fleet, scenario.world(seed), scenario.robots, seed, stop, arguments.held)
     finally:

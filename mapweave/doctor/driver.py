@@ -149,8 +149,10 @@ def _advice(error: str) -> str:
     """What to do about an error of a driver, most of which say it themselves."""
     if "waits for the agents" in error:
         return "start the agents of its other robots, or a simulation of this robot alone: --set robots=1"
+    if "the default, does not use" in error:
+        return "name the driver of the robot in [robot]"
     if "mapweave sim serve" in error:
-        return "start it, and the router between (mapweave server), or give --settings robot.toml"
+        return "start it, and the router between (mapweave server), or name another driver (mapweave robots)"
     if "in use" in error:
         return "stop the program that uses it, for example a running agent"
     if "may not be opened" in error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -62,7 +63,7 @@ def test_an_address_of_another_machine(capfd, tmp_path):
 def test_asking_without_a_server(capfd, recording, closed):
     picture = recording / "images" / "0.png"
     output = complaint(capfd, "relocalize", picture, "--connect", closed, "--timeout", "0.3")
-    assert f"no router at {closed}: start `mapweave server`" in output
+    assert f"no router at {closed}: start" in output
 
 
 def test_asking_about_an_image(capfd, recording, tmp_path, closed):
@@ -115,9 +116,9 @@ def test_an_agent_interrupted_before_its_base_answers_reports_it(closed, tmp_pat
 @pytest.mark.parametrize(
     ("command", "hints"),
     [
-        (["agent", "r0"], {"r0: waits for its robot", "r0 finds no router: start `mapweave server`"}),
+        (["agent", "r0"], {"r0: waits for its robot", "r0 finds no router at {closed}: start"}),
         pytest.param(
-            ["sim", "serve", "office"], {"the simulator finds no router: start `mapweave server`"},
+            ["sim", "serve", "office"], {"the simulator finds no router at {closed}: start"},
             marks=needs_simulator,
         ),
     ],
@@ -130,7 +131,7 @@ def test_waiting_is_reported_with_its_reason(command, hints, closed, tmp_path):
         watchdog.start()
         assert process.stderr is not None
         for line in process.stderr:
-            hints = {hint for hint in hints if hint not in line}
+            hints = {hint for hint in hints if hint.format(closed=closed) not in line}
             if not hints:
                 break
         process.send_signal(signal.SIGINT)
@@ -139,10 +140,30 @@ def test_waiting_is_reported_with_its_reason(command, hints, closed, tmp_path):
     assert not hints
 
 
+def test_a_router_that_lets_no_one_in_without_a_key_is_no_missing_router(tmp_path):
+    """It said to start a server, and that was running, with keys."""
+    with socket.create_server(("127.0.0.1", 0)) as there:
+        endpoint = f"tcp/127.0.0.1:{there.getsockname()[1]}"
+        words = ["agent", "r0", "--connect", endpoint, "--data", str(tmp_path)]
+        command = [sys.executable, "-m", "mapweave", *words]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as agent:
+            watchdog = threading.Timer(40, agent.kill)
+            watchdog.start()
+            assert agent.stderr is not None
+            lines = (line for line in agent.stderr if "finds no router" in line)
+            said = next(lines, "")
+            agent.send_signal(signal.SIGINT)
+            agent.communicate()
+            watchdog.cancel()
+    assert f"r0 finds no router at {endpoint}: what listens there does not let this in" in said
+    assert "--keys FILE" in said and "start `mapweave server`" not in said
+
+
 def test_a_signal_amid_another_stops_a_process():
     """Ctrl-C twice, or a signal to a process and its group: the second handler waited for the first."""
     program = """
 import signal
+import socket
 from mapweave.commands.network import stop_on_signals
 stop = stop_on_signals()
 with stop._cond:
@@ -213,6 +234,7 @@ pathlib.Path({str(tmp_path / "written")!r}).write_text(str(stop.is_set()))
 def test_nohup_keeps_a_process():
     program = """
 import signal
+import socket
 signal.signal(signal.SIGHUP, signal.SIG_IGN)
 from mapweave.commands.network import stop_on_signals
 stop = stop_on_signals()

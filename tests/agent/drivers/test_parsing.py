@@ -88,7 +88,16 @@ def test_what_a_waveshare_says() -> None:
     ("driver", "options", "words"),
     [
         ("koala", {"prot": "x"}, r"\[robot.options\]: no setting 'prot'; did you mean 'port'"),
-        ("create", {}, r"\[robot.options\]: port is missing"),
+        (
+            "create",
+            {},
+            r"\[robot.options\]: port is missing: write it in .* --settings FILE .*`mapweave find-port`",
+        ),
+        (
+            "arduino",
+            {"port": "x"},
+            r"wheel_radius is missing: write it in .* --settings FILE \(docs/drivers.md\)$",
+        ),
         ("arduino", {"port": "x", "wheel_radius": 0.0, "counts_per_turn": 1}, "expected float > 0.0"),
         (
             "arduino",
