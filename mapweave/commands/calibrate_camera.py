@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.drive_geometry import check_mount
     from mapweave.agent.drivers.settings_writer import camera_table, write_camera
     from mapweave.commands.usage import UsageError, arguments_read
-    from mapweave.hybridmap.errors import Refused
+    from mapweave.hybridmap.errors import MapweaveError, Refused
     from mapweave.terminal import plain_or_terminal
     from mapweave.vision.calibration.camera_calibration import calibrate_camera
     from mapweave.vision.calibration.collection import ViewCollection
@@ -101,14 +101,15 @@ def run(arguments: argparse.Namespace) -> int:
         values |= {} if a.images is not None else {"source": source}
         values |= {} if a.height is None else {"height_m": a.height}
         values |= {} if a.forward is None else {"forward_m": a.forward}
-        write_camera(a.settings, values)
+        try:
+            write_camera(a.settings, values)
+        except (MapweaveError, OSError):
+            # Showing the target took a person ten minutes.
+            _print_values(found, console, f"{a.settings} cannot be written")
+            raise
         console.print(f"[robot.camera] written to {a.settings}", markup=False)
     elif not found.problems:
-        console.print(
-            "no --settings FILE: nothing is written. For [robot.camera], or a recording's camera.toml:"
-        )
-        for key, value in _values(found).items():
-            console.print(f"{key} = {json.dumps(value)}", markup=False, highlight=False)
+        _print_values(found, console, "no --settings FILE: nothing is written")
     if a.json:
         print(json.dumps(_report(found, written)))
     for problem in found.problems:
@@ -194,6 +195,13 @@ def _values(found: CameraCalibration) -> dict[str, Any]:
         "width": width, "height": height, **dict(zip(("fx", "fy", "cx", "cy"), values, strict=False)),
         "lens": str(found.fit.model), "distortion": tuple(values[4:]),
     }  # fmt: skip
+
+
+def _print_values(found: CameraCalibration, console: Console, why: str) -> None:
+    """The result for a person who writes it somewhere."""
+    console.print(f"{why}. For [robot.camera], or a recording's camera.toml:", markup=False, highlight=False)
+    for key, value in _values(found).items():
+        console.print(f"{key} = {json.dumps(value)}", markup=False, highlight=False)
 
 
 def _print(found: CameraCalibration, console: Console) -> None:

@@ -206,6 +206,27 @@ def test_the_target_is_written(capfd, tmp_path: Path) -> None:
     assert read_page(out.read_bytes()).rectangles[0, 2] == pytest.approx(20.0)
 
 
+def test_the_result_is_shown_where_it_is_not_written(frames, capfd, tmp_path: Path) -> None:
+    """A person has shown the target for ten minutes: what was measured is not lost."""
+    images = folder_of(frames["pinhole"], tmp_path / "views")
+    assert main(["calibrate", "camera", str(images), *OPTIONS]) == 0
+    *_, why, width, height, fx, _, _, _, lens, distortion = capfd.readouterr().out.splitlines()
+    assert why == "no --settings FILE: nothing is written. For [robot.camera], or a recording's camera.toml:"
+    assert (width, height, fx[:8], lens) == (
+        "width = 320",
+        "height = 240",
+        "fx = 279",
+        'lens = "radial-tangential"',
+    )
+    robot = tmp_path / "r0.toml"
+    robot.write_text("robot = { camera = { height_m = 0.3 } }\n")
+    assert main(["calibrate", "camera", str(images), "--settings", str(robot), *OPTIONS]) == 1
+    output = capfd.readouterr()
+    assert output.out.splitlines()[-1] == distortion and f"{robot} cannot be written. For" in output.out
+    (line,) = output.err.splitlines()
+    assert "nothing is changed" in line
+
+
 def test_mistakes_are_one_line(frames, capfd, tmp_path: Path) -> None:
     blank = folder_of([np.full((240, 320), 99, np.uint8)] * 2, tmp_path / "blank")
     robot = tmp_path / "r0.toml"
