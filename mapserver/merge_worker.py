@@ -179,9 +179,9 @@ class MergeWorker:
         return merged.wait(timeout)
 
     def close(self) -> None:
-        """Stop after the posted changes."""
-        self._schedule.post(lambda: self._save(last=True))
-        self._schedule.close()
+        """Stop, and keep what was found. Changes that wait are in the store, for the next start."""
+        if self._schedule.close():
+            self._save(last=True)
 
     def _post(self, job: Job) -> None:
         """Post a job after which the merged map is out of date."""

@@ -19,9 +19,8 @@ from tests.waiting import eventually
 
 
 def ended(schedule: Schedule) -> None:
-    """Nothing that was posted stays undone."""
-    schedule.close()
-    schedule.close()
+    """It has ended, and may be closed twice."""
+    assert schedule.close() and schedule.close()
 
 
 @pytest.mark.parametrize("make", [LiveSchedule, LockstepSchedule])
@@ -37,9 +36,46 @@ def test_posted_jobs_run_in_order_and_a_defect_in_one_ends_no_other(
     for k in range(50):
         schedule.post(lambda k=k: done.append(k))
         schedule.post(fails)
+    schedule.catch_up()
+    eventually(lambda: done == list(range(50)))
     ended(schedule)
-    assert done == list(range(50))
     assert "a background job failed" in caplog.text
+
+
+def test_closing_interrupts_a_long_job_at_its_next_pause_and_drops_what_waits(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    schedule, began, undone = LiveSchedule(), threading.Event(), list[str]()
+
+    def long_job() -> None:
+        began.set()
+        while True:
+            time.sleep(0.001)
+            schedule.pause()
+
+    schedule.post(long_job)
+    schedule.post(lambda: undone.append("waited"))
+    schedule.start()
+    assert began.wait(30.0)
+    ended(schedule)
+    assert undone == []
+    assert caplog.text == "", "this is no defect"
+
+
+def test_closing_says_when_something_still_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapweave.mapserver.schedule.ENDING", 0.05)
+    schedule, began, go = LiveSchedule(), threading.Event(), threading.Event()
+
+    def without_pause() -> None:
+        began.set()
+        go.wait(60.0)
+
+    schedule.post(without_pause)
+    schedule.start()
+    assert began.wait(30.0)
+    assert not schedule.close()
+    go.set()
+    eventually(schedule.close)
 
 
 @pytest.mark.parametrize("make", [LiveSchedule, LockstepSchedule])
