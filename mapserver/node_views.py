@@ -49,9 +49,11 @@ class NodeViews:
         """Stop watching."""
         self._watching.close()
 
-    def may_have(self, node: NodeId) -> bool:
-        """Whether it is worth asking for the image of a node: its robot is there and keeps images."""
-        return node.agent in self._agents or node in self._cache
+    def why_none(self, node: NodeId) -> str:
+        """Why asking for the image of a node is of no use; empty if its robot is there and keeps images."""
+        if node.agent in self._agents or node in self._cache:
+            return ""
+        return f"{node.agent} is away, or keeps no views (keep_views in [agent] of its settings)"
 
     def view(self, node: NodeId) -> bytes:
         """The image of a node, a JPEG file; waits for the robot.
@@ -67,8 +69,8 @@ class NodeViews:
             if node in self._cache:
                 self._cache.move_to_end(node)
                 return self._cache[node]
-        if node.agent not in self._agents:
-            raise NoView(f"{node.agent} is away, or keeps no views")
+        if missing := self.why_none(node):
+            raise NoView(missing)
         camera = merged.maps[node.map].nodes[node].camera
         if not self._asking.acquire(blocking=False):
             raise Busy(PATIENCE)

@@ -335,9 +335,9 @@ class MapServer:
         """
         return self._plans.put(data, negate)
 
-    def may_have_view(self, node: NodeId) -> bool:
-        """Whether it is worth asking for the image of a node, from any thread."""
-        return self._views.may_have(node)
+    def why_no_view(self, node: NodeId) -> str:
+        """Why asking for the image of a node is of no use, from any thread; empty if it is worth it."""
+        return self._views.why_none(node)
 
     def view(self, node: NodeId) -> bytes:
         """The image of a node, a JPEG file, from any thread; waits for its robot.

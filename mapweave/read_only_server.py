@@ -34,6 +34,8 @@ from mapweave.opened_map import OpenedMap
 from mapweave.storage.map_file import pack_map_file
 from mapweave.wire.log_messages import Scalar
 
+NO_VIEWS = "a map file has no views"
+
 
 class ReadOnlyServer:
     """Answers what `mapserver.http.web.Web` asks. A context manager; any thread may ask."""
@@ -200,9 +202,9 @@ class ReadOnlyServer:
         """
         self._refuse("there are no robots")
 
-    def may_have_view(self, node: NodeId) -> bool:
+    def why_no_view(self, node: NodeId) -> str:
         """Maps have no images."""
-        return False
+        return NO_VIEWS
 
     def view(self, node: NodeId) -> bytes:
         """Refuse.
@@ -210,7 +212,7 @@ class ReadOnlyServer:
         Raises:
             NoView: always.
         """
-        raise NoView("a map file has no views")
+        raise NoView(NO_VIEWS)
 
     def constraints(self) -> ConstraintList:
         """What people decided, in order."""

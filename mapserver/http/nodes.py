@@ -30,8 +30,8 @@ class Showing(Protocol):
     def annotations(self) -> Annotations:
         """What people say about the map."""
 
-    def may_have_view(self, node: NodeId) -> bool:
-        """Whether it is worth asking for the image of a node."""
+    def why_no_view(self, node: NodeId) -> str:
+        """Why asking for the image of a node is of no use; empty if it is worth it."""
 
     def view(self, node: NodeId) -> bytes:
         """The image of a node, a JPEG file; NoView says why there is none."""
@@ -45,7 +45,8 @@ def node_answers(server: Showing) -> list[tuple[str, str, str, Answer]]:
 
         def details() -> Mapping[str, Any]:
             known = node_details(server.merged(), asked, server.annotations().floors)
-            return {**json_values(known), "view": server.may_have_view(asked)}
+            missing = server.why_no_view(asked)
+            return {**json_values(known), "view": not missing, "no_view": missing}
 
         return await run_in_threadpool(details)
 

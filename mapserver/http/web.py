@@ -358,8 +358,9 @@ class Questions:
             first, *more = [await self._result(partial(self._server.explain, one)) for one in asked]
         values = await run_in_threadpool(json_values, route_over([first, *more]) if more else first)
         if isinstance(first, PairExplanation):
-            nodes = (first.a.id, first.b.id)
-            return {**values, "views": [str(node) for node in nodes if self._server.may_have_view(node)]}
+            missing = {str(node): self._server.why_no_view(node) for node in (first.a.id, first.b.id)}
+            views = [node for node, why in missing.items() if not why]
+            return {**values, "views": views, "no_views": {node: why for node, why in missing.items() if why}}
         return values
 
     async def _relocalize(self, request: Request) -> Mapping[str, Any]:

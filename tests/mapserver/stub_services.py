@@ -91,12 +91,12 @@ class StubServices:
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         return Places(Router(self.merged()), self.annotations()).answer(request)
 
-    def may_have_view(self, node: NodeId) -> bool:
-        return node in self.images
+    def why_no_view(self, node: NodeId) -> str:
+        return "" if node in self.images else f"{node.agent} is away, or keeps no views"
 
     def view(self, node: NodeId) -> bytes:
         if node not in self.images:
-            raise NoView(f"{node.agent} is away, or keeps no views")
+            raise NoView(self.why_no_view(node))
         return self.images[node]
 
     def metrics(self) -> bytes:

@@ -9,9 +9,11 @@ function read() {
   for (const name of NAMES) colours[name] = style.getPropertyValue("--" + name).trim();
   colours.hues = style.getPropertyValue("--hues").trim().split(/\s+/);
 }
+const system = matchMedia("(prefers-color-scheme: dark)");
+export const isDark = () => system.matches;
 export function followTheme(changed) {
   read();
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { read(); changed(); });
+  system.addEventListener("change", () => { read(); changed(); });
 }
 // A component keeps its colour as long as its anchor stays.
 export function hue(anchor) {

@@ -11,39 +11,38 @@ function colour(px) {
   const at = 4 * Math.min(px === null ? BAD_PX : px, BAD_PX) / BAD_PX, k = Math.min(Math.floor(at), 3);
   return "rgb(" + COLOURS[k].map((c, i) => Math.round(c + (at - k) * (COLOURS[k + 1][i] - c))) + ")";
 }
-// Both views with the landmarks that match; the images where their robots have kept them.
+// Both views with the landmarks that match, one below the other, as the panel is narrow; the images where their robots
+// have kept them.
 function picture(parent, pair) {
-  const nodes = [pair.a, pair.b], [left, right] = nodes.map(node => node.image);
-  const gap = 0.06 * left[0], shift = [0, left[0] + gap];
+  const nodes = [pair.a, pair.b], [above, below] = nodes.map(node => node.image);
+  const wide = Math.max(above[0], below[0]), px = wide / 320, shift = [0, above[1] + 22 * px];
   const agreement = `${pair.shared.length} landmarks of ${pair.a.id} and ${pair.b.id} agree`;
   const svg = draw(parent, "svg", { role: "img", class: "picture",
     "aria-label": agreement,
-    viewBox: [-2, -14, shift[1] + right[0] + 4, Math.max(left[1], right[1]) + 16].join(" ") });
-  const seen = [];
+    viewBox: [-2 * px, -18 * px, wide + 4 * px, shift[1] + below[1] + 20 * px].join(" ") });
+  const seen = [], words = add(parent, "small");
   nodes.forEach((node, k) => {
     const { id, image: [width, height] } = node;
-    if (pair.views.includes(id)) drawView(svg, node, shift[k], () => {
+    drawView(svg, node, shift[k], pair.no_views[id], () => {
       seen.push(id);
       svg.setAttribute("aria-label", `${agreement}, drawn over the view of ${seen.sort().join(" and ")}`);
-      dots.textContent = "Dots are landmarks.";
-    });
-    draw(svg, "rect", { x: shift[k], y: 0, width, height, class: "frame" });
-    draw(svg, "text", { x: shift[k], y: -4, "font-size": 9 }).textContent = id;
+    }, why => { words.append(` No view of ${id}: ${why}.`); });
+    draw(svg, "rect", { x: 0, y: shift[k], width, height, class: "frame" });
+    draw(svg, "text", { x: 0, y: shift[k] - 5 * px, "font-size": 13 * px }).textContent = id;
   });
   const agree = new Set(pair.shared.map(String));
   const line = ([i, j], values) => {
     const [x, y] = pair.a.pixels[i], [u, v] = pair.b.pixels[j];
-    draw(svg, "line", { x1: x, y1: y, x2: u + shift[1], y2: v, ...values });
+    draw(svg, "line", { x1: x, y1: y, x2: u, y2: v + shift[1], ...values });
   };
   for (const match of pair.matches)
-    if (!agree.has(String(match))) line(match, { "stroke-width": 0.5, class: "alike" });
+    if (!agree.has(String(match))) line(match, { "stroke-width": 0.5 * px, class: "alike" });
   pair.shared.forEach((match, k) =>
-    line(match, { stroke: colour(pair.residuals_px[k]), "stroke-width": 1.1, class: "agree" }));
+    line(match, { stroke: colour(pair.residuals_px[k]), "stroke-width": 1.1 * px, class: "agree" }));
   nodes.forEach(({ pixels }, k) => pixels.forEach(([x, y]) =>
-    draw(svg, "circle", { cx: x + shift[k], cy: y, r: 1.3, class: "landmark" })));
+    draw(svg, "circle", { cx: x, cy: y + shift[k], r: 1.3 * px, class: "landmark" })));
   const alike = pair.matches.filter(match => !agree.has(String(match))).length;
-  const words = add(parent, "small"), dots = add(words, "span", "Dots are landmarks; there is no image.");
-  words.append(` ${pair.shared.length} agree on one pose: dark where it predicts them, yellow where it is ` +
+  words.prepend(`Dots are landmarks. ${pair.shared.length} agree on one pose: dark where it predicts them, yellow where it is ` +
     `${BAD_PX} px off. ${alike} match and do not agree: grey.`);
 }
 function pose({ mean, sigma }) {

@@ -1,6 +1,6 @@
 // Texts on the map, none of which lies on another: what is asked for first comes first, and what finds no room is left
 // out. Drawn last, over everything else.
-const MOST = 400;
+const MOST = 400, OUTLINED = 100;
 const ABOVE = 11, BELOW = 3;  // px that a line reaches from its base
 const LINE = 15;              // px from line to line
 const BESIDE = 14;            // px from a point
@@ -47,8 +47,8 @@ export class Labels {
     c.textBaseline = "alphabetic"; c.textAlign = "left"; c.lineWidth = 3; c.strokeStyle = this.ground;
     for (const { text, left, base, style, colour } of this.texts) {
       c.font = STYLES[style]; c.fillStyle = colour;
-      // Of many small ones the outline takes too long.
-      if (style !== "node") c.strokeText(text, left, base);
+      // A name that a dot covers in part could be read as another. Of many the outline takes too long.
+      if (style !== "node" || this.texts.length <= OUTLINED) c.strokeText(text, left, base);
       c.fillText(text, left, base);
     }
   }

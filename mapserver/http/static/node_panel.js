@@ -14,15 +14,15 @@ function picture(parent, node) {
   const { image: [width, height], pixels } = node.node, faded = new Set(node.faded);
   const svg = draw(parent, "svg", { class: "picture", role: "img", viewBox: `-1 -1 ${width + 2} ${height + 2}`,
     "aria-label": `${pixels.length} landmarks in the image of ${node.node.id}` });
-  if (node.view) drawView(svg, node.node, 0, () => {
+  const red = faded.size ? "; red: faded" : "";
+  const words = add(parent, "small", `The landmarks in its image, ${width} x ${height} px${red}`);
+  drawView(svg, node.node, 0, node.no_view, () => {
     svg.setAttribute("aria-label", `The view of ${node.node.id} with its ${pixels.length} landmarks`);
     words.textContent = `Its view with the landmarks${red}`;
-  });
+  }, why => words.append(`. No view: ${why}.`));
   draw(svg, "rect", { x: 0, y: 0, width, height, class: "frame" });
   pixels.forEach(([cx, cy], k) =>
     draw(svg, "circle", { cx, cy, r: width / 130, class: faded.has(k) ? "faded" : "landmark" }));
-  const red = faded.size ? "; red: faded" : "";
-  const words = add(parent, "small", `The landmarks in its image, ${width} x ${height} px${red}`);
 }
 export async function showNode(name, { select, why, send, edit }) {
   latest = name;

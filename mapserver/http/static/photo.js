@@ -22,7 +22,8 @@ function table(candidates, show) {
   for (const name of ["place", "ahead", "left", "turned", "probability"]) add(head, "th", name);
   for (const c of candidates) {
     const [x, y, turn] = c.node_from_robot.mean, row = made.insertRow();
-    const away = m => c.distance_known ? m.toFixed(2) + " m" : "not known";
+    // No -0.00.
+    const away = m => c.distance_known ? (Math.round(100 * m) / 100 + 0).toFixed(2) + " m" : "not known";
     const place = add(row, "td");
     button(place, c.node, () => show(c.node));
     const where = [c.place, c.floor && `floor ${c.floor}`].filter(Boolean).join(", ");

@@ -1,7 +1,9 @@
 // Floor plans under the map: GET /plans and their images. A map file of before has none.
+import { isDark } from "./colours.js";
 import { ask, byId } from "./dom.js";
 
-const images = new Map(); // by digest
+const LARGEST = 16e6; // px; browsers may refuse larger canvases
+const images = new Map(), inverted = new Map(); // by digest
 let plans = [], offered = true;
 // The plan that is being edited takes the place of the one of its name: `{ name, image, parts }`.
 export const draft = { plan: null };
@@ -28,6 +30,20 @@ export function imageOf(sha256, loaded = () => {}) {
   if (!image.complete) image.addEventListener("load", loaded);
   return image;
 }
+// Black on white becomes white on black: on white the colours of the dark theme could not be read.
+function inDark(sha256, image) {
+  const { naturalWidth: width, naturalHeight: height } = image;
+  if (width * height > LARGEST) return image;
+  if (!inverted.has(sha256)) {
+    const made = Object.assign(document.createElement("canvas"), { width, height }), c = made.getContext("2d");
+    c.drawImage(image, 0, 0);
+    c.globalCompositeOperation = "difference"; c.fillStyle = "#fff"; c.fillRect(0, 0, width, height);
+    // What is transparent stays so.
+    c.globalCompositeOperation = "destination-in"; c.drawImage(image, 0, 0);
+    inverted.set(sha256, made);
+  }
+  return inverted.get(sha256);
+}
 const shown = () => [...plans.filter(one => one.name !== draft.plan?.name), ...draft.plan ? [draft.plan] : []];
 
 export function drawPlans(c, viewport, model) {
@@ -41,7 +57,7 @@ export function drawPlans(c, viewport, model) {
       c.save();
       // The page's v points down, the plane's y up.
       c.transform(s * a, -s * b, s * e, -s * d, u, v);
-      c.drawImage(image, 0, 0);
+      c.drawImage(isDark() ? inDark(plan.image.sha256, image) : image, 0, 0);
       c.restore();
       drawn = true;
     }

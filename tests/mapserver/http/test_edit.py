@@ -244,6 +244,11 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
             box = browser.run("return mapweave.painter.canvas.getBoundingClientRect().left")
             pixel = grey.format(round(x - box) + 25, y - 49 + 25)
             eventually(lambda pixel=pixel, ink=ink: (browser.run(pixel) == 215) == (ink is not None))
+        # In the dark theme, whose colours could not be read on white paper, black and white are exchanged.
+        person.fill("opacity", 100)
+        browser.look(1280, 800, "dark")
+        eventually(lambda: browser.run(pixel) == 255 - 215)
+        browser.look(1280, 800)
         person.fill("plan-because", "by the architect")
         person.press("plan-save")
         eventually(lambda: "plan map is hall.pgm, 5 pairs" in person.text("plan-answer"))

@@ -31,6 +31,7 @@ from tests.waiting import eventually
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 KEYS = Keys("views")
 SHOWN = "return document.querySelectorAll('{} svg.seen image').length"
+WORDS = "return document.querySelector('#selected small').textContent"
 LABEL = "return document.querySelector('{} svg').getAttribute('aria-label')"
 
 
@@ -131,6 +132,7 @@ def test_a_node_without_a_view_is_shown_as_before(
     show(node)
     assert page.run("return document.querySelector('#selected svg image')") is None
     assert "landmarks in the image of" in page.run(LABEL.format("#selected"))
+    assert "No view: r2 is away, or keeps no views (keep_views" in page.run(WORDS)
     assert page.errors() == []
     status, _, content = ask(fleet.web, "GET", f"/nodes/{node}/view")
     assert status == 404 and b"r2 is away, or keeps no views" in content
@@ -146,9 +148,27 @@ def test_a_link_is_shown_over_both_views(fleet: Fleet, page: Browser) -> None:
     assert page.run("return document.querySelectorAll('#result svg image ~ line.agree').length") >= 10
     eventually(lambda: f"drawn over the view of {a} and {b}" in page.run(LABEL.format("#result")))
     first, second = page.run(
-        "return [...document.querySelectorAll('#result svg image')].map(image => image.getBBox().x)"
+        "return [...document.querySelectorAll('#result svg image')].map(image => image.getBBox().y)"
     )
-    assert second - first > CAMERA.width
+    assert second - first > CAMERA.height, "one below the other"
+    # Side by side the views were half as wide as the panel, and their names could not be read.
+    panel, view, name = page.run(
+        "return ['#why', '#result svg image', '#result svg text']"
+        ".map(one => document.querySelector(one).getBoundingClientRect()).map(box => [box.width, box.height])"
+    )
+    assert view[0] > 0.8 * (panel[0] - 40) and name[1] > 9
+
+
+def test_a_link_says_which_view_is_missing_and_why(fleet: Fleet, page: Browser) -> None:
+    a, b = fleet.node("r0"), fleet.node("r2")
+    page.run(
+        "document.getElementById('tab-why').click(); const form = document.getElementById('form');"
+        f"form.a.value = '{a}'; form.b.value = '{b}'; form.requestSubmit()"
+    )
+    eventually(lambda: page.run(SHOWN.format("#result")) == 1)
+    eventually(lambda: page.run(LABEL.format("#result")).endswith(f"drawn over the view of {a}"))
+    words = page.run("return document.querySelector('#result small').textContent")
+    assert f"No view of {b}: r2 is away, or keeps no views" in words and f"No view of {a}" not in words
 
 
 def test_a_view_that_is_lost_is_left_out(fleet: Fleet, page: Browser, show: Callable[[NodeId], None]) -> None:
@@ -158,5 +178,6 @@ def test_a_view_that_is_lost_is_left_out(fleet: Fleet, page: Browser, show: Call
     with pytest.raises(MapweaveError, match=f"r1 has kept no view of {node}"):
         fleet.server.view(node)
     show(node)
-    eventually(lambda: page.run("return document.querySelector('#selected svg image')") is None)
+    eventually(lambda: f"No view: r1 has kept no view of {node}" in page.run(WORDS))
+    assert page.run("return document.querySelector('#selected svg image')") is None
     assert "landmarks in the image of" in page.run(LABEL.format("#selected"))
