@@ -67,6 +67,30 @@ def test_a_node_keeps_its_content(some: SimpleNamespace, data: st.DataObject) ->
     assert np.isnan(new.depth_sigmas[~known]).all()
 
 
+NUMBERS = st.one_of(
+    st.floats(width=32), st.floats(-2000.0, 4000.0, width=32), st.floats(0.0, 100.0, width=32)
+)
+
+
+@given(data)
+def test_whatever_landmarks_are_encoded_can_be_decoded(some: SimpleNamespace, data: st.DataObject) -> None:
+    """Encoding does not unpack them again to find that out."""
+    count = data.draw(st.integers(0, 4))
+    rows = st.lists(NUMBERS, min_size=count, max_size=count)
+    columns = [np.array(data.draw(rows), np.float32) for _ in range(4)]
+    codes = np.array(
+        data.draw(st.lists(st.integers(0, 70), min_size=32 * count, max_size=32 * count)), np.uint8
+    ).reshape(count, 32)
+    landmarks = Landmarks(np.stack(columns[:2], axis=1), codes, *columns[2:])
+    try:
+        encoded = encode_body(NodePut(replace(some.node(), landmarks=landmarks)))
+    except InvalidValue:
+        return
+    body = decode_body(encoded)
+    assert isinstance(body, NodePut)
+    assert np.array_equal(body.node.landmarks.codes, codes)
+
+
 @given(data)
 def test_an_edge_keeps_its_content(some: SimpleNamespace, data: st.DataObject) -> None:
     edge: Edge = data.draw(some.edges)
