@@ -61,6 +61,8 @@ from mapweave.wire.log_messages import Scalar, encode_record
 
 log = logging.getLogger(__name__)
 
+VERSION = version("mapweave")
+
 
 @dataclass(frozen=True)
 class ServerSettings:
@@ -261,7 +263,7 @@ class MapServer:
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,
             "summary": merged.summary(),
-            "version": version("mapweave"),
+            "version": VERSION,
             "cluster": self._cluster.status,
             **self._admission.counters(),
         }
