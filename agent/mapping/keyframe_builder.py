@@ -119,10 +119,11 @@ class KeyframeBuilder:
         estimate: EpisodeEstimate,
         trajectory: TrajectoryRecorder,
         moved: PoseGaussian,
-    ) -> Landmarks | None:
+        known: Callable[[Landmarks | None], None],
+    ) -> None:
         """Begin the next episode elsewhere; the last one's anchor becomes a node, with edges to those before.
 
-        The node, those of further views and loop closures are left for `continue_pending`.
+        The landmarks, the node, those of further views and loop closures are left for `continue_pending`.
 
         Args:
             anchor: the view where the episode began.
@@ -130,20 +131,20 @@ class KeyframeBuilder:
             estimate: what it is known by.
             trajectory: trajectory since the last node; it goes with the anchor, if that becomes a node.
             moved: `old_anchor_from_new`, by the filter.
-
-        Returns:
-            The landmarks of the anchor's node; None if it shows too little and becomes no node.
+            known: gets the landmarks of the anchor's node; None if it shows too little and becomes no node.
         """
         self.finish_pending()
-        here, (landmarks, tracks) = self.map_from_anchor, self._landmarks(anchor, estimate)
-        if len(landmarks) < LEAST_LANDMARKS:
-            self.move_anchor(moved)
-            return None
-        ranges = self._description.ranges(anchor.proximity)
-        segment = trajectory.segment(anchor.stamp_ns, ranges)
+        here = self.map_from_anchor
+        self.map_from_anchor = here @ self._with_floor(moved)
 
         def make() -> None:
+            landmarks, tracks = self._landmarks(anchor, estimate)
             self.map_from_anchor = here
+            if len(landmarks) < LEAST_LANDMARKS:
+                self.move_anchor(moved)
+                known(None)
+                return
+            segment = trajectory.segment(anchor.stamp_ns, self._description.ranges(anchor.proximity))
             placed = AnchoredKeyframe(self._node(anchor, landmarks, here, segment), tracks)
             self.join(placed)
             for view in reversed(further):
@@ -151,10 +152,9 @@ class KeyframeBuilder:
                     partial(self._place_beside, placed, view, estimate, self.map_from_anchor)
                 )
             self.move_anchor(moved)
+            known(landmarks)
 
         self._pending.append(make)
-        self.map_from_anchor = here @ self._with_floor(moved)
-        return landmarks
 
     def _place_beside(
         self, placed: AnchoredKeyframe, view: View, estimate: EpisodeEstimate, map_from_anchor: PoseGaussian

@@ -23,7 +23,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.track_quality import TrackQuality
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.recognition import Recognition
 from mapweave.vision.lens import Lens
@@ -287,7 +287,8 @@ class Mapper:
         self._tracking.reanchor()
         self._anchor = anchor
         self._trajectory.clear(anchor.stamp_ns)
-        self._tracking.follow(anchor, self.typical_depth)
+        self._tracking.follow(anchor)
+        self._tracking.fill(self.typical_depth)
 
     def add_view(self, observation: Observation) -> None:
         """Keep the current image as a further node, for example at the far end of a drive."""
@@ -302,35 +303,38 @@ class Mapper:
         self._use_extracted()
         self._extracting = self._extract(observation.image, observation.left_out), take
 
-    def finish(self, observation: Observation) -> bool:
+    def finish(self, observation: Observation) -> None:
         """End the episode: its views become nodes in the ticks after, the current image the next anchor.
 
-        Returns:
-            Whether the anchor view becomes a node. False without an image.
+        Without an image nothing is done.
         """
         self._use_extracted()
+        self.finish_pending()
         if observation.image is None or self._anchor is None:
-            return False
+            return
         features = self._extract(observation.image, observation.left_out)
-        self._tracking.remember(force=True)
-        estimate = self._tracking.estimate
-        moved = self._tracking.reanchor()
-        landmarks = self._keyframes.place(self._anchor, self._further, estimate, self._trajectory, moved)
-        anchor = self._tracking.take(observation, features.result(), HERE)
-        if landmarks is None:
-            self._trajectory.move_anchor(moved.mean)
-        else:
-            self.typical_depth = float(np.median(landmarks.depths))
-            self._trajectory.clear(anchor.stamp_ns)
-        self._anchor, self._further = anchor, []
+        tracking, anchor, further = self._tracking, self._anchor, self._further
+        tracking.remember(force=True)
+        estimate = tracking.estimate
+        moved = tracking.reanchor()
+        self._anchor, self._further = tracking.take(observation, features.result(), HERE), []
+        tracking.follow(self._anchor)
+
+        def known(landmarks: Landmarks | None) -> None:
+            if landmarks is None:
+                self._trajectory.move_anchor(moved.mean)
+            else:
+                self.typical_depth = float(np.median(landmarks.depths))
+                self._trajectory.clear(observation.stamp_ns)
+            tracking.fill(self.typical_depth)
+
+        # The tick that waits for the features leaves the landmarks to the next one.
+        self._keyframes.place(anchor, further, estimate, self._trajectory, moved, known)
         if self._take_up_pending():
             # Tracks and features of another lens are of no use to a filter of this one.
             self._tracking = Tracking(self._description, self._lens, self._settings)
             self._tracking.step(observation)
             self.begin(observation)
-        else:
-            self._tracking.follow(anchor, self.typical_depth)
-        return landmarks is not None
 
     def _extract(self, image: NDArray[np.uint8], left_out: Array) -> Future[Features]:
         """Have the features of an image extracted, without those of some regions."""

@@ -137,7 +137,7 @@ class Tracking:
         self._strikes = RejectionCounter(STRIKES)
         self._correction = NO_CORRECTION
         self._expected_depth = 1.0
-        self._next_track = 1
+        self._next_track = self._first_new = 1
 
     @property
     def ids(self) -> NDArray[np.int64]:
@@ -230,17 +230,24 @@ class Tracking:
         image = None if observation.image is None else RawImage(observation.image, self._lens)
         return View(observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity, image)
 
-    def follow(self, view: View, expected_depth: float) -> None:
-        """Make tracks of a view's features that have none, and give the filter an even choice of them."""
+    def follow(self, view: View) -> None:
+        """Make tracks of a view's features that have none; `fill` is to come before the next step."""
         new = view.tracks < 0
         ids = np.arange(self._next_track, self._next_track + int(new.sum()), dtype=np.int64)
-        self._next_track += len(ids)
+        self._first_new, self._next_track = self._next_track, self._next_track + len(ids)
         view.tracks[new] = ids
         self._tracker.add(ids, view.features.raw[new])
         self._strikes.forget()
-        self._expected_depth = expected_depth
         self._correction = self._correction._replace(unused=None if len(ids) else 0)
-        self._fill(first=int(ids[0]) if len(ids) else self._next_track)
+
+    def fill(self, expected_depth: float) -> None:
+        """Give the filter an even choice of the tracks that the last view has begun.
+
+        Args:
+            expected_depth: of a landmark of which nothing is known, from now on, m.
+        """
+        self._expected_depth = expected_depth
+        self._fill(self._first_new)
         self.remember(force=True)
 
     def reanchor(self) -> PoseGaussian:

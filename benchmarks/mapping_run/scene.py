@@ -245,7 +245,8 @@ class _Run:
         self.tracking.step(observation)
         view = self.tracking.take(observation, sift.extract(observation.image), HERE)
         self.tracking.reanchor()
-        self.tracking.follow(view, DEPTHS_PER_HEIGHT * self.robot.camera.mount_height)
+        self.tracking.follow(view)
+        self.tracking.fill(DEPTHS_PER_HEIGHT * self.robot.camera.mount_height)
         return view
 
     def _write(self, observation: Observation, step_ms: float) -> None:

@@ -8,11 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave.agent.mapping import keyframe_builder
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.registration.selection import choose
 from mapweave.vision.lens import Lens
 
 
@@ -33,7 +35,7 @@ def test_depths_of_a_node_are_those_of_the_walls(walls, description):
     there = np.arange(0.0, 0.6, 0.025)
     last = drive(mapper, walls, [*there, *there[::-1]])
     assert mapper.take_changes() == ()
-    assert mapper.finish(last)
+    mapper.finish(last)
     mapper.finish_pending()
     (node,) = mapper.map.nodes.values()
     assert mapper.take_changes() == (NodePut(node),)
@@ -73,7 +75,7 @@ def test_what_is_left_of_an_episode_is_made_at_the_end_of_the_process(walls, des
     last = drive(mapper, walls, there)
     mapper.add_view(last)
     last = drive(mapper, walls, there[::-1], start=50)
-    assert mapper.finish(last)
+    mapper.finish(last)
     assert mapper.take_changes() == (), "no tick does all of it"
     mapper.step(replace(last, odometry=Odometry(0.0, 0.0)))
     (node,) = mapper.map.nodes.values()
@@ -85,6 +87,27 @@ def test_what_is_left_of_an_episode_is_made_at_the_end_of_the_process(walls, des
     assert edge.a_from_b.mean.x == pytest.approx(0.575, abs=0.02)
     mapper.finish_pending()
     assert mapper.take_changes() == ()
+
+
+def test_the_tick_that_ends_an_episode_leaves_its_landmarks_to_the_next(walls, description, monkeypatch):
+    """That tick waits for the features of the image; with the landmarks it was the longest of all."""
+    mapper, chosen = Mapper(MapId("r0", 1), description), 0
+
+    def counting(*arguments: object) -> object:
+        nonlocal chosen
+        chosen += 1
+        return choose(*arguments)
+
+    monkeypatch.setattr(keyframe_builder, "choose", counting)
+    last = drive(mapper, walls, np.arange(0.0, 0.6, 0.025))
+    assumed = mapper.typical_depth
+    mapper.finish(last)
+    assert (chosen, mapper.typical_depth) == (0, assumed)
+    assert mapper.map_from_robot.mean.x == pytest.approx(0.575, abs=0.02), "the pose waits for nothing"
+    mapper.step(replace(last, odometry=Odometry(0.0, 0.0)))
+    (node,) = mapper.map.nodes.values()
+    assert chosen == 1
+    assert mapper.typical_depth == np.median(node.landmarks.depths)
 
 
 @pytest.mark.parametrize("forward", [0.3, -0.2])
@@ -122,7 +145,8 @@ def test_a_view_without_features_gives_no_node(walls, description):
         if not mapper.started:
             mapper.begin(observation)
     assert mapper.anchor_features == 0
-    assert not mapper.finish(observation)
+    mapper.finish(observation)
+    mapper.finish_pending()
     assert mapper.take_changes() == ()
     assert not mapper.map.nodes
 

@@ -24,7 +24,8 @@ def begun(walls, description, settings: TrackingSettings | None = None) -> Track
     tracking = Tracking(description, lens, AgentSettings(tracking=settings or TrackingSettings()))
     first = Observation(0, Odometry(0.0, 0.0), walls.render(Pose2()))
     tracking.step(first)
-    tracking.follow(tracking.take(first, Sift(lens).extract(walls.render(Pose2())), HERE), 2.5)
+    tracking.follow(tracking.take(first, Sift(lens).extract(walls.render(Pose2())), HERE))
+    tracking.fill(2.5)
     return tracking
 
 
