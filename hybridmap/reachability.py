@@ -71,10 +71,11 @@ def reachability_of(edge: Edge, a: Node, b: Node) -> Reachability:
         common = "landmark stays" if count == 1 else "landmarks stay"
         lacks.append(f"only {count} {common} in view" if count else "no landmark stays in view")
     if distance > FARTHEST:
-        lacks.append(f"{distance:.1f} m are more than the {FARTHEST:g} m that the servo manages")
+        lacks.append(f"{_above(distance):g} m are more than the {FARTHEST:g} m that the servo manages")
     if turn > WIDEST:
         most = math.degrees(WIDEST)
-        lacks.append(f"{math.degrees(turn):.0f} degrees are more than the {most:.0f} that the servo manages")
+        degrees = _above(math.degrees(turn))
+        lacks.append(f"{degrees:g} degrees are more than the {most:.0f} that the servo manages")
     if lacks:
         return Reachability(False, count, f"ties poses, not driven: {'; '.join(lacks)}")
     return Reachability(True, count, f"can be driven: {count} landmarks stay in view")
@@ -109,6 +110,11 @@ def left(
         if mask is not None:
             out = out[~mask[out[:, side]]]
     return out
+
+
+def _above(number: float) -> float:
+    """With one decimal, rounded up, so that what is above its limit is not said to be as much."""
+    return math.ceil(10.0 * number) / 10.0
 
 
 def least_in_view(shared: NDArray[np.int64], a: Node, b: Node, a_from_b: Pose2, stops: int = 9) -> int:

@@ -33,7 +33,9 @@ def node_of_goal(goal: str, map_id: MapId, places: Places) -> NodeId:
         try:
             node = NodeId.parse(goal)
         except InvalidValue:
-            raise InvalidValue(f"goal {goal!r}{places.alike(goal)}: {FORMS}") from None
+            raise InvalidValue(
+                f"goal {goal!r} is no place of this map{places.alike(goal)}: {FORMS}"
+            ) from None
         if node.map == map_id and not router.closed_goal(node):
             return node  # the robot knows best
     else:

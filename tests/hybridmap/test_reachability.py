@@ -111,6 +111,16 @@ def test_landmarks_without_depth_count_by_being_at_both_ends() -> None:
     assert least_in_view(edge.shared, bare(a), bare(b), edge.a_from_b.mean) == len(edge.shared)
 
 
+def test_what_is_a_little_too_far_is_not_said_to_be_as_far_as_the_servo_manages() -> None:
+    """Before: 45 degrees are more than the 45 that the servo manages."""
+    rng = np.random.default_rng(2)
+    said = reachability_of(
+        *pair(Pose2(FARTHEST + 0.001, 0.0, math.radians(45.04)), wall(60, rng, x=6.0), rng)
+    ).reason
+    assert "45.1 degrees are more than the 45 that" in said
+    assert f"{FARTHEST + 0.1:.1f} m are more than the {FARTHEST:g} m that" in said
+
+
 def test_closed_edges_of_a_map() -> None:
     rng = np.random.default_rng(4)
     edge, a, b = pair(Pose2(0.4), wall(60, rng), rng)

@@ -62,7 +62,7 @@ def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
     ("goal", "reason"),
     [
         ("r9.1.1", "goal r9.1.1 is not in the merged map: there is no map r9.1; known are: "),
-        ("kitchen", "goal 'kitchen': give a node"),
+        ("kitchen", "goal 'kitchen' is no place of this map: give a node"),
         ("1,2,3", "give a node"),
         ("1e400,0", "give a node"),
         ("50,50", "nothing is mapped within 2 m of 50,50: the nearest node is r0.1"),

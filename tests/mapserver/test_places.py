@@ -69,10 +69,12 @@ def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house:
         house.stop_server()
         house.start_server()
         eventually(lambda: house.entry("r0").status is not None or link.report(link_status(), 3))
-    with pytest.raises(InvalidValue, match=r"goal 'kitchn' \(is it kitchen\?\): give a node"):
+    with pytest.raises(
+        InvalidValue, match=r"'kitchn' is no place of this map \(is it kitchen\?\): give a node"
+    ):
         person.go("r0", "kitchn")
     person.withdraw("place", "kitchen")
-    with pytest.raises(InvalidValue, match="goal 'kitchen': give a node"):
+    with pytest.raises(InvalidValue, match="goal 'kitchen' is no place of this map: give a node"):
         person.go("r0", "kitchen")
     with pytest.raises(InvalidValue, match="there is no place kitchen"):
         person.withdraw("place", "kitchen")
