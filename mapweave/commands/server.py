@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import gc
 import logging
+import os
 import sys
+import threading
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -163,7 +165,9 @@ def run(arguments: argparse.Namespace) -> int:
         server = MapServer(bus, keys, arguments.store or path, name, how, schedule, base, data)
         if base is not None:
             print(stamped(f"with {base}"), flush=True)
+        started = end_if_stopped_before(stop)
         stack.enter_context(server)
+        started.set()
         if web is not None:
             loading.take(server)
             stack.callback(lambda: write_shown(shown, web.shown()))
@@ -189,3 +193,23 @@ def run(arguments: argparse.Namespace) -> int:
                 print(stamped(now), flush=True)
                 last_line = now
     return 0
+
+
+def end_if_stopped_before(stop: threading.Event) -> threading.Event:
+    """End the process on this event as long as the returned one is not set.
+
+    A server reads its store at the start, which takes a minute for 100 000 places. Nothing is lost: what it
+    writes meanwhile can be made again, and is written in transactions or whole files.
+    """
+    started = threading.Event()
+
+    def wait() -> None:
+        stop.wait()
+        if not started.is_set():
+            from mapweave.terminal import stamped
+
+            print(stamped("stopped while it was starting"), flush=True)
+            os._exit(0)
+
+    threading.Thread(target=wait, name="start", daemon=True).start()
+    return started

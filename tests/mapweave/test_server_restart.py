@@ -86,3 +86,33 @@ def test_the_page_shows_the_map_of_before_while_the_server_loads(tmp_path: Path)
     kept.write_bytes(kept.read_bytes()[:-5])
     with server(http, *data):
         assert first_messages(http)["state"]["server"]["summary"] == LOADING, "what was kept is damaged"
+
+
+SLOW_START = """
+import sys, time
+from mapweave.cli import main
+from mapweave.mapserver.server import MapServer
+
+def read_a_large_store(server):
+    print("reading", flush=True)
+    time.sleep(600.0)
+
+MapServer.__enter__ = read_a_large_store
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_server_that_reads_its_store_can_be_stopped(tmp_path: Path) -> None:
+    command = [
+        sys.executable, "-c", SLOW_START, "server", "--data", str(tmp_path), "--listen",
+        f"tcp/127.0.0.1:{free_port()}",
+    ]  # fmt: skip
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=dict(os.environ), text=True) as running:
+        assert running.stdout is not None
+        try:
+            assert any("reading" in line for line in running.stdout)
+            running.send_signal(signal.SIGTERM)
+            assert "stopped while it was starting" in running.stdout.read()
+            assert running.wait(60) == 0
+        finally:
+            running.kill()
