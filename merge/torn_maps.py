@@ -30,10 +30,12 @@ MOST_NODES = 100
 """Nodes of a map that are tested, evenly chosen."""
 Excluded = dict[tuple[int, int], dict[str, list[Link]]]
 """Refused links from one component to another, by the robot at their far end."""
+Behind = tuple[HybridMap | PoseGraph, ...]
+"""What a finding rests on besides the links, compared by identity."""
 
 
 class TornMapSearch:
-    """Finds torn maps in merged maps. What was found of links that did not change is kept."""
+    """Finds torn maps in merged maps. What was found of links and components that did not change is kept."""
 
     def __init__(self, consistency: ConsistencySettings) -> None:
         """Nothing is known yet.
@@ -42,20 +44,21 @@ class TornMapSearch:
             consistency: when links agree.
         """
         self._s = consistency
-        self._known: dict[frozenset[Pair], tuple[tuple[HybridMap, ...], bool]] = {}
+        self._known: dict[frozenset[Pair], tuple[Behind, bool]] = {}
 
     def torn(self, merged: MergedMap) -> dict[MapId, str]:
         """The torn maps of a merged map, and what they contradict, in words."""
         out: dict[MapId, str] = {}
-        known = {}
+        known: dict[frozenset[Pair], tuple[Behind, bool]] = {}
         for (alone, joined), by_robot in _excluded(merged).items():
             links = _thinned([link for some in by_robot.values() for link in some])
             placed, fixed = merged.graphs[alone], merged.graphs[joined]
             key = frozenset(link.key for link in links)
-            maps = tuple(merged.maps[map_id] for map_id in sorted(placed.maps))
+            # Links agree by both components: also by where the others have the nodes at the far ends.
+            behind: Behind = (placed, fixed, *(merged.maps[map_id] for map_id in sorted(placed.maps)))
             before = self._known.get(key)
-            if before is None or any(a is not b for a, b in zip(before[0], maps, strict=True)):
-                before = maps, self._is_torn(links, placed, fixed, merged)
+            if before is None or [*map(id, before[0])] != [*map(id, behind)]:
+                before = behind, self._is_torn(links, placed, fixed, merged)
             known[key] = before
             if before[1]:
                 *most, last = sorted(by_robot)

@@ -232,9 +232,10 @@ def _in_turns(maps: Sequence[MapId]) -> list[MapId]:
 
 
 def thinned(links: Sequence[Link]) -> list[Link]:
-    """At most `MOST_LINKS` of them."""
-    chosen = np.unique(np.linspace(0, len(links) - 1, MOST_LINKS).round().astype(np.int64))
-    return [links[int(k)] for k in chosen]
+    """At most `MOST_LINKS` of them, in the order of ids: the order in which they were found has no effect."""
+    ordered = sorted(links, key=lambda link: link.key)
+    chosen = np.unique(np.linspace(0, len(ordered) - 1, MOST_LINKS).round().astype(np.int64))
+    return [ordered[int(k)] for k in chosen]
 
 
 def link_sets(

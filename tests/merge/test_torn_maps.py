@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
-from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.merging import merge_maps
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.links import RefusedLink, refuse
-from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.merge.torn_maps import TornMapSearch
 from mapweave.scenarios.liar.lies import Setting, altered, altered_places, bodies, chain
@@ -91,6 +95,27 @@ def test_what_did_not_change_is_not_tested_again(fleet: Fleet, monkeypatch: pyte
     # Its robot has put a node again.
     maps = {**merged.maps, ODD: HybridMap(merged.maps[ODD].contents())}
     assert not search.torn(replace(merged, maps=maps)) and tested
+    # The others have moved.
+    assert search.torn(merged) == {} and len(tested) == 2
+    graphs = tuple(copy(graph) if len(graph.maps) > 1 else graph for graph in merged.graphs)
+    assert not search.torn(replace(merged, graphs=graphs, poses=Poses(graphs))) and len(tested) == 3
+
+
+@pytest.mark.slow
+def test_a_second_map_of_its_robot_that_joins_it_is_no_defect(fleet: Fleet) -> None:
+    """The same links are refused, of two maps instead of one. Before, the whole merge failed."""
+    merged, search = beside_copies(fleet, TORN, ("r0", "r1")), TornMapSearch(ConsistencySettings())
+    alone = next(graph for graph in merged.graphs if graph.maps == {ODD})
+    assert search.torn(merged)
+    more = MapId(ODD.agent, ODD.epoch + 1)
+    node = replace(merged.maps[ODD].nodes[alone.nodes[0]], id=NodeId(*more, 1))
+    both = solve_graph(alone.nodes[0], alone.pose(alone.nodes[0]), [
+        *(Measurement(edge.a, edge.b, edge.a_from_b) for edge in merged.maps[ODD].edges.values()),
+        Measurement(alone.nodes[0], node.id, PoseGaussian(Pose2(0.1, 0.0, 0.0), 1e-4 * np.eye(3))),
+    ])  # fmt: skip
+    graphs = tuple(both if graph is alone else graph for graph in merged.graphs)
+    maps = {**merged.maps, more: HybridMap([NodePut(node)])}
+    assert search.torn(replace(merged, maps=maps, graphs=graphs, poses=Poses(graphs))).keys() == {ODD, more}
 
 
 @pytest.mark.slow

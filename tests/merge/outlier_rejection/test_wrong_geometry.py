@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from random import Random
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, NodePut
@@ -109,6 +112,22 @@ def test_no_robot_alone_makes_maps_of_others_seem_wrong(count: int) -> None:
     assert finder.wrong(maps, links.__getitem__, links.keys()).keys() == set(ids[:-2])
     # Of two robots that contradict each other neither is wrong.
     assert not finder.wrong(maps, links.__getitem__, (), [ids[-1]])
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.randoms(use_true_random=False))
+def test_the_order_in_which_links_were_found_changes_nothing(random: Random) -> None:
+    """Of more links than are tested, those were tested that came at certain turns."""
+    maps = {MapId(agent, 1): corridor(agent) for agent in "ab"}
+    maps[MapId("c", 1)] = corridor("c", 1.0, 2.0, 12)
+    ids = sorted(maps)
+    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    shuffled = {pair: random.sample(some, len(some)) for pair, some in links.items()}
+    first, second = (WrongGeometrySearch(ConsistencySettings()) for _ in range(2))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wrong_geometry, "MOST_LINKS", 5)
+        wrong = first.wrong(maps, links.__getitem__, links.keys())
+        assert second.wrong(maps, shuffled.__getitem__, links.keys()) == wrong
 
 
 def test_a_map_that_was_left_out_when_its_links_came_is_searched_once_it_is_used() -> None:
