@@ -232,9 +232,11 @@ def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices) -
             )
             eventually(lambda: served.connections == 1)
             eventually(lambda: served.connections == 0)
+    # The time limits of requests have nothing to do with a viewer. It must answer within a stall, which on a
+    # busy machine takes longer than half a second.
+    with Web(("127.0.0.1", 0), services, limits=Limits(head=0.5, whole=0.5)) as served:
         services.holds["summary"] = "short"
         with viewer(served) as watching:
-            # The time limits of requests have nothing to do with it.
             for k in range(3):
                 services.holds["summary"] = f"look {k}"
                 eventually(lambda k=k: watching.until("state")["server"]["summary"] == f"look {k}")
@@ -290,13 +292,18 @@ def test_a_slow_viewer_gets_the_newest_state(services: StubServices, monkeypatch
         while looks < 40:
             await asyncio.sleep(0.005)
         before = looks
-        for _ in range(2):
+
+        def states() -> list[int]:
+            return [int(one["server"]["summary"]) for one in slow.taken if one["kind"] == "state"]
+
+        # The links' probabilities may come in between.
+        while not states() or states()[-1] < before:
+            taken = len(slow.taken)
             slow.free.release()
-        while len(slow.taken) < 5:
-            await asyncio.sleep(0.005)
-        states = [int(one["server"]["summary"]) for one in slow.taken if one["kind"] == "state"]
+            while len(slow.taken) == taken:
+                await asyncio.sleep(0.005)
         # One message was on its way already; the next one is of now, and nothing between was kept.
-        assert states[-1] >= before and len(states) <= 3
+        assert len(states()) <= 3
         slow.gone.set()
         await asyncio.wait_for(serving, 5.0)
 
