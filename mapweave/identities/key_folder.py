@@ -335,9 +335,18 @@ class KeyFolder:
             own: the key that the router has, if not that of the folder.
 
         Raises:
-            InvalidValue, SettingsError: the server's key is not here, or cannot be read.
+            InvalidValue, SettingsError: the server's key is not here, is of another role, or cannot be read.
         """
-        catalogue = self.catalogue
+        catalogue, known = self.catalogue, self.find(server)
+        add = f"mapweave keys add {server} --role {Role.SERVER}"
+        if own is None and known is None:
+            raise InvalidValue(f"{server} has no key here; make one with `{add}`")
+        if known is not None and known.role is not Role.SERVER:
+            # Other routers and robots would take nothing from it, and no one would see why.
+            raise InvalidValue(
+                f"the key of {server} is that of a {known.role}, and a map server needs one of its own role: "
+                f"`mapweave keys revoke {server}`, then `{add}`, or another --name"
+            )
         good = [Member(one.name, one.role, one.subject) for one in catalogue.identities if not one.revoked]
         bad = [pair for one in catalogue.identities for pair in one.void]
         passwords = str(self.path / PASSWORDS) if self.profile is Profile.LAB else ""

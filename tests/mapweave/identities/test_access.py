@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from mapweave.commands.network import server_settings
-from mapweave.hybridmap.errors import SettingsError
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.node import MapId
 from mapweave.identities.authority import Authority
 from mapweave.identities.key_file import read_key_file
@@ -400,6 +400,21 @@ def test_a_server_that_listens_is_a_router() -> None:
     listens, joins = ("tcp/127.0.0.1:7448",), ("tcp/127.0.0.1:7447",)
     settings, _ = server_settings(NetworkSettings(endpoints=listens, routers=joins), "s0")
     assert (settings.mode, settings.listen, settings.routers) == ("router", listens, joins)
+
+
+def test_a_map_server_needs_the_key_of_one(tmp_path: Path) -> None:
+    """Before, one with a robot's key started, and nobody took anything from it."""
+    folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0", 7447)
+    with pytest.raises(
+        InvalidValue, match="s1 has no key here; make one with `mapweave keys add s1 --role server`"
+    ):
+        folder.router("s1")
+    folder.add("s1", Role.ROBOT)
+    with pytest.raises(InvalidValue, match="the key of s1 is that of a robot, and a map server needs"):
+        folder.router("s1")
+    folder.revoke("s1")
+    folder.add("s1", Role.SERVER)
+    assert folder.router("s1").mode == "router"
 
 
 def test_routers_with_passwords_do_not_join(tmp_path: Path) -> None:
