@@ -60,17 +60,25 @@ def _joined(address: str) -> Any:
     """Ray, as a driver in the cluster.
 
     Raises:
-        ConnectionError: there is no cluster.
+        ConnectionError: there is no cluster, or it does not let this server in.
     """
     if address != "auto" and not _listens(address):
         raise ConnectionError(f"nothing listens at {address}")
     import ray
 
     how: dict[str, Any] = {"namespace": "mapweave", "log_to_driver": False, "logging_level": "error"}
-    if address != "auto":
-        ray.init(address=address, **how)
-    elif running := _running():
-        ray.init(address=running, **how)
+    if running := address if address != "auto" else _running():
+        try:
+            ray.init(address=running, **how)
+        except ConnectionError as error:
+            # Ray says nothing else when a cluster asks for a token.
+            token = os.environ.get("RAY_AUTH_MODE") == "token"
+            hint = (
+                ""
+                if token
+                else "; if the cluster asks for a token, start the server with RAY_AUTH_MODE=token"
+            )
+            raise ConnectionError(f"{_words(error)}{hint}") from error
     else:
         ray.init(address="local", include_dashboard=False, _node_ip_address=LOOPBACK, **how)
     return ray

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import socket
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from mapweave.cli import main
 from mapweave.hybridmap.query import Certainty
+from mapweave.mapserver.cluster import gateway_process
 from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.server import MapServer, ServerSettings
 from mapweave.wire.keys import Keys
@@ -30,6 +34,23 @@ def test_the_server_needs_no_cluster(
         answer = server.locate(lambda: room.view(next(iter(room.truth))), 1).result(30.0)
         assert answer.certainty is Certainty.FOUND and not answer.partial
     bus.close()
+
+
+@pytest.mark.parametrize(("mode", "hinted"), [("", True), ("token", False)])
+def test_a_cluster_that_lets_nobody_in_may_want_a_token(
+    monkeypatch: pytest.MonkeyPatch, mode: str, hinted: bool
+) -> None:
+    """Ray itself says only that it could not connect."""
+
+    def init(**_: object) -> None:
+        raise ConnectionError("Failed to connect to Ray cluster")
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
+    monkeypatch.setenv("RAY_AUTH_MODE", mode)
+    with socket.create_server(("127.0.0.1", 0)) as head:
+        with pytest.raises(ConnectionError, match="Failed to connect") as raised:
+            gateway_process._joined(f"127.0.0.1:{head.getsockname()[1]}")
+        assert ("RAY_AUTH_MODE=token" in str(raised.value)) is hinted
 
 
 def test_lock_step_and_a_cluster_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
