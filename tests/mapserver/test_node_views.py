@@ -63,7 +63,7 @@ def views(hub: MemoryHub) -> Iterator[NodeViews]:
 @pytest.fixture
 def robot(hub: MemoryHub, views: NodeViews) -> HandRobot:
     robot = HandRobot(hub)
-    eventually(lambda: views.may_have(NODE))
+    eventually(lambda: not views.why_none(NODE))
     return robot
 
 
@@ -148,7 +148,7 @@ def test_a_robot_that_hangs_holds_up_few_people(
     robot.bus = MemoryBus(robot.hub)
     robot.bus.serve(KEYS.view("r0"), held.append)
     robot.bus.announce(KEYS.view("r0"))
-    eventually(lambda: views.may_have(NODE))
+    eventually(lambda: not views.why_none(NODE))
     with ThreadPoolExecutor(node_views.MOST_ASKED) as people:
         waiting = [people.submit(views.view, NODE) for _ in range(node_views.MOST_ASKED)]
         eventually(lambda: len(held) == node_views.MOST_ASKED)
@@ -174,8 +174,8 @@ def test_why_there_is_none(hub: MemoryHub, views: NodeViews, monkeypatch: pytest
     with pytest.raises(NoView, match="r0 is away, or keeps no views"):
         views.view(NODE)
     robot = HandRobot(hub)
-    eventually(lambda: views.may_have(NODE))
-    assert not views.may_have(OTHER)
+    eventually(lambda: not views.why_none(NODE))
+    assert "r1 is away" in views.why_none(OTHER)
     robot.gives = lambda node: f"r0 has kept no view of {node}"
     with pytest.raises(NoView, match=f"^r0 has kept no view of {NODE}$"):
         views.view(NODE)
@@ -188,6 +188,6 @@ def test_why_there_is_none(hub: MemoryHub, views: NodeViews, monkeypatch: pytest
     monkeypatch.undo()
     seen = views.view(NODE)
     robot.bus.close()
-    eventually(lambda: not views.may_have(NodeId("r0", 1, 2)))
+    eventually(lambda: views.why_none(NodeId("r0", 1, 2)))
     # What was given once is remembered.
-    assert views.may_have(NODE) and views.view(NODE) == seen
+    assert not views.why_none(NODE) and views.view(NODE) == seen
