@@ -10,8 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Container, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
-from mapweave.hybridmap.superseded import Superseded
+from mapweave.hybridmap.node import EdgeKind, MapId
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -81,19 +80,6 @@ def contradict_each_other(merged: MergedMap) -> dict[MapId, str]:
         for some in by_robot.values()
         if len(some) > MOST_FRAGMENTS
         for map_id in some
-    }
-
-
-def rightly_superseded(merged: MergedMap) -> dict[NodeId, Superseded]:
-    """Superseded nodes of a merged map, without those that nodes of other robots' implausible maps supersede.
-
-    A superseded node answers no more and is deleted in the end: no robot takes others' nodes away by a map
-    that cannot be true.
-    """
-    return {
-        node: fate
-        for node, fate in merged.superseded.items()
-        if fate.by.agent == node.agent or fate.by.map not in merged.implausible
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Container, Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.mapserver.plausibility import fragments
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
@@ -55,6 +56,7 @@ class MergePipeline:
         constraints: ManualConstraints,
         pins: Sequence[Pin] = (),
         implausible: Callable[[MergedMap], Mapping[MapId, str]] = lambda merged: {},
+        pruned: Container[MapId] = (),
     ) -> MergedMap:
         """See `Islands.merge`; components are where pins hold them, oldest first.
 
@@ -65,6 +67,7 @@ class MergePipeline:
             constraints: manual constraints.
             pins: hold frames.
             implausible: gives the implausible maps of the merged map.
+            pruned: maps that had more nodes, which newer ones have superseded.
 
         Raises:
             InvalidValue: a node's pose is out of the range of messages.
@@ -75,4 +78,5 @@ class MergePipeline:
             if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():
                 raise InvalidValue(f"nodes joined with {graph.anchor} lie beyond {MAX_POSITION:g} m")
         merged = replace(merged, implausible=implausible(merged))
-        return self._remover.fade(self._superseder.renewed(merged))
+        unsure = {*merged.implausible, *fragments(maps, pruned)}
+        return self._remover.fade(self._superseder.renewed(merged, unsure))

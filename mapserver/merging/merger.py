@@ -22,7 +22,6 @@ from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, NodeComparisons, compare
 from mapweave.mapserver.merging.pruning import PrunePlan, Pruning
 from mapweave.mapserver.merging.verification_cache import VerificationCache
-from mapweave.mapserver.plausibility import rightly_superseded
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
@@ -44,7 +43,8 @@ class Merger:
 
     A new node is compared with its best candidates when it comes; the merged map is made when it is requested
     and something has changed, and then only where it has. New nodes are not compared with nodes superseded on
-    another day. Except for that the result depends on the maps, not on the order of changes.
+    another day, and which of two nodes of one place supersedes the other depends on what was superseded
+    before. Except for that the result depends on the maps, not on the order of changes.
     """
 
     def __init__(
@@ -257,8 +257,9 @@ class Merger:
         use: Callable[[MergedMap], object] | None,
     ) -> MergedMap:
         kept = {map_id: self._kept[map_id] for map_id in maps}
-        odd = partial(self._implausible.of, pruned=self.pruning.pruned.maps)
-        merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins, odd)
+        pruned = self.pruning.pruned.maps
+        odd = partial(self._implausible.of, pruned=pruned)
+        merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins, odd, pruned)
         merged = replace(
             merged,
             set_apart=self._set_apart(),
@@ -266,7 +267,6 @@ class Merger:
             wrong=self._wrong,
             pruned=self.pruning.pruned,
         )
-        merged = replace(merged, superseded=rightly_superseded(merged))
         if use is not None:
             use(merged)
         return merged

@@ -13,17 +13,20 @@ Views from next to a wall show what no other view does, and every drive adds som
 views surround is superseded whatever they show.
 
 Superseded nodes keep their poses and edges, and become active again if their successor is removed.
+
+Nodes of maps that may not be right supersede none of other robots' nodes, and are not asked about the ways of
+these: a superseded node answers no more, and is deleted in the end.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from dataclasses import replace
 
 import numpy as np
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.hybridmap.reachability import FARTHEST, WIDEST
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
@@ -71,31 +74,36 @@ class NodeSuperseder:
         self._graphs: tuple[PoseGraph, ...] = ()
         self._foreign = ForeignEdges()
         self._blocking: dict[NodeId, NodeId] = {}
+        self._unsure: Set[MapId] = frozenset()
 
-    def renewed(self, merged: MergedMap) -> MergedMap:
+    def renewed(self, merged: MergedMap, unsure: Set[MapId] = frozenset()) -> MergedMap:
         """The same map with the nodes that are superseded.
 
         Args:
             merged: the next merged map of the same fleet.
+            unsure: maps that may not be right: their nodes and those of other robots do not supersede each
+                other.
         """
-        nodes = self._changed(merged)
+        differ, self._unsure = self._unsure ^ unsure, unsure
+        nodes = self._changed(merged, differ)
         changed = {node for node, content in nodes.items() if self._nodes_seen.get(node) is not content}
         self._nodes_seen |= nodes
         fresh = {node for link in self._links.follow(merged.links) for node in link.pair}
-        fresh = changed | fresh & nodes.keys()
+        fresh = changed | fresh & nodes.keys() | {node for node in nodes if node.map in differ}
         # A node that was written again is judged again, with those that it covers.
         for node, successor in tuple(self._superseded.items()):
             if (
                 node not in self._nodes_seen
                 or successor.by not in self._nodes_seen
                 or {node, successor.by} & changed
+                or _apart(node, successor.by, unsure)
             ):
                 del self._superseded[node]
                 fresh |= {node} & nodes.keys()
         if nodes:
             foreign = self._foreign.of(merged.maps)
             traversability = Traversability(
-                merged, self._links, self._reaches, NEAR, foreign, self._superseded
+                merged, self._links, self._reaches, NEAR, foreign, self._superseded, unsure
             )
             round_ = _Round(
                 merged,
@@ -105,12 +113,15 @@ class NodeSuperseder:
                 self._blocking,
                 traversability,
                 self._comparisons,
+                unsure,
             )
             round_.update(fresh | round_.reinstate())
         return replace(merged, superseded=dict(sorted(self._superseded.items())))
 
-    def _changed(self, merged: MergedMap) -> dict[NodeId, Node]:
-        """Nodes of components that were solved again; removed nodes are forgotten."""
+    def _changed(self, merged: MergedMap, differ: Set[MapId]) -> dict[NodeId, Node]:
+        """Nodes of components that were solved again, or with maps that became unsure, or sure; removed nodes
+        are forgotten.
+        """
         solved = {id(graph) for graph in self._graphs}
         remaining = {id(graph) for graph in merged.graphs}
         gone = {
@@ -130,7 +141,7 @@ class NodeSuperseder:
         return {
             node: merged.maps[node.map].nodes[node]
             for graph in merged.graphs
-            if id(graph) not in solved
+            if id(graph) not in solved or not graph.maps.isdisjoint(differ)
             for node in graph.nodes
         }
 
@@ -153,9 +164,10 @@ class _Round:
         blocking: dict[NodeId, NodeId],
         traversability: Traversability,
         comparisons: Comparisons,
+        unsure: Set[MapId],
     ) -> None:
         self._merged, self._nodes, self._superseded, self._blocking = merged, nodes, superseded, blocking
-        self._comparisons = comparisons
+        self._comparisons, self._unsure = comparisons, unsure
         self._links = links
         self._refused = {refusal.pair for refusal in merged.refused if refusal.edge is None}
         self._covered: dict[NodeId, set[NodeId]] = {}
@@ -261,9 +273,12 @@ class _Round:
         return Superseded(successor, 0, between.distance(Pose2()), abs(between.heading))
 
     def _neighbours(self, node: NodeId) -> list[tuple[NodeId, Pose2]]:
-        """Nodes within the basin, active or not, with relative poses; the most similar first."""
+        """Nodes within the basin that may supersede a node, or that it may, active or not, with relative
+        poses; the most similar first.
+        """
         if node not in self._basins:
             around = self._traversability.around(node, FARTHEST, with_removed=True)
+            around = [other for other in around if not _apart(node, other, self._unsure)]
             between = self._traversability.stances(node, around)
             distances, turns = np.hypot(between[:, 0], between[:, 1]), np.abs(between[:, 2])
             order = np.argsort(distances / FARTHEST + turns / WIDEST, kind="stable")
@@ -305,6 +320,11 @@ class _Round:
 
     def _between(self, a: NodeId, b: NodeId) -> Pose2:
         return self._merged.pose(a).inverse() @ self._merged.pose(b)
+
+
+def _apart(a: NodeId, b: NodeId, unsure: Set[MapId]) -> bool:
+    """Whether two nodes are of different robots, and the map of one of them may not be right."""
+    return a.agent != b.agent and (a.map in unsure or b.map in unsure)
 
 
 def _distance2(off: Array, spread: Array) -> float:

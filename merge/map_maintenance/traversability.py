@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +37,7 @@ class Traversability:
         same_place: float,
         foreign: Iterable[Edge] = (),
         without: Iterable[NodeId] = (),
+        unsure: Container[MapId] = (),
     ) -> None:
         """Take a merged map.
 
@@ -46,9 +48,10 @@ class Traversability:
             same_place: m, nodes nearer than this to each other are at one place.
             foreign: edges that lead out of their own maps, see `ForeignEdges`.
             without: nodes that are left out from the start.
+            unsure: maps that may not be right: no other robot's node is spared for ways over their nodes.
         """
         self._merged, self._reachability, self._same_place = merged, reaches, same_place
-        self._removed = set(without)
+        self._removed, self._unsure = set(without), unsure
         self._trees: dict[NodeId, cKDTree] = {}
         self._ways: dict[NodeId, dict[NodeId, float]] = {}
         self._foreign: dict[NodeId, list[Edge]] = {}
@@ -110,21 +113,22 @@ class Traversability:
         limits = {
             neighbour: length + to_successor + detour
             for neighbour, length in own.items()
-            if neighbour != successor and neighbour not in self._removed
+            if neighbour != successor and self._counts(neighbour, node)
         }
-        return not limits or reaches(successor, node, limits, self._open_ways)
+        return not limits or reaches(successor, node, limits, partial(self._open_ways, node))
 
     def within(self, node: NodeId, reach: float) -> set[NodeId]:
         """Nodes that are left and that are reached from a node by ways of some length at most, m."""
-        return within(node, reach, self._open_ways)
+        return within(node, reach, partial(self._open_ways, node))
 
-    def _open_ways(self, node: NodeId) -> dict[NodeId, float]:
-        """Neighbours that are left, with the distance, m."""
-        return {
-            neighbour: step
-            for neighbour, step in self._ways_of(node).items()
-            if neighbour not in self._removed
-        }
+    def _open_ways(self, asked: NodeId, node: NodeId) -> dict[NodeId, float]:
+        """Neighbours that count for the node that is asked about, with the distance, m."""
+        ways = self._ways_of(node).items()
+        return {neighbour: step for neighbour, step in ways if self._counts(neighbour, asked)}
+
+    def _counts(self, node: NodeId, asked: NodeId) -> bool:
+        """Whether a node is left, and is sure or of the robot whose node is asked about."""
+        return node not in self._removed and (node.agent == asked.agent or node.map not in self._unsure)
 
     def _ways_of(self, node: NodeId) -> dict[NodeId, float]:
         """Neighbours, also those that were left out, with the distance, m."""

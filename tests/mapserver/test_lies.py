@@ -376,22 +376,26 @@ def test_a_robot_that_parks_where_another_one_has_mapped_has_copied_nothing() ->
     assert not found.maps(frozenset())
 
 
-def test_an_implausible_map_supersedes_no_nodes_of_others() -> None:
+def test_maps_that_may_not_be_right_supersede_no_nodes_of_others() -> None:
     """They would answer no more, and be deleted after two weeks."""
-    true = [body for body in views(LAST, Pose2(), STEP) if isinstance(body, NodePut)]
+    true = [body.node for body in views(LAST, Pose2(), STEP) if isinstance(body, NodePut)]
     superseded: dict[str, dict[NodeId, NodeId]] = {}
-    for clock in ("", "utc"):
+    for lie in ("", "clock", "fragments", "silence"):
         merger = Merger()
         for log in sound_logs().values():
             for message in log:
                 merger.on_change(decode_change(message))
-        for k, body in enumerate(true, start=1):
+        nodes = true * (MOST_FRAGMENTS if lie == "fragments" else lie != "silence")
+        for k, node in enumerate(nodes, start=1):
             # Later than all others; the clock runs backwards, if there is one.
-            stamp_ns = 10**15 - k * 10**9 if clock else 10**15 + k * 10**9
-            put = NodePut(replace(body.node, stamp_ns=stamp_ns, clock=clock))
-            merger.on_change(Change(LAST, k, stamp_ns, put))
+            stamp_ns = 10**15 - k * 10**9 if lie == "clock" else 10**15 + k * 10**9
+            epoch = k if lie == "fragments" else LAST.epoch
+            new = replace(node, id=NodeId(LAST.agent, epoch, node.id.number), stamp_ns=stamp_ns)
+            new = replace(new, clock="utc" if lie == "clock" else "")
+            merger.on_change(Change(new.id.map, k, stamp_ns, NodePut(new)))
         merged = merger.merged()
-        assert (LAST in merged.implausible) is bool(clock)
-        superseded[clock] = {node: fate.by for node, fate in merged.superseded.items() if node.map != LAST}
+        assert (LAST in merged.implausible) is (lie in ("clock", "fragments"))
+        others = {node: fate.by for node, fate in merged.superseded.items() if node.agent != LAST.agent}
+        superseded[lie] = others
     assert any(by.map == LAST for by in superseded[""].values()), "an honest robot's newer nodes do"
-    assert not any(by.map == LAST for by in superseded["utc"].values())
+    assert superseded["clock"] == superseded["fragments"] == superseded["silence"]
