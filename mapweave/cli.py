@@ -44,6 +44,7 @@ from mapweave.commands import (
 )
 from mapweave.commands.examples import add_examples
 from mapweave.commands.usage import UsageError
+from mapweave.early_interrupt import remember
 from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA, NO, USAGE
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError, Refused
@@ -125,6 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         See `mapweave.exit_status`; argparse itself exits with 2 on a wrong command line.
     """
+    remember()
     # FAISS reads this when it is imported. On a busy machine its threads spin while they wait for each other:
     # a search by two of them took three times the processor time of a search by one, and longer.
     os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -177,9 +177,10 @@ class RemoteRobot:
             now = time.monotonic()
             if now >= end:
                 raise DeviceError(f"{key}: {reason} for {self._patience:g} s; {START if gone else WAITS}")
-            if now - begin >= ASK_TIMEOUT and self._description is not None:
+            if now - begin >= ASK_TIMEOUT:
                 if not reported:
-                    log.warning("%s: %s; the agent waits up to %g s", key, _cause(gone), self._patience)
+                    why = f"no answer yet; {START}" if self._description is None else _cause(gone)
+                    log.warning("%s: %s; the agent waits up to %g s", key, why, self._patience)
                     reported = True
                 if gone and after_restart is not None:
                     payload = after_restart

@@ -226,6 +226,7 @@ def stop_on_signals() -> threading.Event:
 
     A process that `nohup` has started outlasts its terminal, and so does a job that its shell has disowned.
     """
+    from mapweave import early_interrupt
     from mapweave.lost_terminal import outlast_terminal
     from mapweave.processes import parent_watchdog
 
@@ -252,4 +253,6 @@ def stop_on_signals() -> threading.Event:
         signal.signal(number, lambda signum, _: came.put(signum))
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         signal.signal(signal.SIGHUP, hang_up)
+    if early_interrupt.came():
+        stop.set()
     return stop

@@ -124,8 +124,7 @@ def _end_log(rerun: RerunLog, say: Callable[[str], None], name: str) -> None:
 
 def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> RobotDescription:
     """Description of the robot; a long wait for it is reported."""
-    advice = "switch it on; in the simulator: `mapweave sim serve`; or name its driver (--settings, --robot)"
-    patience = threading.Timer(SILENCE, print_line, [f"{name}: waits for its robot: {advice}"])
+    patience = threading.Timer(SILENCE, print_line, [f"{name}: waits for its robot"])
     patience.daemon = True
     patience.start()
     try:

@@ -109,7 +109,8 @@ def test_an_agent_interrupted_before_its_base_answers_reports_it(closed, tmp_pat
         watchdog.cancel()
     *before, last = output.splitlines()
     assert last.endswith("robot/r0/describe: stopped before its base has answered")
-    assert all("waits for its robot" in line or "finds no router" in line for line in before)
+    known = ("waits for its robot", "finds no router", "no answer yet; start the robot's base")
+    assert all(any(words in line for words in known) for line in before)
     assert process.returncode == 1
 
 
@@ -157,6 +158,26 @@ def test_a_router_that_lets_no_one_in_without_a_key_is_no_missing_router(tmp_pat
             watchdog.cancel()
     assert f"r0 finds no router at {endpoint}: what listens there does not let this in" in said
     assert "--keys FILE" in said and "start `mapweave server`" not in said
+
+
+def test_an_interrupt_that_a_library_swallows_stops_a_process():
+    """While a library in C was imported, Ctrl-C was lost, and the simulator went on."""
+    program = """
+import signal
+from mapweave import early_interrupt
+from mapweave.commands.network import stop_on_signals
+early_interrupt.remember()
+assert not early_interrupt.came()
+try:
+    signal.raise_signal(signal.SIGINT)
+except BaseException as error:
+    print(type(error).__name__)
+print(stop_on_signals().wait(0.0))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.split() == ["KeyboardInterrupt", "True"]
 
 
 def test_a_signal_amid_another_stops_a_process():
