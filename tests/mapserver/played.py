@@ -74,8 +74,15 @@ class HandAgent:
 class Server:
     """An ingest with its store, which can be restarted."""
 
-    def __init__(self, hub: MemoryHub, path: Path, name: str = "s0", quotas: Quotas | None = None) -> None:
-        self.hub, self.path, self.name, self.quotas = hub, path, name, quotas
+    def __init__(
+        self,
+        hub: MemoryHub,
+        path: Path,
+        name: str = "s0",
+        quotas: Quotas | None = None,
+        settings: IngestSettings = QUICK,
+    ) -> None:
+        self.hub, self.path, self.name, self.quotas, self.settings = hub, path, name, quotas, settings
         self.seen: list[Change] = []
         self.retired: set[MapId] = set()
         self.on_change: Callable[[Change], None] = self.seen.append
@@ -85,8 +92,8 @@ class Server:
         self.bus = MemoryBus(self.hub)
         self.store = SqliteStore(self.path)
         self.ingest = Ingest(
-            self.bus, KEYS, self.store, self.name, lambda c: self.on_change(c), QUICK, quotas=self.quotas,
-            retired=lambda: self.retired,
+            self.bus, KEYS, self.store, self.name, lambda c: self.on_change(c), self.settings,
+            quotas=self.quotas, retired=lambda: self.retired,
         )  # fmt: skip
 
     def end(self) -> None:

@@ -33,7 +33,7 @@ class EvenBase:
     geometry = Geometry(radius=0.1, axle=0.25, max_forward=0.3, max_turn=0.8)
 
     def __init__(self) -> None:
-        self.failing = self.broken = False
+        self.failing = self.broken = self.stamped = False
         self.touches = self.reads = 0
         self.answers = threading.Event()
         self.answers.set()
@@ -62,7 +62,9 @@ class EvenBase:
         self.answers.wait()
         self.reads += 1
         touched, self.touches = self.touches > 0, max(self.touches - 1, 0)
-        return BaseReading(self.way(now_ns()), bumped=touched, kidnapped=touched)
+        now = now_ns()
+        stamp = now if self.stamped else None
+        return BaseReading(self.way(now), stamp_ns=stamp, bumped=touched, kidnapped=touched)
 
 
 class LateCamera:
@@ -105,16 +107,33 @@ def robot(base: EvenBase, camera: LateCamera) -> Iterator[CheckedRobot]:
     robot.close()
 
 
-def test_odometry_is_that_of_the_time_between_the_images(robot: CheckedRobot) -> None:
+def test_odometry_is_that_of_the_time_between_the_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wheels' way is that of the middle of the base's answer. Time passes with its answers alone."""
+    passed = [10**15]
+
+    class Answers(EvenBase):
+        def read(self) -> BaseReading:
+            half = 5_000_000 if self.reads % 2 else 25_000_000
+            passed[0] += half
+            reading = super().read()
+            passed[0] += half
+            return reading
+
+    for module in (wheeled, sys.modules[__name__]):
+        monkeypatch.setattr(module, "now_ns", lambda: passed[0])
+    robot = CheckedRobot(WheeledRobot(Answers(), SETTINGS, LateCamera(0.13)))
+    # Those before are images from before the base has answered first.
+    eventually(lambda: (seen := robot.sense()) is not None and seen.odometry.forward > 0.0)
     first = robot.sense()
     for _ in range(10):
         assert first is not None
         second = robot.sense()
         assert second is not None
         seconds = (second.stamp_ns - first.stamp_ns) / 1e9
-        assert second.odometry.forward == pytest.approx(0.25 * seconds, abs=5e-4)
-        assert second.odometry.turn == pytest.approx(0.1 / 0.25 * seconds, abs=4e-3)
+        assert second.odometry.forward == pytest.approx(0.25 * seconds, abs=1e-6)
+        assert second.odometry.turn == pytest.approx(0.1 / 0.25 * seconds, abs=1e-5)
         first = second
+    robot.close()
 
 
 def test_a_touch_between_two_observations_is_not_lost(robot: CheckedRobot, base: EvenBase) -> None:
@@ -129,7 +148,13 @@ def test_a_touch_between_two_observations_is_not_lost(robot: CheckedRobot, base:
     assert [seen.kidnapped for seen in (quiet, touched, after)] == [False, True, False]
 
 
-def test_ticks_without_image_and_images_after_them(robot: CheckedRobot, camera: LateCamera) -> None:
+def test_ticks_without_image_and_images_after_them(
+    robot: CheckedRobot, base: EvenBase, camera: LateCamera
+) -> None:
+    # Else what a busy machine does between the reading and the clock would count.
+    base.stamped, base.reads = True, 0
+    eventually(lambda: base.reads >= 3)
+    robot.sense()
     seen = [robot.sense() for _ in range(3)]
     camera.silent = True
     seen += [robot.sense() for _ in range(5)]
@@ -148,19 +173,18 @@ def test_ticks_without_image_and_images_after_them(robot: CheckedRobot, camera: 
 def test_neither_image_nor_wheels(robot: CheckedRobot, base: EvenBase, camera: LateCamera) -> None:
     robot.sense()
     camera.silent = base.failing = True
-    begin = time.monotonic()
+    took = []
     for _ in range(6):
+        begin = time.monotonic()
         seen = robot.sense()
+        took.append(time.monotonic() - begin)
         assert seen is not None
-    assert time.monotonic() - begin < 1.6
+    # The median: a busy machine may hold up a single call.
+    assert np.median(took) < 0.26
     assert seen is not None
     assert seen.odometry.forward == 0.0
     camera.silent = base.failing = False
-    time.sleep(0.5)
-    for _ in range(3):
-        seen = robot.sense()
-    assert seen is not None
-    assert seen.image is not None
+    eventually(lambda: (seen := robot.sense()) is not None and seen.image is not None)
 
 
 def test_a_base_that_waits_on_for_an_answer_is_called_silent(
@@ -214,13 +238,13 @@ class Reads(EvenBase):
     ],
 )
 def test_a_base_that_reads_wrongly_from_the_start(
-    read: Callable[[], Any], words: str, camera: LateCamera
+    read: Callable[[], Any], words: str, camera: LateCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # It is not waited for: that would take longer than any test may.
+    monkeypatch.setattr(wheeled, "PATIENCE", 600.0)
     robot = CheckedRobot(WheeledRobot(Reads(read), SETTINGS, camera))
-    begin = time.monotonic()
     with pytest.raises(DeviceError, match=f"^driver: {words}"):
         robot.sense()
-    assert time.monotonic() - begin < 4.0
     robot.close()
 
 
