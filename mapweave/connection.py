@@ -48,6 +48,8 @@ def not_let_in(settings: BusSettings) -> str:
     if not any(map(_listens, settings.endpoints)):
         return ""
     hint = _key_hint(settings.credentials) or "; if the fleet has keys, give a key file (--keys FILE)"
+    if settings.credentials is not None and settings.credentials.certified:
+        hint += "; or the router's certificate is for other names, those of `mapweave keys init --at`"
     return f"what listens there does not let this in{hint}"
 
 

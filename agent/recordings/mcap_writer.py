@@ -139,9 +139,8 @@ class McapWriter:
     def _fail(self, error: Exception) -> None:
         if self._failed:
             return
-        self._failed = (
-            getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
-        )
+        words = " ".join(str(error).split()) or type(error).__name__
+        self._failed = reason_of(error) if isinstance(error, OSError) else words
         self._say(f"{self._folder}: the recording ends here, {self._failed}")
 
     def _next_part(self, stamp_ns: int) -> None:

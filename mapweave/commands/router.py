@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.network import (
     add_log_format,
     add_network,
@@ -26,6 +27,10 @@ def add_to(commands: Any) -> None:
         "map server can be reached. A map server elsewhere joins it with --connect.",
     )
     parser.add_argument(
+        "--name", type=values.name,
+        help="of the server whose key this router has, with --keys (default: `server` of the settings, s0)",
+    )  # fmt: skip
+    parser.add_argument(
         "--print-config", action="store_true",
         help="print the configuration as JSON5 for a zenohd, which takes the same, and end; with --keys it "
         "contains the private key",
@@ -44,7 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     log_with_time(arguments.log_format)
     network = network_of(arguments, settings_of(arguments))
-    settings, keys = router_settings(network, network.server)
+    name = arguments.name or network.server
+    settings, keys = router_settings(network, name)
     if arguments.print_config:
         print(router_file(settings))
         return 0
@@ -54,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     bus = ZenohBus(settings)
     try:
         print(stamped(f"router listens at {', '.join(settings.listen)}"), flush=True)
-        renewal = key_renewal(bus, keys, network.server, settings)
+        renewal = key_renewal(bus, keys, name, settings)
         while not stop.wait(1.0):
             if renewal is not None:
                 renewal.check()

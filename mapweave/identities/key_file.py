@@ -64,6 +64,8 @@ def read_key_file(path: Path) -> KeyFile:
         ) from None
     except OSError as error:
         raise SettingsError(f"{path}: the key file cannot be read: {reason_of(error)}") from None
+    if path.is_dir():
+        raise SettingsError(f"{path}: is a folder; give one of the key files in it, NAME{SUFFIX}")
     try:
         try:
             table = build(_Table, read_toml(path), str(path))

@@ -82,5 +82,5 @@ def test_a_full_disk_ends_the_command(
     out = str(tmp_path / "drive")
     assert main(["record", "r0", "--out", out, "--robot", driver, "--connect", "tcp/127.0.0.1:1"]) == 1
     output = capfd.readouterr()
-    assert output.err.count("the recording ends here, No space left on device") == 1
+    assert output.err.count("the recording ends here, the disk is full; make room") == 1
     assert "r0: at most 0 observations in" in output.out

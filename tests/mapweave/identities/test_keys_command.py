@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import json
 import os
@@ -252,3 +253,19 @@ def test_a_host_is_a_name_or_an_address_without_a_port(
 def test_a_key_that_is_not_there_is_named(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     said = complaint(capfd, "status", "--keys", tmp_path / "r0.key.toml")
     assert "r0.key.toml: no such key file; `mapweave keys add NAME` at the server makes one" in said
+
+
+def test_a_folder_is_no_key_file(keys: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert "is a folder; give one of the key files in it" in complaint(capfd, "status", "--keys", keys)
+
+
+def test_a_second_router_has_a_key_of_its_own(keys: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """On another machine there is no key of the first server."""
+    assert main(["keys", "add", "s1", "--role", "server", "--keys", str(keys)]) == 0
+    (keys / "s0.key.toml").unlink()
+    capfd.readouterr()
+    assert main(["router", "--print-config", "--keys", str(keys), "--name", "s1"]) == 0
+    written = capfd.readouterr().out
+    own = read_key_file(keys / "s1.key.toml").credentials
+    secret = base64.b64encode(own.private_key.encode()).decode() if own.certified else own.password
+    assert secret in written
