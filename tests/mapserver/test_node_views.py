@@ -20,12 +20,12 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.packing import pack
+from synthetic.world import CAMERA
 from tests.mapserver.stub_services import picture, two_maps
 from tests.waiting import eventually
 
 KEYS = Keys("fleet")
 NODE, OTHER = NodeId("r0", 1, 1), NodeId("r1", 1, 1)
-CAMERA = two_maps().maps[NODE.map].nodes[NODE].camera
 JPEG = picture(CAMERA.width, CAMERA.height, ".jpg")
 
 
