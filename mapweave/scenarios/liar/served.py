@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -134,10 +134,11 @@ class Served:
         return bool(replies) and not replies[0].error and bool(decode_record(replies[0].payload))
 
     def named(self, agent: str) -> str:
-        """What the page's timeline says against a robot, by name; empty if it says nothing."""
-        accused = f"map {agent}."
-        words = (event.words for event in self._server.history())
-        return next((one for one in words if one.startswith(accused)), "")
+        """What the page's timeline says against a robot, by name; empty if it says nothing.
+
+        A map that had been joined until then is accused as the reason of the split.
+        """
+        return accusing((event.words for event in self._server.history()), agent)
 
     def in_status(self, agent: str) -> bool:
         """Whether the status of the robots says something against one that is there."""
@@ -190,6 +191,12 @@ class Served:
     def _hear(self, sample: Sample) -> None:
         ack = Ack.decode(sample.payload)
         self._acks[ack.map] = max(ack.watermark, self._acks.get(ack.map, 0))
+
+
+def accusing(words: Iterable[str], agent: str) -> str:
+    """The first words that say something against a map of a robot, from where they do; empty if none do."""
+    accused = f"map {agent}."
+    return next((one[one.index(accused) :] for one in words if accused in one), "")
 
 
 def difference(one: Pose2, other: Pose2, lever: float = 1.0) -> float:

@@ -16,6 +16,7 @@ from mapweave.mapserver.log.entry import Entry
 from mapweave.scenarios.actions import Lie, parse_action
 from mapweave.scenarios.figures import kinds
 from mapweave.scenarios.liar.lies import EVERY, UNDECIDABLE, WAYS, Setting, bodies, honest
+from mapweave.scenarios.liar.served import accusing
 from mapweave.scenarios.liar.trial import Outcome, row
 from mapweave.scenarios.lying import Lies
 from synthetic.world import room, take_map
@@ -96,3 +97,12 @@ def test_the_figures_count_the_ways_that_can_be_found_out() -> None:
     }  # fmt: skip
     assert figures.keys() <= kinds().keys()
     assert "not in the status" in row(second, bad)
+
+
+def test_an_accusation_counts_also_as_the_reason_of_a_split() -> None:
+    """A map that was joined until its geometry was found wrong is accused in no event of its own."""
+    reason = "map r3.1 contradicts r0.1 and r1.1, which agree: its geometry is wrong"
+    split = f"r0.1+r1.1 and r3.1 are no longer one map: 40 links refused ({reason})"
+    assert accusing(["r0.1 and r3.1 are one map now, by 2 links", split], "r3").startswith(reason)
+    assert accusing([reason], "r3") == reason
+    assert not accusing([split, reason], "r0")
