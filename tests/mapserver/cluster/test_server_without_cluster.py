@@ -37,7 +37,7 @@ def test_the_server_needs_no_cluster(
 
 
 @pytest.mark.parametrize(("mode", "hinted"), [("", True), ("token", False)])
-def test_a_cluster_that_lets_nobody_in_may_want_a_token(
+def test_a_cluster_that_refuses_a_server_may_want_a_token(
     monkeypatch: pytest.MonkeyPatch, mode: str, hinted: bool
 ) -> None:
     """Ray itself says only that it could not connect."""

@@ -403,7 +403,7 @@ def test_a_server_that_listens_is_a_router() -> None:
 
 
 def test_a_map_server_needs_the_key_of_one(tmp_path: Path) -> None:
-    """Before, one with a robot's key started, and nobody took anything from it."""
+    """Before, one with a robot's key started, and no robot took anything from it."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0", 7447)
     with pytest.raises(
         InvalidValue, match="s1 has no key here; make one with `mapweave keys add s1 --role server`"
