@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from mapweave.agent.recordings import bag as bags
@@ -24,11 +25,23 @@ def open_recording(path: Path, options: RecordingOptions | None = None) -> Recor
         DeviceError: it is none, or something in it is missing or wrong; one line says what.
     """
     options = options or RecordingOptions()
+    opened = _opener(path)
+    has_height = opened is images_folder and (path / "camera.toml").exists()
+    options.check_used(path, opened is bags.bag, has_height)
+    return opened(path, options)
+
+
+def _opener(path: Path) -> Callable[[Path, RecordingOptions], Recording]:
+    """What opens a recording of this format.
+
+    Raises:
+        DeviceError: it is none.
+    """
     if path.is_file():
         if path.suffix.lower() in bags.SUFFIXES:
-            return bags.bag(path, options)
+            return bags.bag
         if path.suffix.lower() in videos.SUFFIXES:
-            return videos.video(path, options)
+            return videos.video
         raise DeviceError(f"{path}: not a recording; one is {FORMATS}")
     if not path.is_dir():
         raise DeviceError(f"{path}: no such folder or file; a recording is {FORMATS}")
@@ -38,7 +51,7 @@ def open_recording(path: Path, options: RecordingOptions | None = None) -> Recor
     }  # fmt: skip
     for mark, opened in marks.items():
         if (path / mark).exists():
-            return opened(path, options)
+            return opened
     if bags.parts_of(path):
-        return bags.bag(path, options)
+        return bags.bag
     raise DeviceError(f"{path}: not a recording; one is {FORMATS}")

@@ -31,6 +31,29 @@ class RecordingOptions:
     odometry_topic: str | None = None
     camera_info_topic: str | None = None
 
+    def check_used(self, path: Path, is_bag: bool, has_height: bool) -> None:
+        """Refuse an option that the recording does not use: a person who gives one expects an effect.
+
+        Args:
+            path: of the recording.
+            is_bag: whether it has topics.
+            has_height: whether its camera.toml gives the height of the camera.
+
+        Raises:
+            DeviceError: the option.
+        """
+        topics = {
+            "--image-topic": self.image_topic,
+            "--odometry-topic": self.odometry_topic,
+            "--camera-info-topic": self.camera_info_topic,
+        }
+        for option, topic in topics.items():
+            if topic is not None and not is_bag:
+                raise DeviceError(f"{path}: is no bag and has no topics: leave out {option}")
+        if self.camera_height is not None and (has_height or self.camera is not None):
+            file = self.camera or path / "camera.toml"
+            raise DeviceError(f"{path}: the height is height_m of {file}: leave out --camera-height")
+
     def camera_of(self, given: CameraAndLens | None, height_given: bool = False) -> CameraGiven:
         """The camera: the person's file, else the recording's with the person's height.
 

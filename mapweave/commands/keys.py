@@ -41,7 +41,10 @@ def add_to(commands: Any) -> None:
     add = _action(actions, "add", "give a robot, server or person a key, or a new one")
     add.add_argument("name", type=values.name, metavar="NAME", help="a robot's name is that of its agent")
     add.add_argument("--role", choices=ROLES, default="robot", help="what it may do (default: robot)")
-    add.add_argument("--days", type=float, default=365.0, help="for which it holds (default: 365)")
+    add.add_argument(
+        "--days", type=float,
+        help="for which it holds (default: 365); passwords of the lab profile do not expire",
+    )  # fmt: skip
     add.set_defaults(run=_add)
 
     token = _action(actions, "token", "a token with which a person or a script logs in over HTTP")
@@ -96,11 +99,18 @@ def _init(arguments: argparse.Namespace) -> int:
 
 
 def _add(arguments: argparse.Namespace) -> int:
-    from mapweave.identities.key_folder import KeyFolder
+    from mapweave.commands.usage import UsageError
+    from mapweave.identities.key_folder import KeyFolder, Profile
     from mapweave.wire.credentials import Role
 
-    _check_days(arguments.days)
-    path = KeyFolder(arguments.keys).add(arguments.name, Role(arguments.role), arguments.days)
+    days = 365.0 if arguments.days is None else arguments.days
+    _check_days(days)
+    folder = KeyFolder(arguments.keys)
+    if arguments.days is not None and folder.catalogue.profile is Profile.LAB:
+        raise UsageError(
+            "--days: passwords of the lab profile do not expire; `mapweave keys revoke` ends one"
+        )
+    path = folder.add(arguments.name, Role(arguments.role), days)
     print(f"{path}: copy this file to {arguments.name}, and to no other")
     return 0
 

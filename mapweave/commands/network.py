@@ -94,7 +94,10 @@ def network_of(arguments: argparse.Namespace, settings: Settings, name: str = ""
         if fleet not in (default.fleet, key.fleet):
             raise SettingsError(f"{keys} is a key of fleet {key.fleet}, not of {fleet}")
         if name and name != owner:
-            raise SettingsError(f"{keys} is the key of {owner}, not of {name}")
+            raise SettingsError(
+                f"{keys} is the key of {owner}, not of {name}: give that of {name}, which "
+                f"`mapweave keys add {name}` at the server makes"
+            )
         fleet, endpoints = key.fleet, key.endpoints if endpoints == default.endpoints else endpoints
     if arguments.endpoints:
         endpoints = tuple(arguments.endpoints)

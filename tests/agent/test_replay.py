@@ -18,6 +18,8 @@ from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Command, Odometry
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.camera_file import read_camera
+from mapweave.agent.recordings.opening import open_recording
+from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
@@ -326,6 +328,21 @@ def test_errors_are_reported_in_one_line(folder, case):
     words = refused(lambda: Replay(folder))
     assert message in words
     assert str(folder) in words
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (RecordingOptions(image_topic="/camera"), "has no topics: leave out --image-topic"),
+        (
+            RecordingOptions(camera_height=0.3),
+            "is height_m of {folder}/camera.toml: leave out",
+        ),
+    ],
+)
+def test_options_without_effect_are_refused(folder, options, words):
+    """They were ignored: the map had another height than the person had said."""
+    assert words.format(folder=folder) in refused(lambda: open_recording(folder, options))
 
 
 @pytest.mark.parametrize("case", WRONG_SPLITS)

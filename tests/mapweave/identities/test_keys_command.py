@@ -269,3 +269,13 @@ def test_a_second_router_has_a_key_of_its_own(keys: Path, capfd: pytest.CaptureF
     own = read_key_file(keys / "s1.key.toml").credentials
     secret = base64.b64encode(own.private_key.encode()).decode() if own.certified else own.password
     assert secret in written
+
+
+def test_a_password_that_would_not_expire_is_not_promised_to(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    keys = tmp_path / "lab"
+    assert main(["keys", "init", "--keys", str(keys), "--at", "10.0.0.5", "--profile", "lab"]) == 0
+    capfd.readouterr()
+    said = complaint(capfd, "keys", "add", "guest", "--days", 1, "--keys", keys, status=USAGE)
+    assert "do not expire" in said and not (keys / "guest.key.toml").exists()
