@@ -68,7 +68,7 @@ def contents(merged: MergedMap) -> dict[str, Any]:
 
 
 @cache
-def afresh(way: str) -> tuple[dict[str, Any], MergedMap]:
+def fresh_merge(way: str) -> tuple[dict[str, Any], MergedMap]:
     """The merge of a restarted server."""
     merger = Merger(compare=compare)
     merger.read([(map_id, body) for map_id, log in record(way).items() for body in log])
@@ -113,7 +113,7 @@ def test_a_merge_in_steps_is_the_merge_of_the_record(
 ) -> None:
     # Few links are tested of many, as in a large map.
     monkeypatch.setattr(wrong_geometry, "MOST_LINKS", 12)
-    expected, fresh = afresh(way)
+    expected, fresh = fresh_merge(way)
     merged = in_steps(way, order, steps)
     found = contents(merged)
     for name, value in expected.items():
