@@ -35,11 +35,13 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 pytest_plugins = ["tests.postgres"]
 
-# All that is imported and collected stays: to look for what does not takes each process a second.
+# All that is imported and collected stays: to look for what does not takes each process a second, and again
+# whenever all is looked through later.
 gc.disable()
 
 
 def pytest_collection_finish() -> None:
+    gc.freeze()
     gc.enable()
 
 
