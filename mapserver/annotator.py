@@ -228,7 +228,9 @@ def _check_floor(
     which, label = floor.node.map, floor.label
     floors = {**annotations.floors, which: label}
     if against := held_together(merged, constraints, floors, which):
-        raise InvalidValue(f"map {which} cannot be on floor {label}: {against}; take one of it back first")
+        raise InvalidValue(
+            f"map {which} cannot be on floor {label}: {against}; take the other label, or the link, back first"
+        )
     for entry, portal in annotations.in_force(Portal):
         first, second = (floor_of(merged, floors, node) for node in (portal.a, portal.b))
         differ = first and second and first != second

@@ -127,6 +127,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(summary))
     else:
         for key, value in summary.items():
+            if value is None:
+                continue  # a database has no size of a file
             print(f"{key.replace('_', ' '):26} {_text(value)}")
     return 0
 

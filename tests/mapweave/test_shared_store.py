@@ -109,6 +109,8 @@ def test_either_of_two_servers_may_be_killed(
     for journal in journals:
         journal.close()
     capfd.readouterr()
+    assert main(["map", "show", address, "--no-picture"]) == 0
+    assert "None" not in capfd.readouterr().out
     assert main(["map", "show", address, "--json", "--no-picture"]) == 0
     shown = json.loads(capfd.readouterr().out)
     assert (shown["nodes"], shown["maps"], shown["source"]) == (
