@@ -2,6 +2,6 @@
 
 import sys
 
-from mapweave.cli import main
+from mapweave.start import main
 
 sys.exit(main())

@@ -153,3 +153,22 @@ def test_an_option_that_is_none_names_the_help_of_its_command(capfd: pytest.Capt
     assert (
         complaint == "mapweave map show: unrecognized arguments: --colour; see `mapweave map show --help`\n"
     )
+
+
+def test_ctrl_c_while_the_command_line_is_imported_is_one_line() -> None:
+    program = """
+import sys
+
+class Interrupted:
+    def find_spec(self, name, path=None, target=None):
+        if name == "mapweave.cli":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupted())
+from mapweave.start import main
+sys.exit(main())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.stderr, done.returncode) == ("mapweave: interrupted\n", 130)
