@@ -1,4 +1,4 @@
-"""Where the command `mapweave` begins: Ctrl-C while the command line is imported is one line, too."""
+"""Where the command `mapweave` begins: Ctrl-C while the command line is read is one line, too."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ def main() -> int:
     """Run a command; returns its exit status."""
     try:
         from mapweave.cli import main as run
+
+        return run()
     except KeyboardInterrupt:
         print("mapweave: interrupted", file=sys.stderr)
         return INTERRUPTED
-    return run()

@@ -155,13 +155,18 @@ def test_an_option_that_is_none_names_the_help_of_its_command(capfd: pytest.Capt
     )
 
 
-def test_ctrl_c_while_the_command_line_is_imported_is_one_line() -> None:
+@pytest.mark.parametrize("module", ["mapweave.cli", "argcomplete"])
+def test_ctrl_c_while_the_command_line_is_read_is_one_line(module: str) -> None:
+    """While it is imported, and while its parser is made."""
     program = """
+import os
 import sys
+
+os.environ["_ARGCOMPLETE"] = "1"
 
 class Interrupted:
     def find_spec(self, name, path=None, target=None):
-        if name == "mapweave.cli":
+        if name == sys.argv[1]:
             raise KeyboardInterrupt
 
 sys.meta_path.insert(0, Interrupted())
@@ -169,6 +174,6 @@ from mapweave.start import main
 sys.exit(main())
 """
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", program, module], capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.stderr, done.returncode) == ("mapweave: interrupted\n", 130)
