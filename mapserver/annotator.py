@@ -229,7 +229,7 @@ def _check_floor(
     floors = {**annotations.floors, which: label}
     if against := held_together(merged, constraints, floors, which):
         raise InvalidValue(
-            f"map {which} cannot be on floor {label}: {against}; take the other label, or the link, back first"
+            f"map {which} cannot be on floor {label}: {against}; first take back the other label or the link"
         )
     for entry, portal in annotations.in_force(Portal):
         first, second = (floor_of(merged, floors, node) for node in (portal.a, portal.b))
