@@ -24,7 +24,8 @@ def services() -> StubServices:
 
 @pytest.fixture
 def served(services: StubServices) -> Iterator[Web]:
-    with Web(("127.0.0.1", 0), services) as served:
+    # A large image takes longer than the usual patience where many tests run at once.
+    with Web(("127.0.0.1", 0), services, patience=60.0) as served:
         yield served
 
 
