@@ -79,6 +79,8 @@ def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer)
     person.edit("place", "it is so", name="the hall")
     person.apply()
     eventually(lambda: "the hall place" in page.run(PLACES))
+    # Its event comes a moment later, and is announced over what a search has said.
+    eventually(lambda: "place the hall is an area" in person.text("announcement"))
     person.fill("edit-nodes", "the hall")
     assert page.run("return mapweave.selection.area.anchor") == area["anchor"]
     # The search takes the same words.
