@@ -79,6 +79,10 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
     (kept,) = house.mapped.path.with_name(f"{house.mapped.path.name}.plans").iterdir()
     for damaged in (b"", PNG.png[:-1]):
         kept.write_bytes(damaged)
+        # The packed map is kept as long as nothing changes.
+        house.stop_server()
+        house.start_server()
+        assert house.server.settle(20.0)
         assert len(map_of(fleet).poses) == 7 and map_of(fleet).images == {}
     fleet.withdraw("plan", "flat")
     assert fleet.plans().plans == () and map_of(fleet).images == {}
