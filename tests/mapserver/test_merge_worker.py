@@ -121,8 +121,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
         worker.take(change)
     began = time.monotonic()
     answer = worker.answers.relocalizer.answer(view)
-    assert time.monotonic() - began < 10.0, "the merge is held for 20 s"
-    assert answer.certainty is Certainty.FOUND
+    assert time.monotonic() - began < 1.0 and answer.certainty is Certainty.FOUND
     best = answer.candidates[0]
     assert best.component == NO_COMPONENT and best.merged_from_robot is None
     go.set()

@@ -230,9 +230,9 @@ def test_a_key_of_thousands_of_parts_is_refused_at_once(tmp_path):
         " . ".join(["a", '"b.c"', "'d'"] * 3000),
         f"[{'.'.join(['a'] * 64)}]",
     ):
-        began = time.process_time()
+        began = time.monotonic()
         assert "a key has 64 parts" in refused(tmp_path, f"x = 1\n{key} = 1" if "[" not in key else key)
-        assert time.process_time() - began < 0.5
+        assert time.monotonic() - began < 0.5
     many = ", ".join(f"{number}.5" for number in range(500))
     (tmp_path / "numbers.toml").write_text(f"a.{'.'.join('b' * 62)} = [{many}]\nname = {'a.' * 40!r}")
     assert len(read_toml(tmp_path / "numbers.toml")) == 2

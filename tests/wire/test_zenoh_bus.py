@@ -69,7 +69,7 @@ def test_a_client_that_never_connects_closes_at_once() -> None:
     client = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
     begin = time.monotonic()
     client.close()
-    assert time.monotonic() - begin < 20
+    assert time.monotonic() - begin < 5
 
 
 def test_a_taken_port_is_reported_in_one_line() -> None:

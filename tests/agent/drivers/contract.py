@@ -23,7 +23,7 @@ from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.errors import InvalidValue
-from tests.waiting import PATIENCE, eventually
+from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[3]
 WIDTH, HEIGHT = 64, 48
@@ -33,8 +33,6 @@ ANSWERS_WITHIN = 0.02
 """s that `act` may take, and `sense` beyond two ticks."""
 SLACK = 0.03
 """s; processes and threads of a busy machine wait for their turn."""
-TRIES = 4
-"""Of which one is in time: a busy machine may be late now and then, a driver that is late is so each time."""
 
 CHILD = """
 import sys, time
@@ -63,7 +61,7 @@ def write_video(path: Path, seconds: float) -> Path:
     return path
 
 
-def until(happened: Callable[[], bool], seconds: float = PATIENCE) -> None:
+def until(happened: Callable[[], bool], seconds: float) -> None:
     end = time.monotonic() + seconds
     while not happened():
         assert time.monotonic() < end, f"did not happen within {seconds:g} s"
@@ -205,46 +203,39 @@ class RobotContract:
             robot.act(Command(float("nan"), 0.0))
 
     def test_wheels_stop_when_commands_cease(self, robot: Robot, emulator: Any) -> None:
-        def stops_soon() -> bool:
-            drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
-            last = time.monotonic()
-            until(lambda: emulator.wheels.speeds == (0.0, 0.0))
-            return emulator.wheels.stopped_at - last < STOPS_WITHIN + SLACK
-
-        assert any(stops_soon() for _ in range(TRIES))
+        drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
+        last = time.monotonic()
+        until(lambda: emulator.wheels.speeds == (0.0, 0.0), 1.5)
+        assert emulator.wheels.stopped_at - last < STOPS_WITHIN + SLACK
         # It drives on with the next command.
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
 
     def test_wheels_stop_when_it_is_closed(self, robot: Robot, emulator: Any) -> None:
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         robot.close()
-        # How soon is the matter of the tests beside this one.
-        until(lambda: emulator.wheels.speeds == (0.0, 0.0))
+        until(lambda: emulator.wheels.speeds == (0.0, 0.0), STOPS_WITHIN)
         assert robot.sense() is None
 
     @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
     def test_wheels_stop_when_the_process_dies_or_hangs(
         self, settings: Path, emulator: Any, end: signal.Signals
     ) -> None:
-        def stops_soon() -> bool:
-            child = subprocess.Popen(
-                [sys.executable, "-c", CHILD, str(settings)], stdout=subprocess.PIPE, cwd=ROOT,
-                env={**os.environ, "PYTHONPATH": str(ROOT)},
-            )  # fmt: skip
-            try:
-                assert child.stdout is not None
-                for _ in range(3):
-                    assert child.stdout.readline() == b"driving\n"
-                until(lambda: emulator.wheels.speeds[0] > 0.1)
-                child.send_signal(end)
-                died = time.monotonic()
-                until(lambda: emulator.wheels.speeds == (0.0, 0.0))
-                return emulator.wheels.stopped_at - died < STOPS_WITHIN + SLACK
-            finally:
-                child.kill()
-                child.communicate()
-
-        assert any(stops_soon() for _ in range(TRIES))
+        child = subprocess.Popen(
+            [sys.executable, "-c", CHILD, str(settings)], stdout=subprocess.PIPE, cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+        try:
+            assert child.stdout is not None
+            for _ in range(3):
+                assert child.stdout.readline() == b"driving\n"
+            until(lambda: emulator.wheels.speeds[0] > 0.1, 1.0)
+            child.send_signal(end)
+            died = time.monotonic()
+            until(lambda: emulator.wheels.speeds == (0.0, 0.0), 1.5)
+            assert emulator.wheels.stopped_at - died < STOPS_WITHIN + SLACK
+        finally:
+            child.kill()
+            child.communicate()
 
     def test_it_comes_back_when_the_port_has_vanished(self, robot: Robot, emulator: Any) -> None:
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
@@ -269,8 +260,8 @@ class RobotContract:
             robot.sense()
             senses.append(time.monotonic() - begin)
         emulator.stalled = False
-        # The median, and not the two longest: a busy machine may hold up single calls.
+        # The median: a machine that does other things as well may hold up a single call.
         assert np.median(acts) < ANSWERS_WITHIN
         assert np.median(senses) < 2 * tick + ANSWERS_WITHIN
-        assert sorted(acts)[-3] < 0.25
+        assert max(acts) < 0.25
         drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Iterator
@@ -12,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from mapweave.agent.drivers.camera import Capture, Frame
+from mapweave.agent.drivers.camera import Capture
 from mapweave.agent.drivers.settings import CameraSettings
 from mapweave.hybridmap.errors import DeviceError
 from tests.mjpeg_stream import MjpegStream
-from tests.waiting import PATIENCE, eventually
+from tests.waiting import eventually
 
 WIDTH, HEIGHT = 64, 48
 RATE = 20.0
@@ -43,37 +42,29 @@ def clip(tmp_path: Path) -> str:
 
 
 def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str) -> None:
-
-    def plays() -> bool:
-        camera = Capture(settings(clip))
-        first = camera.newer(0, 2.0)
-        assert first is not None
-        assert first.image.shape == (HEIGHT, WIDTH)
-        time.sleep(0.5)
-        later = camera.newer(first.stamp_ns, 2.0)
-        assert later is not None
-        age = time.time_ns() - later.stamp_ns
-        camera.close()
-        # The ten frames between are not waited for.
-        passed = (later.stamp_ns - first.stamp_ns) / 1e9
-        frames = (int(later.image[0, 0]) - int(first.image[0, 0])) / 5
-        return abs(passed - 0.5) < 0.12 and abs(frames - passed * RATE) <= 2 and abs(age) < 0.3e9
-
-    # A busy machine may hold up one of these threads for longer; a camera that waits does so each time.
-    eventually(plays)
+    camera = Capture(settings(clip))
+    first = camera.newer(0, 2.0)
+    assert first is not None
+    assert first.image.shape == (HEIGHT, WIDTH)
+    time.sleep(0.5)
+    later = camera.newer(first.stamp_ns, 0.2)
+    assert later is not None
+    # The ten frames between are not waited for.
+    passed = (later.stamp_ns - first.stamp_ns) / 1e9
+    assert passed == pytest.approx(0.5, abs=0.12)
+    assert (int(later.image[0, 0]) - int(first.image[0, 0])) / 5 == pytest.approx(passed * RATE, abs=2)
+    assert abs(time.time_ns() - later.stamp_ns) < 0.3e9
+    camera.close()
 
 
 def test_after_the_end_of_a_file_nothing_comes(clip: str) -> None:
     camera = Capture(settings(clip))
-
-    def newest() -> Frame:
-        seen = camera.newer(0, 2.0)
-        assert seen is not None
-        return seen
-
-    eventually(lambda: round(int(newest().image[0, 0]) / 5) == 39)
-    last = newest()
+    time.sleep(2.5)
+    last = camera.newer(0, 0.1)
+    assert last is not None
+    begin = time.monotonic()
     assert camera.newer(last.stamp_ns, 0.1) is None
+    assert time.monotonic() - begin < 0.3
     camera.close()
     camera.close()
 
@@ -82,8 +73,7 @@ def test_a_known_delay_is_subtracted(clip: str) -> None:
     camera = Capture(settings(clip, delay=5.0))
     frame = camera.newer(0, 2.0)
     assert frame is not None
-    # It may have to wait for its turn to be looked at, and is none the younger for it.
-    assert 5.0 <= (time.time_ns() - frame.stamp_ns) / 1e9 < 9.0
+    assert (time.time_ns() - frame.stamp_ns) / 1e9 == pytest.approx(5.0, abs=0.4)
     camera.close()
 
 
@@ -132,8 +122,7 @@ def test_a_stream_over_http_is_no_more_than_two_frames_behind(stream: Stream) ->
         frame = camera.newer(frame.stamp_ns, 1.0)
         assert frame is not None
         behind.append((stream.number - round(int(frame.image[0, 0]) / 5)) % 50)
-    # The least: a busy machine may hold up the thread, and what keeps frames back does so each time.
-    assert min(behind) <= 2
+    assert np.median(behind) <= 2
     camera.close()
 
 
@@ -146,7 +135,7 @@ def test_a_stream_that_ends_is_opened_again(stream: Stream) -> None:
     time.sleep(0.2)
     last = camera.newer(0, 0.1)
     assert last is not None
-    assert camera.newer(last.stamp_ns, PATIENCE) is not None
+    assert camera.newer(last.stamp_ns, 6.0) is not None
     camera.close()
 
 
@@ -213,19 +202,16 @@ def test_a_device_is_stamped_by_its_driver_and_its_exposure_locked(
 ) -> None:
     device, opened = Device(locks), []
     monkeypatch.setattr("cv2.VideoCapture", lambda *arguments: opened.append(arguments) or device)
-    monkeypatch.setattr("mapweave.agent.drivers.camera.SETTLING", math.inf)
+    monkeypatch.setattr("mapweave.agent.drivers.camera.SETTLING", 0.2)
     camera = Capture(settings("/dev/video2", lock_exposure=True))
     assert opened == [(2, cv2.CAP_V4L2)]
-    frame = camera.newer(0, PATIENCE)
+    frame = camera.newer(0, 2.0)
     assert frame is not None
     age = (time.time_ns() - frame.stamp_ns) / 1e9
-    assert 0.08 < age < 4.0
+    assert 0.08 < age < 0.4
     assert device.properties[cv2.CAP_PROP_FRAME_WIDTH] == WIDTH
     assert device.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == 3.0
-    monkeypatch.setattr("mapweave.agent.drivers.camera.SETTLING", 0.2)
-    # White balance is last.
-    eventually(lambda: cv2.CAP_PROP_AUTO_WB in device.properties)
-    eventually(lambda: locks or caplog.messages)
+    time.sleep(0.6)
     assert device.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == (1.0 if locks else 3.0)
     assert device.properties[cv2.CAP_PROP_EXPOSURE] == 157.0
     assert ("cannot lock its exposure" in caplog.text) is not locks

@@ -28,7 +28,7 @@ class TestCreate(RobotContract):
     def test_it_drives_on_after_it_was_lifted(self, robot: Robot, emulator: Any) -> None:
         drive(robot, Command(0.1, 0.0), 0.3)
         emulator.lift()
-        until(lambda: emulator.wheels.speeds == (0.0, 0.0))
+        until(lambda: emulator.wheels.speeds == (0.0, 0.0), 0.5)
         drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)
         assert emulator.mode == 2
 

@@ -66,5 +66,5 @@ class TestKoala25(RobotContract):
         assert (bearings[4:8] < 0).all()
 
     def test_wheels_stand_before_the_first_command(self, robot: Robot, emulator: Any) -> None:
-        until(lambda: b"D,0,0" in emulator.heard)
+        until(lambda: b"D,0,0" in emulator.heard, 1.0)
         assert emulator.wheels.way() == (0.0, 0.0)

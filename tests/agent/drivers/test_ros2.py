@@ -142,7 +142,7 @@ def test_a_scan_is_free_room_from_the_robots_edge(start: Start) -> None:
     walls = [math.inf] * 90
     walls[45], walls[22], walls[70], walls[0] = 1.03, 0.5, 0.09, 0.0
     emulator.walls = walls
-    until(lambda: last(robot, 1).proximity.min() < 3.5)
+    until(lambda: last(robot, 1).proximity.min() < 3.5, 5.0)
     seen = dict(zip(np.degrees(described.ranger_bearings).round(1), last(robot).proximity, strict=True))
     # Ahead, between two sectors: 1.03 m from the scanner, 1.0 m from the axle, 15 cm are the robot.
     assert seen[7.5] == seen[-7.5] == pytest.approx(0.85, abs=1e-6)
@@ -181,9 +181,9 @@ def test_range_and_infrared_sensors(start: Start) -> None:
     assert proximity == pytest.approx([0.2, 0.2, 0.1, 0.2, 0.2, 0.2, 0.2, 0.2], abs=0.001)
     # The sensor is 3 cm inside the robot's outline.
     emulator.ranges = {"front": 0.08}
-    until(lambda: last(robot, 1).proximity[0] == pytest.approx(0.05, abs=1e-6))
+    until(lambda: last(robot, 1).proximity[0] == pytest.approx(0.05, abs=1e-6), 5.0)
     emulator.silent = {"range"}
-    until(lambda: not len(last(robot, 1).proximity))
+    until(lambda: not len(last(robot, 1).proximity), 5.0)
 
 
 def test_touch_and_being_lifted_are_reported(start: Start) -> None:
@@ -193,14 +193,14 @@ def test_touch_and_being_lifted_are_reported(start: Start) -> None:
     emulator.hazards = [2, 5]
     assert not last(robot).bumped
     emulator.hazards = [1]
-    until(lambda: last(robot, 1).bumped)
+    until(lambda: last(robot, 1).bumped, 5.0)
     emulator.hazards, emulator.kidnapped = [], True
-    until(lambda: last(robot, 1).kidnapped)
+    until(lambda: last(robot, 1).kidnapped, 5.0)
     emulator.kidnapped = False
-    until(lambda: not last(robot, 1).kidnapped)
+    until(lambda: not last(robot, 1).kidnapped, 5.0)
     assert last(robot, 1).battery is None
     emulator.battery = 0.625
-    until(lambda: last(robot, 1).battery == 0.625)
+    until(lambda: last(robot, 1).battery == 0.625, 5.0)
 
 
 def test_another_clock_is_translated(start: Start) -> None:
@@ -248,7 +248,7 @@ def test_what_is_wrong_is_said_in_one_line(
         assert "\n" not in str(error.value)
         return re.search(line, str(error.value)) is not None
 
-    until(said)
+    until(said, 10.0)
 
 
 def test_settings_are_checked_before_anything_moves(start: Start) -> None:

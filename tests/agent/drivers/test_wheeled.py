@@ -173,18 +173,19 @@ def test_ticks_without_image_and_images_after_them(
 def test_neither_image_nor_wheels(robot: CheckedRobot, base: EvenBase, camera: LateCamera) -> None:
     robot.sense()
     camera.silent = base.failing = True
-    took = []
+    begin = time.monotonic()
     for _ in range(6):
-        begin = time.monotonic()
         seen = robot.sense()
-        took.append(time.monotonic() - begin)
         assert seen is not None
-    # The median: a busy machine may hold up a single call.
-    assert np.median(took) < 0.26
+    assert time.monotonic() - begin < 1.6
     assert seen is not None
     assert seen.odometry.forward == 0.0
     camera.silent = base.failing = False
-    eventually(lambda: (seen := robot.sense()) is not None and seen.image is not None)
+    time.sleep(0.5)
+    for _ in range(3):
+        seen = robot.sense()
+    assert seen is not None
+    assert seen.image is not None
 
 
 def test_a_base_that_waits_on_for_an_answer_is_called_silent(
@@ -243,8 +244,10 @@ def test_a_base_that_reads_wrongly_from_the_start(
     # It is not waited for: that would take longer than any test may.
     monkeypatch.setattr(wheeled, "PATIENCE", 600.0)
     robot = CheckedRobot(WheeledRobot(Reads(read), SETTINGS, camera))
+    begin = time.monotonic()
     with pytest.raises(DeviceError, match=f"^driver: {words}"):
         robot.sense()
+    assert time.monotonic() - begin < 4.0
     robot.close()
 
 

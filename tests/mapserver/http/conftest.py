@@ -24,8 +24,7 @@ def services() -> StubServices:
 
 @pytest.fixture
 def served(services: StubServices) -> Iterator[Web]:
-    # A large image takes longer than the usual patience where many tests run at once.
-    with Web(("127.0.0.1", 0), services, patience=60.0) as served:
+    with Web(("127.0.0.1", 0), services) as served:
         yield served
 
 

@@ -198,12 +198,12 @@ def test_forms_that_are_none(served: Web, body: bytes, content_type: str, words:
 def test_a_camera_costs_next_to_nothing(served: Web, camera: bytes) -> None:
     body, headers = form(("image", picture()), ("camera", camera))
     tracemalloc.start()
-    begin = time.process_time()
+    begin = time.monotonic()
     status, answer = post(served, body=body, **headers)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert (status, answer["error"]) == (400, f"camera has {len(camera)} bytes, at most 4096 are read")
-    assert peak < 2_000_000 and time.process_time() < begin + 5.0
+    assert peak < 2_000_000 and time.monotonic() < begin + 5.0
 
 
 @pytest.mark.parametrize(
@@ -226,11 +226,11 @@ def test_a_camera_with_remarks(served: Web, services: StubServices) -> None:
 
 def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
     head = b'--b\r\nContent-Disposition: form-data; name="image"' + b"; a*0=b" * 100_000
-    begin = time.process_time()
+    begin = time.monotonic()
     status, _ = post(
         served, body=head + b"\r\n\r\nx\r\n--b--", **{"Content-Type": "multipart/form-data; boundary=b"}
     )
-    assert status == 400 and time.process_time() < begin + 2.0
+    assert status == 400 and time.monotonic() < begin + 2.0
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_a_silent_agent_does_not_hold_up_another(hub: MemoryHub, agent: HandAgen
     other = HandAgent(hub, MapId("r1", 1))
     other.serve(3)
     other.beacon(3)
-    eventually(lambda: server.store.watermark(other.map) == 3)
+    eventually(lambda: server.store.watermark(other.map) == 3, seconds=1)
     kept[0].refuse("at last")
     server.end()
     other.bus.close()
