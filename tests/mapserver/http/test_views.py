@@ -138,12 +138,16 @@ def test_a_node_without_a_view_is_shown_as_before(
     assert status == 404 and b"r2 is away, or keeps no views" in content
 
 
-def test_a_link_is_shown_over_both_views(fleet: Fleet, page: Browser) -> None:
-    a, b = fleet.node("r0"), fleet.node("r1")
+def ask_why(page: Browser, a: NodeId, b: NodeId) -> None:
     page.run(
         "document.getElementById('tab-why').click(); const form = document.getElementById('form');"
         f"form.a.value = '{a}'; form.b.value = '{b}'; form.requestSubmit()"
     )
+
+
+def test_a_link_is_shown_over_both_views(fleet: Fleet, page: Browser) -> None:
+    a, b = fleet.node("r0"), fleet.node("r1")
+    ask_why(page, a, b)
     eventually(lambda: page.run(SHOWN.format("#result")) == 2)
     assert page.run("return document.querySelectorAll('#result svg image ~ line.agree').length") >= 10
     eventually(lambda: f"drawn over the view of {a} and {b}" in page.run(LABEL.format("#result")))
@@ -161,10 +165,7 @@ def test_a_link_is_shown_over_both_views(fleet: Fleet, page: Browser) -> None:
 
 def test_a_link_says_which_view_is_missing_and_why(fleet: Fleet, page: Browser) -> None:
     a, b = fleet.node("r0"), fleet.node("r2")
-    page.run(
-        "document.getElementById('tab-why').click(); const form = document.getElementById('form');"
-        f"form.a.value = '{a}'; form.b.value = '{b}'; form.requestSubmit()"
-    )
+    ask_why(page, a, b)
     eventually(lambda: page.run(SHOWN.format("#result")) == 1)
     eventually(lambda: page.run(LABEL.format("#result")).endswith(f"drawn over the view of {a}"))
     words = page.run("return document.querySelector('#result small').textContent")
