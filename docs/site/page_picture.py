@@ -1,7 +1,7 @@
 """Draws the page in a real browser: `page.png` with the recorded fleet, `edit.png` with a plan being laid.
 
 A picture that is there stays, since a browser draws each a little differently.
-`python docs/site/page_picture.py` draws other ones.
+`python -m docs.site.page_picture` draws other ones.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ ROOMS = (0, 2, 4, 6, 8)
 CLICKS = 2.0
 """How far a person clicks beside a place, px."""
 SHARP = "return mapweave.painter.drawn?.scale === mapweave.viewport.scale && !mapweave.painter.waiting"
+LIVE = "return document.getElementById('connection').textContent === 'live'"
 MERGED = 240.0
 """Longest wait for the merge, s."""
 
@@ -105,6 +106,8 @@ def draw_fleet() -> None:
             # Two of the four maps that it shows at once are joined to a third.
             eventually(lambda: page.run("return window.mapweave?.model.components.length") == 2, MERGED)
             eventually(lambda: page.run("return mapweave.painter.robots.length") == 4)
+            # Until the server has merged, the page shows all as it was last shown.
+            eventually(lambda: page.run(LIVE), MERGED)
             eventually(lambda: page.run(SHARP))
             page.screenshot(FLEET)
     finally:
