@@ -19,6 +19,7 @@ import msgspec
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.os_errors import reason_of
+from mapweave.wire.conversion import convert
 
 T = TypeVar("T")
 MOST_PARTS = 64
@@ -79,7 +80,8 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     for problem in _problems(cls, values, ""):
         raise SettingsError(f"{where}: {problem}")
     try:
-        return msgspec.convert(values, cls)
+        settings: T = convert(values, cls)
+        return settings
     except msgspec.ValidationError as error:
         raise SettingsError(f"{where}: {_in_words(str(error), values)}") from None
     except SettingsError as error:

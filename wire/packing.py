@@ -15,6 +15,7 @@ import msgpack
 import msgspec
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
+from mapweave.wire.conversion import convert
 
 SCHEMA = 1
 """Version of all messages; raised when a program of the version before would misread one."""
@@ -76,7 +77,7 @@ def unpack(data: bytes, kind: Any, limit: Limit, read: Callable[[Any, Any], Any]
         InvalidMessage: the message is invalid; one line gives the reason.
     """
     try:
-        return msgspec.convert(_fields(data, limit), kind, builtin_types=(bytes,), dec_hook=read)
+        return convert(_fields(data, limit), kind, read)
     except (msgspec.ValidationError, MapweaveError) as error:
         raise InvalidMessage(f"{limit.what}: {str(error).splitlines()[0][:300]}") from None
 

@@ -36,6 +36,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import Distortion, RadialTangential
 from mapweave.wire.codec import decode_body, encode_body
+from mapweave.wire.conversion import convert
 from mapweave.wire.packing import Limit, pack, unpack
 from mapweave.wire.pose_codec import pack_camera, pack_pose, unpack_camera, unpack_pose
 
@@ -269,7 +270,7 @@ def _fields(kind: Any) -> type[msgspec.Struct]:
 
 
 def _convert(plain: Any, kind: Any) -> Any:
-    return msgspec.convert(plain, kind, builtin_types=(bytes,), dec_hook=_read)
+    return convert(plain, kind, _read)
 
 
 def _read(opaque: Any, plain: Any) -> Any:

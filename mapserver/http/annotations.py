@@ -16,6 +16,7 @@ from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.floor_plans import placed_plan
 from mapweave.mapserver.http.json_values import json_values, time_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.conversion import json_value
 
 FORM = 'send JSON: {"name": "kitchen", "body": {"kind": "place", "node": "r0.1.17"}}'
 
@@ -76,7 +77,7 @@ def annotate(server: Annotating, data: bytes, by: str, who: str = "") -> Mapping
         InvalidValue: it is none, or says nothing new.
     """
     try:
-        posted = msgspec.json.decode(data, type=_Posted)
+        posted = json_value(data, _Posted)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidValue(f"{error}; {FORM}") from None
     annotation = annotation_of_words(

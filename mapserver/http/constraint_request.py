@@ -34,6 +34,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.named_nodes import Record, Resolve, own_ids_of, retired_of
 from mapweave.hybridmap.node import NodeId
+from mapweave.wire.conversion import json_value
 
 ONE = "link, unmerge, retire, area, window, or undo with a number"
 
@@ -84,7 +85,7 @@ def read_request(
         InvalidValue: it is no such request.
     """
     try:
-        asked = msgspec.json.decode(body, type=_Body)
+        asked = json_value(body, _Body)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InvalidValue(f"the body is no constraint: {error}; write {ONE}, as JSON") from None
     numbered = not isinstance(asked.undo, bool)

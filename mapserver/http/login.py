@@ -27,6 +27,7 @@ from mapweave.mapserver.http.reply import Reply
 from mapweave.mapserver.http.same_site import is_loopback
 from mapweave.mapserver.http.sessions import LIFE, Failures, Sessions
 from mapweave.wire.access_rules import COMMANDS, may_ask
+from mapweave.wire.conversion import json_value
 from mapweave.wire.credentials import Role
 
 log = logging.getLogger(__name__)
@@ -165,7 +166,7 @@ class Access:
         if self._logins is None:
             raise InvalidValue("this server has no keys, and needs no login")
         try:
-            token = msgspec.json.decode(body, type=_Posted).token.strip()
+            token = json_value(body, _Posted).token.strip()
         except (msgspec.MsgspecError, UnicodeDecodeError):
             raise InvalidValue('send JSON: {"token": "mapweave_..."}') from None
         login = self._checked(request, token, self._failed_logins)

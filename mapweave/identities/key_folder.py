@@ -38,6 +38,7 @@ from mapweave.identities.tokens import add_token, end_tokens, time_of
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.storage.os_errors import reason_of
 from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.conversion import json_value
 from mapweave.wire.credentials import Access, Credentials, Member, Role
 
 CATALOGUE = "fleet.json"
@@ -134,7 +135,7 @@ class KeyFolder:
     def _read_catalogue(self) -> Catalogue:
         path = self.path
         try:
-            return msgspec.json.decode(read_whole(path / CATALOGUE), type=Catalogue)
+            return json_value(read_whole(path / CATALOGUE), Catalogue)
         except FileNotFoundError:
             raise SettingsError(f"{path}: no keys are here; make some with `mapweave keys init`") from None
         except NotADirectoryError:

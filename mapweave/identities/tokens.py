@@ -18,6 +18,7 @@ from mapweave.hybridmap.errors import SettingsError
 from mapweave.identities.key_file import write_private
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.os_errors import reason_of
+from mapweave.wire.conversion import json_value
 
 TOKENS = "tokens.json"
 PREFIX = "mapweave_"
@@ -79,7 +80,7 @@ def read_tokens(folder: Path) -> tuple[Token, ...]:
         SettingsError: their file is damaged.
     """
     try:
-        return msgspec.json.decode(read_whole(folder / TOKENS), type=tuple[Token, ...])
+        return json_value(read_whole(folder / TOKENS), tuple[Token, ...])
     except FileNotFoundError:
         return ()
     except OSError as error:
