@@ -93,8 +93,16 @@ class Bus(Protocol):
         """Send best-effort; never blocks the caller, never raises for a missing connection."""
         ...
 
-    def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
-        """Call the handler with each message whose key the pattern (`*`, `**`) matches."""
+    def subscribe(self, pattern: str, handler: Callable[[Sample], None], *, direct: bool = False) -> Closing:
+        """Call the handler with each message whose key the pattern (`*`, `**`) matches.
+
+        Args:
+            pattern: of keys.
+            handler: what is called.
+            direct: that it only passes the message on to a thread of its own, and never waits: then it may be
+                called in the transport's thread, beside the other handlers. Each thread between costs more
+                than the message.
+        """
         ...
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:

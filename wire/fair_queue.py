@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -43,7 +44,15 @@ class FairQueue(Generic[_T]):
         lane = self._lanes.get(sender)
         return 0 if lane is None else len(lane.items)
 
-    def put(self, sender: str, item: _T, size: int = 0, *, bounded: bool = True) -> bool:
+    def put(
+        self,
+        sender: str,
+        item: _T,
+        size: int = 0,
+        *,
+        bounded: bool = True,
+        replaces: Callable[[_T], bool] | None = None,
+    ) -> bool:
         """Add something.
 
         Args:
@@ -51,12 +60,18 @@ class FairQueue(Generic[_T]):
             item: any.
             size: bytes.
             bounded: whether it may be refused.
+            replaces: whether it takes the place of the sender's last thing.
 
         Returns:
             False if there is no room for it.
         """
         lane = self._lanes.get(sender)
-        if bounded and not self._has_room(lane, size):
+        if lane is not None and replaces is not None and replaces(lane.items[-1][0]):
+            _, before = lane.items.pop()
+            lane.size -= before
+            self._count -= 1
+            self._size -= before
+        elif bounded and not self._has_room(lane, size):
             return False
         if lane is None:
             lane = self._lanes[sender] = _Lane()

@@ -165,8 +165,9 @@ class MemoryBus:
         if not self._closed:
             self._hub._publish(self, Sample(key, bytes(payload), bytes(attachment)))
 
-    def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
+    def subscribe(self, pattern: str, handler: Callable[[Sample], None], *, direct: bool = False) -> Closing:
         """Call the handler with each matching message."""
+        del direct  # all have one thread
         declared = Subscription(check_pattern(pattern), self._dispatcher, self._remove, handler)
         return self._add(self._subscriptions, declared)
 

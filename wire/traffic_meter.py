@@ -33,14 +33,14 @@ class TrafficMeter:
             self._count(key, payload, attachment)
         self._bus.publish(key, payload, attachment)
 
-    def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
+    def subscribe(self, pattern: str, handler: Callable[[Sample], None], *, direct: bool = False) -> Closing:
         """Listen."""
 
         def count(sample: Sample) -> None:
             self._count(sample.key, sample.payload, sample.attachment)
             handler(sample)
 
-        return self._bus.subscribe(pattern, count)
+        return self._bus.subscribe(pattern, count, direct=direct)
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
         """Answer questions."""

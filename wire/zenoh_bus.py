@@ -80,9 +80,9 @@ class ZenohBus:
                 # The session was closed between the check and the put: the same as no connection.
                 log.debug("put on %s after the session was closed", key)
 
-    def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
+    def subscribe(self, pattern: str, handler: Callable[[Sample], None], *, direct: bool = False) -> Closing:
         """Call the handler with each matching message."""
-        return self.declare(Subscription(self.owner, check_pattern(pattern), handler))
+        return self.declare(Subscription(self.owner, check_pattern(pattern), handler, direct))
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
         """Answer questions."""

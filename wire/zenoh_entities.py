@@ -15,7 +15,7 @@ import zenoh
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire.alive_keys import AliveKeys
 from mapweave.wire.bus import Reply, Request, Sample
-from mapweave.wire.dispatch import Dispatcher
+from mapweave.wire.dispatch import Dispatcher, guarded
 from mapweave.wire.keyexpr import answered
 from mapweave.wire.refusal import decode_refusal, encode_refusal
 
@@ -113,11 +113,13 @@ class Token(Declared):
 
 
 class Subscription(Declared):
-    """Messages to a handler."""
+    """Messages to a handler, which may be called in the thread of Zenoh's callbacks."""
 
-    def __init__(self, owner: Owner, key: str, handler: Callable[[Sample], None]) -> None:
+    def __init__(
+        self, owner: Owner, key: str, handler: Callable[[Sample], None], direct: bool = False
+    ) -> None:
         super().__init__(owner, key)
-        self._handler = handler
+        self._handler, self._direct = handler, direct
 
     def _declare_in(self, session: zenoh.Session) -> Any:
         return session.declare_subscriber(self.key, self._receive)
@@ -126,7 +128,10 @@ class Subscription(Declared):
         self._owner.heard()
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
         message = Sample(str(sample.key_expr), sample.payload.to_bytes(), attachment)
-        self._owner.dispatcher.message(self._handler, message, self.wanted)
+        if not self._direct:
+            self._owner.dispatcher.message(self._handler, message, self.wanted)
+        elif self.wanted():
+            guarded(lambda: self._handler(message), message.key)
 
 
 class Service(Declared):

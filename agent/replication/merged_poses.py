@@ -41,7 +41,7 @@ class MergedPoses:
         self._thread = threading.Thread(target=self._listen, name=f"poses-{agent}", daemon=True)
         self._thread.start()
         self._closing = [
-            bus.subscribe(self._key, self._work.put),
+            bus.subscribe(self._key, self._work.put, direct=True),
             bus.watch(keys.server_alive(server), lambda _, alive: self._work.put(alive)),
         ]
 

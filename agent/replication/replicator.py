@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from mapweave.agent.replication.ack_timer import AckTimer
 from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.log_state import LogState
 from mapweave.hybridmap.change import ChangeBody
@@ -33,7 +34,8 @@ class ReplicationSettings:
     """How changes are carried.
 
     Attributes:
-        beacon_interval: from a change to the beacon of a map of which servers lack something, s.
+        beacon_interval: shortest time from a change to the beacon of a map of which servers lack something,
+            s: it is sent when the acknowledgement is overdue, see AckTimer.
         answer_bytes: a log answer ends after so many bytes, since a link may be slow.
         retry_interval: after a failed commit (disk full), s.
     """
@@ -63,13 +65,13 @@ class ReplicationStatus:
 
 
 SETTLED_BEACONS = 20
-"""In the time of so many beacons, a map that servers have sends one: a server that is new, or has lost it,
-learns so."""
+"""In the time of so many beacons, or statuses that servers want, a map that servers have sends one: a server
+that has lost it learns so."""
 COMPACTED = 1000
 """After so many further changes that servers have, what later ones undo is dropped from the disk."""
 RAREST = 4
-"""A beacon on which nothing follows is sent again after twice the time, up to so many times the interval: the
-beacons of a fleet that a server cannot keep up with must not hold it up further."""
+"""A beacon on which nothing follows is sent again after twice the time, up to so many times that of the
+first: the beacons of a fleet that a server cannot keep up with must not hold it up further."""
 
 
 class Replicator:
@@ -113,7 +115,9 @@ class Replicator:
         # Only the thread touches these.
         self._pending: list[Draft] = []
         self._retry_at = 0.0
-        self._pause = self._settings.beacon_interval
+        shortest = self._settings.beacon_interval
+        self._ack_timer = AckTimer(shortest, SETTLED_BEACONS * shortest)
+        self._pause = self._ack_timer.timeout
         self._next_beacon = self._everyone_at = 0.0
         self._compacted = 0
         for state in self._logs.values():
@@ -122,7 +126,7 @@ class Replicator:
         self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
         self._thread.start()
         self._declared = [
-            bus.subscribe(keys.acks(map_id.agent), self._work.put),
+            bus.subscribe(keys.acks(map_id.agent), self._work.put, direct=True),
             bus.serve(keys.logs(map_id.agent), self._work.put),
             bus.watch(keys.servers_alive(), self._see_server),
         ]
@@ -219,6 +223,7 @@ class Replicator:
                     elif isinstance(item, bool):
                         # A server that has come may have lost its store, or be new.
                         self._everyone_at = 0.0
+                        self._ack_timer.forget()
                         self._beacon_after(0.0)
                     else:
                         questions.append(item)
@@ -245,7 +250,7 @@ class Replicator:
 
     def _beacon_after(self, seconds: float) -> None:
         """Something has happened: the next beacon comes so soon, and those behind it at the usual times."""
-        self._pause = self._settings.beacon_interval
+        self._pause = self._ack_timer.timeout
         self._next_beacon = min(self._next_beacon, time.monotonic() + seconds)
 
     def _commit(self) -> None:
@@ -270,7 +275,8 @@ class Replicator:
             self._changed.notify_all()
         for sequence, change in encoded:
             self._bus.publish(self._keys.change(self._map), change, self._mark(sequence))
-        self._beacon_after(self._settings.beacon_interval)
+        self._ack_timer.sent(first, time.monotonic())
+        self._beacon_after(self._ack_timer.timeout)
 
     def _mark(self, sequence: int) -> bytes:
         return Mark(sequence, self._current.log_id).encode()
@@ -278,7 +284,9 @@ class Replicator:
     def _send_beacons(self, now: float) -> None:
         everyone = now >= self._everyone_at
         if everyone:
-            self._everyone_at = now + SETTLED_BEACONS * self._settings.beacon_interval
+            self._everyone_at = now + SETTLED_BEACONS * max(
+                self._settings.beacon_interval, self.status_period
+            )
         unsettled = False
         for state in self._logs.values():
             lacking = state.unsettled(self._servers) > 0
@@ -288,7 +296,7 @@ class Replicator:
         self._next_beacon = self._everyone_at
         if unsettled:
             self._next_beacon = min(now + self._pause, self._next_beacon)
-            self._pause = min(2 * self._pause, RAREST * self._settings.beacon_interval)
+            self._pause = min(2 * self._pause, RAREST * self._ack_timer.timeout)
 
     def _take_ack(self, sample: Sample) -> None:
         try:
@@ -328,8 +336,12 @@ class Replicator:
             self._changed.notify_all()
         if state is self._current and state.settled(self._servers) - self._compacted >= COMPACTED:
             self._compact(state)
+        if state is self._current:
+            self._ack_timer.settled(state.settled(self._servers), time.monotonic())
         if state.unsettled(self._servers):
-            self._beacon_after(self._settings.beacon_interval)
+            # The others have the whole time again (RFC 6298, 5.3).
+            self._next_beacon = self._everyone_at
+            self._beacon_after(self._ack_timer.timeout)
 
     def _compact(self, state: LogState) -> None:
         """Drop from the disk what later changes of a log undo."""
@@ -365,6 +377,8 @@ class Replicator:
         except MapweaveError as error:
             question.refuse(str(error))
             return
+        if state is self._current:
+            self._ack_timer.asked_for(asked.first, last)
         total = 0
         for count, (_, change) in enumerate(rows):
             total += len(change)

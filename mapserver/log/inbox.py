@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from mapweave.wire.fair_queue import FairQueue
@@ -25,10 +26,18 @@ class Inbox(Generic[_T]):
         self._items: FairQueue[_T] = FairQueue(MOST, MOST_BYTES)
         self._woken = False
 
-    def put(self, robot: str, item: _T, size: int = 0, *, bounded: bool = True) -> bool:
-        """Add something of a robot; False if there is no room for it."""
+    def put(
+        self,
+        robot: str,
+        item: _T,
+        size: int = 0,
+        *,
+        bounded: bool = True,
+        replaces: Callable[[_T], bool] | None = None,
+    ) -> bool:
+        """Add something of a robot, see FairQueue.put; False if there is no room for it."""
         with self._changed:
-            taken = self._items.put(robot, item, size, bounded=bounded)
+            taken = self._items.put(robot, item, size, bounded=bounded, replaces=replaces)
             self._changed.notify()
         return taken
 

@@ -116,6 +116,7 @@ class Ingest:
         self._pieces = Pieces()
         self._puller = Puller(bus, keys, self._intakes, unmerged, s.ask_timeout, self._put_pulled)
         self._pulls = self._puller.schedule
+        self._unaware: dict[MapId, AgentLog] = {}
         self._work: Inbox[Sample | Pulled | Piece | News] = Inbox()
         self._follower = Follower(
             store, self._logs, self._intakes, self._pulls, s.pull, self._pass_on, note_refusal
@@ -139,8 +140,8 @@ class Ingest:
             self._pulls.note(agent_log, time.monotonic())
         self._thread.start()
         self._declared = [
-            self._bus.subscribe(self._keys.changes(), self._hear),
-            self._bus.subscribe(self._keys.heads(), self._hear),
+            self._bus.subscribe(self._keys.changes(), self._hear, direct=True),
+            self._bus.subscribe(self._keys.heads(), self._hear, direct=True),
             self._acks.serve(),
         ]
 
@@ -180,7 +181,13 @@ class Ingest:
     def _hear(self, sample: Sample) -> None:
         """A message has come; in the bus's thread."""
         robot = robot_of(sample.key)
-        if not self._work.put(robot, sample, len(sample.payload)):
+
+        def replaces(last: Sample | Pulled | Piece | News) -> bool:
+            """A newer beacon of the same log says all that the one before it did."""
+            return isinstance(last, Sample) and not last.attachment and last.key == sample.key
+
+        newer = None if sample.attachment else replaces
+        if not self._work.put(robot, sample, len(sample.payload), replaces=newer):
             self._quotas.hold_back(robot, "changes" if sample.attachment else "beacons")
 
     def _run(self) -> None:
@@ -259,7 +266,8 @@ class Ingest:
         agent_log.heard(time.monotonic())
         # More than there is: it was another store that had it.
         if head.acknowledged.get(self._name, 0) != agent_log.watermark:
-            self._acks.acknowledge(agent_log)
+            # Behind the commit of this turn, which may be acknowledged anyway.
+            self._unaware[agent_log.map] = agent_log
         return agent_log
 
     def _take_pulled(self, pulled: Pulled) -> AgentLog | None:
@@ -333,11 +341,15 @@ class Ingest:
             self._pass_on(changes)
         # Last: a robot may ask about its changes as soon as they are acknowledged.
         for run, received in done:
+            self._unaware.pop(run.log.map, None)
             self._acks.acknowledge(run.log)
             for at in received:
                 self._observe_ack(time.monotonic() - at)
             if run.full is not None:
                 self._rest(run.log, run.full)
+        for agent_log in self._unaware.values():
+            self._acks.acknowledge(agent_log)
+        self._unaware.clear()
 
     def _recover(self, agent_log: AgentLog, first: int, piece: Piece) -> None:
         """Put damaged changes in their places again, or verify others, and pass on what that changes."""

@@ -193,6 +193,32 @@ def test_a_subscriber_that_raises_is_logged_and_goes_on(
     assert "broken handler" in caplog.text
 
 
+def test_a_direct_subscriber_gets_the_same(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+    bus = fleet.join()
+    seen: list[bytes] = []
+
+    def handler(sample: Sample) -> None:
+        seen.append(sample.payload)
+        if sample.payload == b"1":
+            raise ValueError("broken handler")
+
+    subscribed = bus.subscribe("a", handler, direct=True)
+    eventually(lambda: bus.publish("a", b"0") or b"0" in seen)
+    with caplog.at_level(logging.ERROR):
+        for payload in (b"1", b"2", b"3"):
+            bus.publish("a", payload)
+        eventually(lambda: b"3" in seen)
+    assert [payload for payload in seen if payload != b"0"] == [b"1", b"2", b"3"]
+    assert "broken handler" in caplog.text
+    subscribed.close()
+    settled = len(seen)
+    bus.publish("a", b"4")
+    settle_after = subscribe(bus, bus, "b")
+    bus.publish("b", b"")
+    eventually(lambda: settle_after)
+    assert len(seen) == settled
+
+
 def test_an_answer_may_come_later_from_another_thread_and_counts_once(fleet: Fleet) -> None:
     asker, server = fleet.join(), fleet.join()
 

@@ -52,3 +52,19 @@ def test_one_that_floods_takes_no_more_than_the_queue() -> None:
     assert sum(queue.put("flood", k, 1) for k in range(1000)) == 100
     assert sum(queue.put("r0", k, 1) for k in range(1000)) == 50
     assert [queue.pop()[0] for _ in range(6)] == ["flood", "r0"] * 3
+
+
+def test_a_thing_may_take_the_place_of_its_senders_last() -> None:
+    queue: FairQueue[str] = FairQueue(3, 100)
+    for sender, item in (("a", "beacon 1"), ("b", "beacon 1"), ("a", "change")):
+        assert queue.put(sender, item, 10)
+
+    def beacon(item: str) -> bool:
+        return item.startswith("beacon")
+
+    assert not queue.put("a", "beacon 2", 10, replaces=beacon), "a change stays, and the queue is full"
+    assert queue.put("b", "beacon 2", 10, replaces=beacon), "it needs no room"
+    assert queue.waiting("b") == 1
+    assert [queue.pop() for _ in range(3)] == [("a", "beacon 1"), ("b", "beacon 2"), ("a", "change")]
+    assert len(queue) == 0
+    assert queue.put("c", "one that takes it all", 100)

@@ -200,6 +200,25 @@ def test_the_beacon_has_the_length_of_the_log_and_the_watermarks(agent: Agent, s
     eventually(lambda: len(server.heads) >= count + 3)
 
 
+def test_a_slow_server_gets_no_beacons_for_what_is_on_its_way(agent: Agent, server: HandServer) -> None:
+    """Its acknowledgements take ten times as long as the shortest time to a beacon."""
+
+    def beacons_until_acknowledged(sequence: int) -> int:
+        agent.replicator.submit(bodies(sequence, sequence), 0)
+        eventually(lambda: len(server.changes) == sequence)
+        before = len(server.heads)
+        time.sleep(10 * QUICK.beacon_interval)
+        lacking = [head for head in server.heads[before:] if head.newest == sequence]
+        server.acknowledge(agent.log_id, sequence)
+        assert agent.replicator.wait_acknowledged(30)
+        return len(lacking)
+
+    first, *rest = [beacons_until_acknowledged(sequence) for sequence in range(1, 9)]
+    assert first >= 2
+    # The one that all maps have from time to time may be among them.
+    assert sorted(rest)[len(rest) // 2] <= 1
+
+
 def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: HandServer) -> None:
     agent = Agent(hub, path, ("s0", "s1"))
     agent.replicator.submit(bodies(1, 3), 0)

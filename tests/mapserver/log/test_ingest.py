@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
+from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
 from mapweave.mapserver.log.entry import Applied, Entry
@@ -94,6 +96,29 @@ def test_a_beacon_with_a_low_watermark_gets_another_acknowledgement(server: Serv
     agent.beacon(1)
     eventually(lambda: len(agent.acks) == 3)
     assert {ack.watermark for ack in agent.acks} == {1}
+
+
+def test_beacons_that_wait_become_one(server: Server, agent: HandAgent) -> None:
+    """Each would be acknowledged, and hold up the changes of others."""
+    held, go_on = threading.Event(), threading.Event()
+
+    def hold(change: Change) -> None:
+        held.set()
+        assert go_on.wait(30)
+
+    server.on_change = hold
+    agent.publish(1)
+    assert held.wait(30)
+    agent.serve(2)
+    for newest in (1, 1, 1, 2, 2):
+        agent.beacon(newest)
+    eventually(lambda: server.ingest.waiting == 1)
+    # The last of them has come.
+    agent.publish(2)
+    eventually(lambda: server.ingest.waiting == 2)
+    go_on.set()
+    eventually(lambda: [ack.watermark for ack in agent.acks][-1:] == [2])
+    assert [ack.watermark for ack in agent.acks] == [1, 2]
 
 
 def test_a_restarted_server_replays_and_goes_on(server: Server, agent: HandAgent) -> None:
