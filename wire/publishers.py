@@ -40,10 +40,16 @@ class Publishers:
         """
         with self._lock:
             publisher = self._by_key.get(key)
-            if publisher is None:
-                publisher = self._by_key[key] = session.declare_publisher(key)
-            self._by_key.move_to_end(key)
-            unused = self._by_key.popitem(last=False)[1] if len(self._by_key) > self._most else None
-        if unused is not None:
-            unused.undeclare()  # type: ignore[no-untyped-call]
+            if publisher is not None:
+                self._by_key.move_to_end(key)
+                return publisher
+        # It takes milliseconds beside a thousand robots: messages on other keys do not wait for it.
+        declared = session.declare_publisher(key)
+        with self._lock:
+            publisher = self._by_key.setdefault(key, declared)
+            unused = [] if publisher is declared else [declared]
+            if len(self._by_key) > self._most:
+                unused.append(self._by_key.popitem(last=False)[1])
+        for one in unused:
+            one.undeclare()  # type: ignore[no-untyped-call]
         return publisher

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import cast
 
 import pytest
 import zenoh
@@ -40,3 +44,38 @@ def test_a_key_has_one_publisher_until_others_need_its_place(session: zenoh.Sess
     with pytest.raises(zenoh.ZError):
         used[1].put(b"it is taken back")
     subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+class SlowSession:
+    """Declares when it is allowed to."""
+
+    def __init__(self) -> None:
+        self.allowed = {key: threading.Event() for key in ("slow", "quick")}
+        self.asked, self.undeclared = list[str](), list[object]()
+
+    def declare_publisher(self, key: str) -> object:
+        self.asked.append(key)
+        assert self.allowed[key].wait(30)
+        return SlowPublisher(self)
+
+
+class SlowPublisher:
+    def __init__(self, session: SlowSession) -> None:
+        self.session = session
+
+    def undeclare(self) -> None:
+        self.session.undeclared.append(self)
+
+
+def test_a_key_whose_publisher_is_being_declared_holds_up_no_other() -> None:
+    session, publishers = SlowSession(), Publishers()
+    of = partial(publishers.of, cast(zenoh.Session, session))
+    with ThreadPoolExecutor(2) as pool:
+        both = [pool.submit(of, "slow") for _ in range(2)]
+        eventually(lambda: session.asked == ["slow", "slow"])
+        session.allowed["quick"].set()
+        quick = of("quick")
+        session.allowed["slow"].set()
+        first, second = (future.result() for future in both)
+    assert first is second is of("slow") and first is not quick
+    assert len(session.undeclared) == 1 and first not in session.undeclared
