@@ -169,12 +169,22 @@ class Replicator:
             return self._changed.wait_for(lambda: self._committed >= goal, timeout)
 
     def wait_acknowledged(self, timeout: float) -> bool:
-        """Wait until every map is on every required server's disk; False if the time is over first."""
+        """Wait until every map is on every required server's disk; False if the time is over first.
+
+        Beacons do not wait for overdue acknowledgements meanwhile.
+        """
+        pause, end = self._settings.beacon_interval, time.monotonic() + timeout
         with self._changed:
             goal = self._submitted
-            return self._changed.wait_for(
-                lambda: self._committed >= goal and self._unacknowledged() == 0, timeout
-            )
+            while not self._changed.wait_for(
+                lambda: self._committed >= goal and self._unacknowledged() == 0,
+                max(0.0, min(pause, end - time.monotonic())),
+            ):
+                if time.monotonic() >= end:
+                    return False
+                self._work.put(False)
+                pause = min(2 * pause, RAREST * self._settings.beacon_interval)
+        return True
 
     def status(self) -> ReplicationStatus:
         """Where things stand."""
@@ -221,9 +231,10 @@ class Replicator:
                     elif isinstance(item, Sample):
                         self._take_ack(item)
                     elif isinstance(item, bool):
-                        # A server that has come may have lost its store, or be new.
-                        self._everyone_at = 0.0
-                        self._ack_timer.forget()
+                        if item:
+                            # A server that has come may have lost its store, or be new.
+                            self._everyone_at = 0.0
+                            self._ack_timer.forget()
                         self._beacon_after(0.0)
                     else:
                         questions.append(item)

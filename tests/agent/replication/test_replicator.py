@@ -219,6 +219,24 @@ def test_a_slow_server_gets_no_beacons_for_what_is_on_its_way(agent: Agent, serv
     assert sorted(rest)[len(rest) // 2] <= 1
 
 
+def test_who_waits_for_acknowledgements_does_not_wait_for_beacons(agent: Agent, server: HandServer) -> None:
+    """A slow hour is over, and a change is lost: the robot's owner wants to switch it off."""
+    for sequence in range(1, 4):
+        agent.replicator.submit(bodies(sequence, sequence), 0)
+        eventually(lambda sequence=sequence: len(server.changes) == sequence)
+        time.sleep(20 * QUICK.beacon_interval)
+        server.acknowledge(agent.log_id, sequence)
+        assert agent.replicator.wait_acknowledged(30)
+    agent.replicator.submit(bodies(4, 4), 0)
+    assert agent.replicator.flush(30)
+    before = len(server.heads)
+    began = time.monotonic()
+    assert not agent.replicator.wait_acknowledged(30 * QUICK.beacon_interval)
+    # After 1, 3, 7, 11 and so on intervals: overdue it is after 20 and more.
+    assert len(server.heads) - before >= 3
+    assert time.monotonic() - began >= 30 * QUICK.beacon_interval
+
+
 def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: HandServer) -> None:
     agent = Agent(hub, path, ("s0", "s1"))
     agent.replicator.submit(bodies(1, 3), 0)
