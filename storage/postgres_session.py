@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -39,6 +41,16 @@ KEEPALIVE = {
     "tcp_user_timeout": 11_000,
 }
 """The same at this side."""
+ATTEMPT = re.compile(r" ?- host: (?:'(.*?)'|None), port: (?:'(.*?)'|None), hostaddr: (?:'.*?'|None): ")
+"""What psycopg writes before the reason why one of several hosts is not connected."""
+NOISE = re.compile(
+    r"^connection failed: |(?:connection|connection to server) (?:at|on) .*? failed: "
+    r"| Is the server running .*?\?"
+)
+"""What libpq says around a reason, when host and port are named already."""
+
+# It logs what it ignores when a connection is lost; the error itself is raised and reported.
+logging.getLogger("psycopg").setLevel(logging.ERROR)
 
 
 @dataclass(frozen=True)
@@ -79,7 +91,8 @@ class PostgresAddress:
                 "the store's address has `options`, which Mapweave sets itself: leave them out"
             )
         host = parameters.get("host") or parameters.get("service") or "localhost"
-        return PostgresAddress(parameters, f"{SCHEME}{host}/{parameters.get('dbname', '')}")
+        places = _places(str(host).split(","), port.split(","))
+        return PostgresAddress(parameters, f"{SCHEME}{','.join(places)}/{parameters.get('dbname', '')}")
 
     def conninfo(self, name: str, options: dict[str, str], writes: bool) -> str:
         """For libpq.
@@ -159,8 +172,9 @@ class PostgresSession:
         except psycopg.Error as error:
             if self._connection is not None and self._connection.broken:
                 self._drop()
-            reason = " ".join(str(error).split())
-            raise InvalidFile(f"{self.address.words}: the map store cannot be used ({reason})") from None
+            raise InvalidFile(
+                f"{self.address.words}: the map store cannot be used ({_reason(error)})"
+            ) from None
 
     def close(self) -> None:
         """End the connection for good. Idempotent."""
@@ -172,3 +186,27 @@ class PostgresSession:
         if connection is not None:
             with suppress(psycopg.Error):
                 connection.close()
+
+
+def _places(hosts: list[str], ports: list[str]) -> list[str]:
+    """Each host with its port where one is given; a single port is that of all hosts."""
+    ports = ports * len(hosts) if len(ports) == 1 else ports
+    named = [f"[{host}]" if ":" in host else host for host in hosts]
+    return [f"{host}:{port}" if port else host for host, port in zip(named, ports, strict=False)]
+
+
+def _reason(error: psycopg.Error) -> str:
+    """An error in one line; of several hosts, each with its reason."""
+    if isinstance(error, psycopg.errors.LockNotAvailable):
+        return "another session holds what is to be changed; perhaps it waits for a standby"
+    reason = " ".join(str(error).split())
+    _, *attempts = ATTEMPT.split(reason)
+    hosts, ports, reasons = attempts[::3], attempts[1::3], attempts[2::3]
+    if not reasons:
+        return reason
+    words = [
+        f"{place}: {NOISE.sub('', why).strip()}"
+        for host, port, why in zip(hosts, ports, reasons, strict=True)
+        for place in _places([host or "localhost"], [port or ""])
+    ]
+    return "; ".join(dict.fromkeys(words))

@@ -1,0 +1,84 @@
+"""What a session with PostgreSQL says when there is none: one line, and nothing of libraries."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
+from tests.postgres import PostgresServer, started
+from tests.waiting import free_port
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("postgresql://anna@db1/maps", "postgresql://db1/maps"),
+        ("postgresql://anna@db1:5433/maps", "postgresql://db1:5433/maps"),
+        ("postgresql://anna@db1,db2/maps", "postgresql://db1,db2/maps"),
+        ("postgresql://anna@db1:5441,db2:5442/maps", "postgresql://db1:5441,db2:5442/maps"),
+        ("postgresql://anna@db1:5441,db2/maps", "postgresql://db1:5441,db2/maps"),
+        ("postgresql://anna@/maps?host=db1,db2&port=5433", "postgresql://db1:5433,db2:5433/maps"),
+        ("postgresql://anna@[::1]:5433/maps", "postgresql://[::1]:5433/maps"),
+        ("postgresql://?service=maps", "postgresql://maps/"),
+        ("postgresql:///maps?host=/run/postgresql&port=5433", "postgresql:///run/postgresql:5433/maps"),
+    ],
+)
+def test_an_address_names_its_ports(address: str, words: str) -> None:
+    assert PostgresAddress.read(address).words == words
+
+
+def test_each_of_several_machines_is_named_once_with_its_reason() -> None:
+    first, second = free_port(), free_port()
+    address = PostgresAddress.read(f"postgresql://anna@127.0.0.1:{first},127.0.0.1:{second}/maps")
+    with pytest.raises(InvalidFile) as away:
+        _ = PostgresSession(address, "test").connection
+    assert str(away.value) == (
+        f"{address.words}: the map store cannot be used (127.0.0.1:{first}: Connection refused; "
+        f"127.0.0.1:{second}: Connection refused)"
+    )
+
+
+def test_a_standby_is_named_as_one_that_only_reads(tmp_path: Path) -> None:
+    servers = started("-c", "default_transaction_read_only=on")
+    server = next(servers)
+    try:
+        # A second machine, of which nothing is there.
+        address = PostgresAddress.read(
+            f"postgresql://mapweave@/postgres?host={server.folder},{tmp_path}&port=5432"
+        )
+        with pytest.raises(InvalidFile, match=r"session is read-only; ") as away:
+            _ = PostgresSession(address, "test").connection
+        assert str(away.value).count("session is read-only") == 1
+    finally:
+        servers.close()
+
+
+def test_a_lock_that_another_session_holds_is_explained(postgres: PostgresServer) -> None:
+    address = PostgresAddress.read(postgres.database())
+    session = PostgresSession(address, "test", {"lock_timeout": "10ms"})
+    with psycopg.connect(
+        postgres.address(), autocommit=True, dbname=session.connection.info.dbname
+    ) as holder:
+        holder.execute("CREATE TABLE held (number INT)")
+        with holder.transaction(), pytest.raises(InvalidFile, match="another session") as late:
+            holder.execute("LOCK TABLE held")
+            with session.guard():
+                session.connection.execute("INSERT INTO public.held VALUES (1)")
+        assert "waits for a standby" in str(late.value)
+    session.close()
+
+
+def test_a_connection_that_is_lost_in_a_pipeline_says_no_more_than_its_error(
+    postgres: PostgresServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    session = PostgresSession(PostgresAddress.read(postgres.database()), "test")
+    with pytest.raises(InvalidFile), session.guard(), session.connection.pipeline():
+        with psycopg.connect(postgres.address(), autocommit=True) as other:
+            other.execute("SELECT pg_terminate_backend(%s)", [session.connection.info.backend_pid])
+        session.connection.execute("SELECT 1").fetchone()
+    session.close()
+    assert not caplog.records
