@@ -12,6 +12,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlanImage
 from mapweave.mapserver.log.store import Store
 from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.storage.os_errors import reason_of
 from mapweave.storage.plan_image import check_plan_png
 
 MOST_BYTES = 2**29
@@ -27,6 +28,23 @@ def kept_images(store: Path, annotations: Annotations) -> dict[str, bytes]:
     folder = _folder_of(store)
     files = {name: folder / f"{name}{SUFFIX}" for name in sorted(used)}
     return {name: path.read_bytes() for name, path in files.items() if path.is_file()}
+
+
+def copy_images(store: Path, to: Path) -> None:
+    """Copy all images of a store beside a copy of it. Those that are there are not written again.
+
+    Raises:
+        InvalidFile: one cannot be read, or the disk does not take it.
+    """
+    folder = _folder_of(to)
+    for path in sorted(_folder_of(store).glob(f"*{SUFFIX}")):
+        try:
+            png = read_whole(path)
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InvalidFile(f"{error.filename}: {reason_of(error)}") from None
+        if not _holds(folder / path.name, png):
+            write_whole(folder / path.name, png)
 
 
 def recorded_images(store: Store, annotations: Annotations) -> dict[str, bytes]:

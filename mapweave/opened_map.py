@@ -137,8 +137,12 @@ def open_map(path: Path | str) -> OpenedMap:
     return _of_journal(path) if source is MapSource.JOURNAL else _of_store(path)
 
 
-def source_of(path: Path) -> MapSource:
+def source_of(path: Path, live: bool = False) -> MapSource:
     """What a file is, by its content.
+
+    Args:
+        path: of the file.
+        live: a running agent or server may use it.
 
     Raises:
         InvalidFile: it is no map, cannot be read, or is of a newer version.
@@ -159,7 +163,7 @@ def source_of(path: Path) -> MapSource:
     if head != SQLITE:
         raise InvalidFile(f"{path}: {OTHER}")
     try:
-        with reading(path) as connection:
+        with reading(path, live=live) as connection:
             kind, version = (
                 int(connection.execute(f"PRAGMA {name}").fetchone()[0])
                 for name in ("application_id", "user_version")

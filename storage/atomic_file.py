@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
@@ -24,18 +26,28 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
         # A pipe, a terminal, /dev/null: nothing to keep, and nothing to put in its place.
         path.write_bytes(data)
         return
+    with replacing(path) as beside:
+        beside.write_bytes(data)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A path in the same folder, whose file takes the place of `path` at the end, or is removed on an error.
+
+    Raises:
+        InvalidFile: the disk does not take it; what was there is as before.
+    """
     path = path.resolve()
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with beside.open("wb") as file:
-            file.write(data)
-            file.flush()
+        yield beside
+        with beside.open("rb") as file:
             os.fsync(file.fileno())
         beside.replace(path)
         _sync_folder(path.parent)
     except OSError as error:
         beside.unlink(missing_ok=True)
-        raise _unwritable(path, reason_of(error)) from None
+        raise unwritable(path, reason_of(error)) from None
     except BaseException:
         # Interrupted: remove the temporary file.
         beside.unlink(missing_ok=True)
@@ -60,14 +72,15 @@ def check_place(path: Path) -> None:
         InvalidFile: it is a folder, or its folder is missing or takes no files.
     """
     if path.is_dir() or not path.name:
-        raise _unwritable(path, os.strerror(errno.EISDIR))
+        raise unwritable(path, os.strerror(errno.EISDIR))
     if not path.parent.is_dir():
-        raise _unwritable(path, f"there is no folder {path.parent}")
+        raise unwritable(path, f"there is no folder {path.parent}")
     if not os.access(path.parent, os.W_OK) and not path.exists():
-        raise _unwritable(path, no_permission())
+        raise unwritable(path, no_permission())
 
 
-def _unwritable(path: Path, why: str) -> InvalidFile:
+def unwritable(path: Path, why: str) -> InvalidFile:
+    """The error of a file that cannot be written, with why."""
     return InvalidFile(f"{path}: cannot be written ({why})")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_reader import reading
+from mapweave.storage.file_owner import owning
 from mapweave.storage.os_errors import DISK_FULL, READ_ONLY, no_permission
 
 LEAST_FREE = 1 << 16
@@ -17,13 +18,17 @@ LEAST_FREE = 1 << 16
 DISK_ERRORS = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN)
 BUSY = 1.0
 """How long to wait for a file that another process is about to close, s."""
+LOG_BYTES = 1 << 24
+"""The write-ahead log is cut to this where it has grown behind a reader, for example a backup."""
 
 
 class Database:
     """One SQLite file in WAL mode, each commit on the disk before it returns (synchronous=FULL).
 
-    The file is locked while it is open: two processes that append to one log would use the same sequence
-    numbers.
+    The file belongs to one process while it is open: two that append to one log would use the same sequence
+    numbers. Others may read it, for a backup (see mapweave.storage.database_copy). Where the disk has no room
+    for the index that SQLite shares with readers, or is none that processes can share memory through, it is
+    locked against these, too.
     """
 
     def __init__(
@@ -58,23 +63,13 @@ class Database:
         self._repair = repair
         self._advice = f"; {advice}" if advice else ""
         self._closing = ExitStack()
-        with self.guard():
-            if read_only:
-                self.connection = self._closing.enter_context(reading(path, kind))
-            else:
-                # Threads take turns: a shared Database is used under the caller's lock.
-                self.connection = sqlite3.connect(
-                    path, timeout=BUSY, isolation_level=None, check_same_thread=False
-                )
-        self._closing.callback(self.connection.close)
-        # Text with a flipped bit may be no UTF-8; its meaning is checked by the reader.
-        self.connection.text_factory = lambda data: data.decode("utf-8", "replace")
         try:
             with self.guard():
                 if read_only:
+                    self.connection = self._closing.enter_context(reading(path, kind))
                     self._check_kind(application_id, version)
                 else:
-                    self._prepare(application_id, version, schema)
+                    self._open(application_id, version, schema)
                 self._check_pages()
             self._inode = self._inode_now()
         except BaseException:
@@ -96,9 +91,7 @@ class Database:
             yield
         except sqlite3.Error as error:
             if "locked" in str(error):
-                raise InvalidFile(
-                    f"{self.path}: {self.what} is in use by another process; stop it first"
-                ) from None
+                raise self._in_use() from None
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF
             if code == sqlite3.SQLITE_CORRUPT:
                 raise self._damaged(str(error)) from None
@@ -137,10 +130,38 @@ class Database:
         """Close the file. Idempotent."""
         self._closing.close()
 
-    def _prepare(self, application_id: int, version: int, schema: str) -> None:
+    def _open(self, application_id: int, version: int, schema: str) -> None:
+        owned = True
+        try:
+            self._closing.enter_context(owning(self._file, BUSY))
+        except BlockingIOError:
+            raise self._in_use() from None
+        except OSError:
+            # The folder takes no file, or is not there: SQLite finds out which.
+            owned = False
+        for locking in ("NORMAL", "EXCLUSIVE") if owned else ("EXCLUSIVE",):
+            self._connect()
+            try:
+                self._prepare(application_id, version, schema, locking)
+                return
+            except sqlite3.OperationalError as error:
+                if locking == "EXCLUSIVE" or error.sqlite_errorcode & 0xFF not in DISK_ERRORS:
+                    raise
+                self.connection.close()
+
+    def _connect(self) -> None:
+        # Threads take turns: a shared Database is used under the caller's lock.
+        connection = sqlite3.connect(self.path, timeout=BUSY, isolation_level=None, check_same_thread=False)
+        self._closing.callback(connection.close)
+        # Text with a flipped bit may be no UTF-8; its meaning is checked by the reader.
+        connection.text_factory = lambda data: data.decode("utf-8", "replace")
+        self.connection = connection
+
+    def _prepare(self, application_id: int, version: int, schema: str, locking: str) -> None:
         run = self.connection.execute
-        run("PRAGMA locking_mode=EXCLUSIVE")
+        run(f"PRAGMA locking_mode={locking}")
         run("PRAGMA synchronous=FULL")
+        run(f"PRAGMA journal_size_limit={LOG_BYTES}")
         empty = run("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
         if not empty:
             self._check_kind(application_id, version)
@@ -170,6 +191,9 @@ class Database:
         damage = str(self.connection.execute("PRAGMA quick_check(1)").fetchone()[0])
         if damage != "ok":
             raise self._damaged(damage.splitlines()[-1])
+
+    def _in_use(self) -> InvalidFile:
+        return InvalidFile(f"{self.path}: {self.what} is in use by another process; stop it first")
 
     def _damaged(self, reason: str) -> InvalidFile:
         return InvalidFile(f"{self.path}: {self.what} is damaged ({reason}){self._advice}")

@@ -10,13 +10,14 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.storage.file_owner import is_owned
 
 MAGIC = b"SQLite format 3\0"
 """First bytes of every SQLite file (https://sqlite.org/fileformat2.html, 1.3.1)."""
 
 
 @contextmanager
-def reading(path: Path, what: str = "file") -> Iterator[sqlite3.Connection]:
+def reading(path: Path, what: str = "file", live: bool = False) -> Iterator[sqlite3.Connection]:
     """A connection that only reads; also in a folder that cannot be written.
 
     A file next to which there is no write-ahead log is read in place, as immutable: SQLite then makes no
@@ -26,6 +27,8 @@ def reading(path: Path, what: str = "file") -> Iterator[sqlite3.Connection]:
     Args:
         path: of the file.
         what: for the errors, for example `agent journal`.
+        live: also a file that a process has open as a Database, as it is at one moment: between two of its
+            commits. The process goes on writing, and keeps in the write-ahead log what is newer.
 
     Raises:
         InvalidFile: there is no such file, it cannot be opened, or another process has it open for writing.
@@ -35,13 +38,17 @@ def reading(path: Path, what: str = "file") -> Iterator[sqlite3.Connection]:
     log = path.with_name(path.name + "-wal")
     try:
         with tempfile.TemporaryDirectory() as folder:
-            if not log.exists():
+            owned = is_owned(path)
+            if live and owned:
+                uri = f"{path.absolute().as_uri()}?mode=ro"
+            elif not log.exists():
                 uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
             else:
-                if _in_use(path):
+                if owned or _locked(path):
                     raise InvalidFile(
                         f"{path}: {what} is in use by another process; stop it, or ask the running server, "
-                        "`mapweave map fetch FILE` for example"
+                        "`mapweave map fetch FILE` for example, or read a copy of its store "
+                        "(`mapweave map backup`)"
                     )
                 copy = Path(folder) / "copy"
                 shutil.copyfile(path, copy)
@@ -50,12 +57,28 @@ def reading(path: Path, what: str = "file") -> Iterator[sqlite3.Connection]:
             with closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
                 # Text with a flipped bit may be no UTF-8; its meaning is checked by the reader.
                 connection.text_factory = lambda data: data.decode("utf-8", "replace")
+                if live and owned:
+                    _hold(connection, path, what)
                 yield connection
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _in_use(path: Path) -> bool:
+def _hold(connection: sqlite3.Connection, path: Path, what: str) -> None:
+    """Let a connection see the file as it is now, whatever is written meanwhile."""
+    try:
+        connection.execute("BEGIN")
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except sqlite3.Error as error:
+        if "locked" in str(error):
+            raise InvalidFile(
+                f"{path}: {what} is in use by a process that lets no other read it, for want of disk space "
+                "or on a network file system; stop it first"
+            ) from None
+        raise InvalidFile(f"{path}: {what} cannot be read ({error})") from None
+
+
+def _locked(path: Path) -> bool:
     """Whether a process has locked the file. Makes no file, if a write-ahead log is there already."""
     uri = f"{path.absolute().as_uri()}?mode=ro&readonly_shm=1"
     try:

@@ -6,6 +6,7 @@ import errno
 import os
 import pwd
 
+NO_ROOM = "the disk is full; make room, or give a place on another disk"
 DISK_FULL = "the disk is full; make room, and what waits is written"
 READ_ONLY = "the disk is read-only; a damaged disk becomes so by itself: see the system's log"
 
@@ -15,7 +16,7 @@ def reason_of(error: OSError) -> str:
     if error.errno in (errno.EACCES, errno.EPERM):
         return no_permission()
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "the disk is full; make room, or give a place on another disk"
+        return NO_ROOM
     return READ_ONLY if error.errno == errno.EROFS else error.strerror or str(error)
 
 
