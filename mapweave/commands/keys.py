@@ -45,6 +45,10 @@ def add_to(commands: Any) -> None:
         "--days", type=float,
         help="for which it holds (default: 365); passwords of the lab profile do not expire",
     )  # fmt: skip
+    add.add_argument(
+        "--at", action="append", default=[], metavar="HOST",
+        help="of a server: a further name or address under which robots reach it; may be repeated",
+    )  # fmt: skip
     add.set_defaults(run=_add)
 
     token = _action(actions, "token", "a token with which a person or a script logs in over HTTP")
@@ -99,10 +103,15 @@ def _init(arguments: argparse.Namespace) -> int:
 
 
 def _add(arguments: argparse.Namespace) -> int:
-    from mapweave.commands.usage import UsageError
+    from mapweave.commands.usage import UsageError, arguments_read
+    from mapweave.identities.hosts import check_hosts
     from mapweave.identities.key_folder import KeyFolder, Profile
     from mapweave.wire.credentials import Role
 
+    if arguments.at and arguments.role != Role.SERVER:
+        raise UsageError("--at: is for a server; a robot's key names the servers that the fleet has")
+    with arguments_read():
+        check_hosts(arguments.at)
     days = 365.0 if arguments.days is None else arguments.days
     _check_days(days)
     folder = KeyFolder(arguments.keys)
@@ -110,8 +119,11 @@ def _add(arguments: argparse.Namespace) -> int:
         raise UsageError(
             "--days: passwords of the lab profile do not expire; `mapweave keys revoke` ends one"
         )
-    path = folder.add(arguments.name, Role(arguments.role), days)
+    path = folder.add(arguments.name, Role(arguments.role), days, arguments.at)
     print(f"{path}: copy this file to {arguments.name}, and to no other")
+    if arguments.at:
+        where = ", ".join(folder.catalogue.endpoints)
+        print(f"new keys find the servers at {where}; who has an older key needs `endpoints` in its settings")
     return 0
 
 

@@ -9,8 +9,6 @@ NAME.key.toml     key file of NAME: copy it there
 
 from __future__ import annotations
 
-import ipaddress
-import re
 import secrets
 import socket
 from collections.abc import Iterator, Sequence
@@ -26,6 +24,7 @@ import msgspec
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, Refused, SettingsError
 from mapweave.hybridmap.node import check_name
 from mapweave.identities.folder_changes import kept_on_failure, locked
+from mapweave.identities.hosts import check_hosts, endpoints_of
 from mapweave.identities.key_file import (
     SUFFIX,
     KeyFile,
@@ -44,7 +43,6 @@ from mapweave.wire.credentials import Access, Credentials, Member, Role
 CATALOGUE = "fleet.json"
 AUTHORITY, AUTHORITY_KEY, PASSWORDS = "authority.pem", "authority.key", "passwords"
 PORT = 7447
-HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 SERVER_DAYS = 825
 DAYS = 365
 """For which a key holds, unless it is said otherwise."""
@@ -157,17 +155,13 @@ class KeyFolder:
         """
         check_name(fleet)
         check_name(server)
-        for host in hosts:
-            if not (HOST_NAME.fullmatch(host) or _is_ipv6(host)):
-                raise InvalidValue(
-                    f"--at {host!r}: write a name or an address without a port, such as 192.168.1.10"
-                )
+        check_hosts(hosts)
         scheme = "tls" if profile is Profile.PRODUCTION else "tcp"
         reached = tuple(hosts) or ("127.0.0.1",)
         known = dict.fromkeys((*reached, "localhost", "127.0.0.1", "::1", socket.gethostname()))
         catalogue = Catalogue(
             fleet, profile, (f"{scheme}/0.0.0.0:{port}",),
-            tuple(f"{scheme}/{f'[{host}]' if ':' in host else host}:{port}" for host in reached),
+            endpoints_of(reached, scheme, port),
             tuple(known),
         )  # fmt: skip
         new = not path.exists()
@@ -214,17 +208,33 @@ class KeyFolder:
         """How identities are proved."""
         return self.catalogue.profile
 
-    def add(self, name: str, role: Role, days: float = DAYS) -> Path:
+    def add(self, name: str, role: Role, days: float = DAYS, hosts: Sequence[str] = ()) -> Path:
         """Give an identity a key. One that it has and that was not revoked holds until it expires.
+
+        Args:
+            name: of the robot, server or person.
+            role: what it may do.
+            days: for which the key holds.
+            hosts: of a server, where its router is reached besides the fleet's names of before. From now on
+                certificates of servers have them, and new key files name them.
 
         Returns:
             Its key file.
 
         Raises:
-            InvalidValue: it has a key, and another role.
+            InvalidValue: it has a key, and another role; or a host is no name or address.
         """
         check_name(name)
+        check_hosts(hosts)
         with self._changing():
+            kept = self.catalogue
+            scheme, _, place = kept.listen[0].partition("/")
+            added = endpoints_of(hosts, scheme, int(place.rpartition(":")[2]))
+            self.catalogue = replace(
+                kept,
+                endpoints=tuple(dict.fromkeys((*kept.endpoints, *added))),
+                hosts=tuple(dict.fromkeys((*kept.hosts, *hosts))),
+            )
             return self._add(name, role, days)
 
     def _add(self, name: str, role: Role, days: float) -> Path:
@@ -402,11 +412,3 @@ class KeyFolder:
             raise SettingsError(f"{self.path / name}: {reason_of(error)}") from None
         except UnicodeDecodeError as error:
             raise SettingsError(f"{self.path / name}: {error}") from None
-
-
-def _is_ipv6(host: str) -> bool:
-    try:
-        ipaddress.IPv6Address(host)
-    except ValueError:
-        return False
-    return "%" not in host

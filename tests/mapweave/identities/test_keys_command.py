@@ -279,3 +279,46 @@ def test_a_password_that_would_not_expire_is_not_promised_to(
     capfd.readouterr()
     said = complaint(capfd, "keys", "add", "guest", "--days", 1, "--keys", keys, status=USAGE)
     assert "do not expire" in said and not (keys / "guest.key.toml").exists()
+
+
+def test_a_server_that_comes_later_may_be_on_another_machine(
+    keys: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The fleet's keys were made for one machine: they stay as they are."""
+    where = ["--keys", str(keys)]
+    before = (keys / "r0.key.toml").read_bytes()
+    assert (
+        main(["keys", "add", "s1", "--role", "server", "--at", "maps2.local", "--at", "fd00::7", *where]) == 0
+    )
+    scheme = "tls" if KeyFolder(keys).profile == "production" else "tcp"
+    endpoints = tuple(f"{scheme}/{host}:7447" for host in ("10.0.0.5", "maps2.local", "[fd00::7]"))
+    assert ", ".join(endpoints) in capfd.readouterr().out
+    assert main(["keys", "add", "r1", *where]) == 0
+    for name in ("s1", "r1"):
+        assert read_key_file(keys / f"{name}.key.toml").endpoints == endpoints
+    assert (keys / "r0.key.toml").read_bytes() == before
+    assert Logins(keys).hosts[-2:] == ("maps2.local", "fd00::7"), "its page is served under these names"
+    if scheme == "tls":
+        text = read_key_file(keys / "s1.key.toml").credentials.certificate
+        certificate = x509.load_pem_x509_certificate(text.encode())
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        assert "maps2.local" in names.get_values_for_type(x509.DNSName)
+        assert "fd00::7" in [str(one) for one in names.get_values_for_type(x509.IPAddress)]
+    assert main(["keys", "add", "s1", "--role", "server", "--at", "maps2.local", *where]) == 0
+    assert KeyFolder(keys).catalogue.endpoints == endpoints, "said again, it is there once"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["s1", "--role", "server", "--at", "maps2:7447"], "without a port"),
+        (["r1", "--at", "maps2"], "is for a server"),
+    ],
+)
+def test_where_a_server_is_reached_is_said_of_servers_alone(
+    keys: Path, capfd: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    before = contents(keys)
+    capfd.readouterr()
+    assert said in complaint(capfd, "keys", "add", *words, "--keys", keys, status=USAGE)
+    assert contents(keys) == before
