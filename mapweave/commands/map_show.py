@@ -52,16 +52,16 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.node import EdgeKind
     from mapweave.mapserver.content_hash import content_hash
 
+    if arguments.out is not None and not arguments.no_picture:
+        need("viz")
+    source = opened(arguments.file)
     if not arguments.no_picture:
         try:
             need("viz")
         except MissingExtra as missing:
-            if arguments.out is not None:
-                raise
             # The summary is what most want to know: it needs nothing.
             print(f"mapweave: the picture {missing}", file=sys.stderr)
             arguments.no_picture = True
-    source = opened(arguments.file)
     content, placed = source.content, source.content.poses
     hybrid = HybridMap(content.changes)
     if content.kind == "agent":

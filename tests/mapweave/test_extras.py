@@ -210,6 +210,13 @@ def test_a_trial_names_only_what_is_missing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_map_that_is_not_there_is_the_only_complaint(tmp_path: Path) -> None:
+    """That a picture would need an extra is no matter then."""
+    missing = tmp_path / "office.mapweave"
+    (outcome,) = outcomes(["viz"], [f"map show {missing}"])
+    assert outcome == (1, "", f"mapweave: {missing}: no such file\n")
+
+
 def test_the_extras_are_those_of_the_package() -> None:
     package = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     installed = packages_distributions()
