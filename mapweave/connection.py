@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from mapweave.hybridmap.errors import NotConnected
+from mapweave.identities.validity import out_of_date
 from mapweave.wire.credentials import Role
 
 if TYPE_CHECKING:
@@ -44,7 +45,9 @@ def reach(settings: BusSettings, advice: str = "give the endpoint of its router 
 
 
 def not_let_in(settings: BusSettings) -> str:
-    """Why there is no connection though something listens there, and what to do; empty if nothing listens."""
+    """Why no router lets this in, and what to do; empty if the key is good and nothing listens there."""
+    if old := out_of_date(settings.credentials):
+        return old
     if not any(map(_listens, settings.endpoints)):
         return ""
     hint = _key_hint(settings.credentials) or "; if the fleet has keys, give a key file (--keys FILE)"

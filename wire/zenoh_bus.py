@@ -124,6 +124,11 @@ class ZenohBus:
         """Call the handler with who is alive, now and at each change."""
         return self.declare(Watcher(self.owner, check_pattern(pattern), handler))
 
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed; it does not connect again."""
+        return self._closed.is_set()
+
     def connected(self) -> bool:
         """Whether messages can leave now. A router is always connected."""
         session = self._session

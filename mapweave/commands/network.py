@@ -14,7 +14,7 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 from mapweave.commands import values
-from mapweave.connection import SOON
+from mapweave.connection import LOOK, SOON
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from mapweave.wire.credentials import Credentials
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
+
+LOST = 10.0
+"""s; after which a router that was there counts as lost."""
 
 
 def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
@@ -205,21 +208,34 @@ def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[Zen
 
 
 def warn_without_router(bus: ZenohBus, name: str, settings: BusSettings) -> None:
-    """Warn on stderr if no router is reached soon; does not wait."""
+    """Say on stderr if no router is reached soon or for long, and when one is found then; does not wait.
+
+    A router that is only restarted is not reported.
+    """
     from mapweave.connection import not_let_in
     from mapweave.terminal import stamped
 
-    began = time.monotonic()
+    where = ", ".join(settings.endpoints)
+
+    def say(words: str) -> None:
+        print(stamped(f"{name} {words}"), file=sys.stderr, flush=True)
 
     def look() -> None:
-        # A process that ends earlier has not waited long enough to know.
-        if not bus.wait_connected(SOON) and time.monotonic() - began >= SOON:
-            where = ", ".join(settings.endpoints)
-            advice = not_let_in(settings) or (
-                "start `mapweave server` or `mapweave router`, or give --connect"
-            )
-            line = stamped(f"{name} finds no router at {where}: {advice}; it goes on looking")
-            print(line, file=sys.stderr, flush=True)
+        patience, since = SOON, time.monotonic()
+        while not bus.closed:
+            if bus.connected():
+                patience, since = LOST, time.monotonic()
+            # A process that ends earlier has not waited long enough to know.
+            elif time.monotonic() - since >= patience:
+                advice = not_let_in(settings) or (
+                    "start `mapweave server` or `mapweave router`, or give --connect"
+                )
+                say(f"finds no router at {where}: {advice}; it goes on looking")
+                while not bus.connected() and not bus.closed:
+                    time.sleep(LOOK)
+                if not bus.closed:
+                    say("has found a router")
+            time.sleep(LOOK)
 
     threading.Thread(target=look, name="router", daemon=True).start()
 

@@ -9,13 +9,25 @@ import socket
 import subprocess
 import sys
 import threading
+import time
+from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import cv2
 import numpy as np
 import pytest
 
 from mapweave.cli import main
+from mapweave.commands import network
 from mapweave.exit_status import USAGE
+from mapweave.identities.authority import Authority
+from mapweave.identities.key_file import read_key_file, write_key_file
+from mapweave.identities.key_folder import KeyFolder, Profile
+from mapweave.settings import NetworkSettings
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.credentials import Role
+from mapweave.wire.zenoh_bus import ZenohBus
 from tests.mapweave.command_line import complaint
 from tests.simulator import needs_simulator
 from tests.waiting import eventually
@@ -158,6 +170,71 @@ def test_a_router_that_lets_no_one_in_without_a_key_is_no_missing_router(tmp_pat
             watchdog.cancel()
     assert f"r0 finds no router at {endpoint}: what listens there does not let this in" in said
     assert "--keys FILE" in said and "start `mapweave server`" not in said
+
+
+def test_a_router_that_is_found_after_all_is_reported_once(closed, tmp_path):
+    """The line that there is none was the last word, though the agent had long been connected."""
+    command = [sys.executable, "-m", "mapweave", "agent", "r0", "--connect", closed, "--data", str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as agent:
+        watchdog = threading.Timer(60, agent.kill)
+        watchdog.start()
+        assert agent.stderr is not None
+        lines = (line for line in agent.stderr if " a router" in line or "finds no router" in line)
+        assert "r0 finds no router" in next(lines, "")
+        with closing(ZenohBus(BusSettings(mode="router", listen=(closed,)))):
+            assert next(lines, "").rstrip().endswith("r0 has found a router")
+            agent.send_signal(signal.SIGINT)
+            assert not [line for line in lines if "router" in line]
+        watchdog.cancel()
+
+
+def test_a_router_that_is_lost_for_long_is_reported(closed, capfd, monkeypatch):
+    monkeypatch.setattr(network, "LOST", 3.0)
+    settings, said = BusSettings(endpoints=(closed,)), []
+
+    def heard(words):
+        said.extend(line.split(" ", 2)[2] for line in capfd.readouterr().err.splitlines() if " r0 " in line)
+        return any(words in line for line in said)
+
+    with closing(ZenohBus(settings)) as bus:
+        with closing(ZenohBus(BusSettings(mode="router", listen=(closed,)))):
+            eventually(bus.connected)
+            network.warn_without_router(bus, "r0", settings)
+            time.sleep(1.0)
+        eventually(lambda: not bus.connected())
+        assert not heard("router"), "a router that is restarted is not reported"
+        eventually(lambda: heard(f"r0 finds no router at {closed}: start `mapweave server`"))
+        with closing(ZenohBus(BusSettings(mode="router", listen=(closed,)))):
+            eventually(lambda: heard("r0 has found a router"))
+    assert len(said) == 2
+
+
+def test_the_own_certificate_that_has_expired_is_named_by_an_agent(tmp_path, closed):
+    """It said only that what listens there does not let it in."""
+    folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, ["127.0.0.1"], "s0")
+    folder.add("r0", Role.ROBOT)
+    path, at = folder.key_file("r0"), closed.replace("tcp", "tls")
+    good = read_key_file(path)
+    own = Authority(good.credentials.authority, (tmp_path / "keys" / "authority.key").read_text())
+    old = own.issue("r0", Role.ROBOT, timedelta(days=1), now=datetime(2026, 1, 2, 3, 4, tzinfo=UTC))
+    expired = replace(good.credentials, certificate=old.certificate, private_key=old.private_key)
+    write_key_file(path, replace(good, credentials=expired))
+    router, _ = network.router_settings(NetworkSettings(endpoints=(at,), keys=str(tmp_path / "keys")), "s0")
+    words = ["agent", "r0", "--keys", str(path), "--connect", at, "--data", str(tmp_path)]
+    command = [sys.executable, "-m", "mapweave", *words]
+    with (
+        closing(ZenohBus(router)),
+        subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as agent,
+    ):
+        watchdog = threading.Timer(40, agent.kill)
+        watchdog.start()
+        assert agent.stderr is not None
+        said = next((line for line in agent.stderr if "finds no router" in line), "")
+        agent.send_signal(signal.SIGINT)
+        agent.communicate()
+        watchdog.cancel()
+    assert "the certificate of r0 expired on 2026-01-03 03:04 UTC" in said
+    assert "`mapweave keys add r0 --role robot` at the server" in said
 
 
 def test_an_interrupt_that_a_library_swallows_stops_a_process():
