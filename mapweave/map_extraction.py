@@ -32,7 +32,7 @@ class Extracted:
     complaint: str
 
 
-def extract_maps(source: Path | str, folder: Path) -> tuple[list[Extracted], str]:
+def extract_maps(source: Path | str, folder: Path) -> tuple[list[Extracted], str, str]:
     """Write every robot's own map into a file of a folder. A journal or store must not be in use.
 
     Args:
@@ -40,7 +40,8 @@ def extract_maps(source: Path | str, folder: Path) -> tuple[list[Extracted], str
         folder: made if it is not there.
 
     Returns:
-        The maps, and in one line what could not be read and belongs to no map; empty if nothing.
+        The maps; in one line what could not be read and belongs to no map, empty if nothing; and the source
+        in words, without user and password.
 
     Raises:
         InvalidFile: the source is none of these, or cannot be read.
@@ -61,4 +62,4 @@ def extract_maps(source: Path | str, folder: Path) -> tuple[list[Extracted], str
             write_map_file(written, MapFile("agent", str(map_id), tuple(hybrid.contents())))
         complaint = opened.complaints.get(map_id, "")
         extracted.append(Extracted(map_id, written, len(hybrid.nodes), len(hybrid.edges), complaint))
-    return extracted, opened.complaints.get(None, "")
+    return extracted, opened.complaints.get(None, ""), str(opened.path)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands.map_input import SOURCES, map_source
+from mapweave.exit_status import DONE, FAILED, NO
 
 
 def add_to(actions: Any) -> None:
@@ -18,7 +19,8 @@ def add_to(actions: Any) -> None:
         help="write every robot's own map of a journal, store or map file into a map file",
         description="Write every map that an agent's journal (NAME.sqlite), a server's store or a merged map "
         "file holds into a map file of its own, for example r0.3.mapweave. The agent or server must not be "
-        "running. A file that is there already is never written over.",
+        "running. A file that is there already is never written over. Exit status: 4 if there is no map to "
+        "write.",
     )
     parser.add_argument("source", type=map_source, metavar="FILE", help=SOURCES)
     parser.add_argument(
@@ -29,10 +31,10 @@ def add_to(actions: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write them, and print which; 1 if a part of a map could not be read."""
+    """Write them, and print which; 1 if a part of a map could not be read, 4 if there is none to write."""
     from mapweave.map_extraction import extract_maps
 
-    maps, lost = extract_maps(arguments.source, arguments.out)
+    maps, lost, source = extract_maps(arguments.source, arguments.out)
     if arguments.json:
         rows = [
             {
@@ -51,10 +53,12 @@ def run(arguments: argparse.Namespace) -> int:
             )
             print(f"{extracted.path or extracted.map}: {content}")
         if not maps:
-            print(f"{arguments.source}: holds no map")
+            print(f"{source}: holds no map")
     for extracted in maps:
         if extracted.complaint:
             print(f"mapweave: {extracted.complaint}", file=sys.stderr)
     if lost:
         print(f"mapweave: {lost}", file=sys.stderr)
-    return int(bool(lost) or any(extracted.complaint for extracted in maps))
+    if lost or any(extracted.complaint for extracted in maps):
+        return FAILED
+    return DONE if any(extracted.path for extracted in maps) else NO

@@ -7,14 +7,18 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+import psycopg
 import pytest
 
 from mapweave.agent.replication import salvage
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
+from mapweave.exit_status import NO
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.mapserver.log.postgres_store import PostgresStore
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.storage.map_file import read_map_file
 from synthetic.maps import write_store
 from tests.mapweave.command_line import complaint
@@ -67,6 +71,22 @@ def test_other_files_and_files_in_use_are_named(tmp_path, capfd):
     empty = tmp_path / "empty.sqlite"
     empty.write_bytes(b"")
     assert "nor an agent's journal nor a server's store" in complaint(capfd, "map", "extract", empty)
+
+
+def test_where_there_is_no_map_the_answer_is_no_and_no_user_is_named(tmp_path, capfd, postgres):
+    SqliteStore(tmp_path / "s0.sqlite").close()
+    assert main(["map", "extract", str(tmp_path / "s0.sqlite"), "-o", str(tmp_path / "out")]) == NO
+    assert capfd.readouterr().out == f"{tmp_path / 's0.sqlite'}: holds no map\n"
+    address = postgres.database()
+    PostgresStore(address).close()
+    assert main(["map", "extract", address, "-o", str(tmp_path / "out")]) == NO
+    (said,) = capfd.readouterr().out.splitlines()
+    assert said.endswith(": holds no map")
+    login = psycopg.conninfo.conninfo_to_dict(address)
+    assert address not in said and f"{login['user']}@" not in said and "user" not in said
+    assert main(["map", "extract", address, "-o", str(tmp_path / "out"), "--json"]) == NO
+    journal_with(tmp_path / "r0.sqlite")
+    assert main(["map", "extract", str(tmp_path / "r0.sqlite"), "-o", str(tmp_path / "out")]) == NO
 
 
 def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, capfd):
