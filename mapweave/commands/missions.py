@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.mission_order import MissionReport
 
 STATUS = (
-    "Exit status: 0 if the robot took the mission (with --wait: has done it), 4 if it did not, or the map "
-    "server refused it, 1 if neither can be asked."
+    "Exit status: 0 if the robot took the mission (with --wait: has done it within --timeout), 4 if it did "
+    "not, or the map server refused it, 1 if neither can be asked."
 )
 
 
@@ -114,6 +114,8 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
         if arguments.wait and report.open:
             print(words(report), file=sys.stderr)
             report = fleet.wait(report, arguments.timeout, _progress(), _silence(arguments.robot))
+            if report.open:
+                print(_late(report, arguments.timeout), file=sys.stderr)
     _print([report], arguments.json)
     return _exit_status([report], arguments.wait)
 
@@ -176,6 +178,13 @@ def _silence(robot: str) -> Callable[[float], None]:
         print(words, file=sys.stderr, flush=True)
 
     return show
+
+
+def _late(report: MissionReport, timeout: float) -> str:
+    """That the wait is over and the mission is not."""
+    robot = report.order.robot
+    on = f"the mission goes on: `mapweave stop {robot}` ends it"
+    return f"{robot}: not over after {timeout:g} s (--timeout); {on}"
 
 
 def _print(reports: list[MissionReport], as_json: bool) -> None:

@@ -207,6 +207,7 @@ def test_a_robot_that_falls_silent_is_named_to_who_waits_for_it(
             one.close()
     said = capfd.readouterr().err.splitlines()
     assert "r0: exploring (0%)" in said
+    assert said[-1].startswith("r0: not over after 3 s (--timeout); the mission goes on")
     silent = [line for line in said if line.startswith("r0: nothing heard for ")]
     assert 1 <= len(silent) <= 9 and silent[0].endswith("is its agent running, and its network up?")
     assert said.index("r0: exploring (0%)") < said.index(silent[0])
