@@ -6,6 +6,7 @@ import argparse
 import gc
 import logging
 import os
+import shutil
 import sys
 import threading
 from contextlib import ExitStack
@@ -33,6 +34,8 @@ DEMO_HTTP = "8080"
 TURN = 0.001
 """s, for which a thread has the interpreter while another waits. A question lets go of it twenty times, and
 waited 5 ms for the merge each time, which is Python's own."""
+REMOVALS = 10
+"""How often the files of a demo are removed that ends amid its start, while they are still being made."""
 LARGE = 20_000_000
 """Bytes of a store whose reading is announced, since it takes long."""
 
@@ -165,7 +168,7 @@ def run(arguments: argparse.Namespace) -> int:
         server = MapServer(bus, keys, arguments.store or path, name, how, schedule, base, data)
         if base is not None:
             print(stamped(f"with {base}"), flush=True)
-        started = end_if_stopped_before(stop)
+        started = end_if_stopped_before(stop, data if arguments.demo else None)
         stack.enter_context(server)
         started.set()
         if web is not None:
@@ -195,11 +198,15 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def end_if_stopped_before(stop: threading.Event) -> threading.Event:
+def end_if_stopped_before(stop: threading.Event, temporary: Path | None = None) -> threading.Event:
     """End the process on this event as long as the returned one is not set.
 
     A server reads its store at the start, which takes a minute for 100 000 places. Nothing is lost: what it
     writes meanwhile can be made again, and is written in transactions or whole files.
+
+    Args:
+        stop: set by signals.
+        temporary: a folder that is removed then.
     """
     started = threading.Event()
 
@@ -209,6 +216,10 @@ def end_if_stopped_before(stop: threading.Event) -> threading.Event:
             from mapweave.terminal import stamped
 
             print(stamped("stopped while it was starting"), flush=True)
+            # The server goes on writing until the process ends.
+            if temporary is not None:
+                for _ in range(REMOVALS):
+                    shutil.rmtree(temporary, ignore_errors=True)
             os._exit(0)
 
     threading.Thread(target=wait, name="start", daemon=True).start()

@@ -73,6 +73,23 @@ def post(http: int, path: str, content: dict) -> dict:
         return json.load(reply)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("soon", [0.0, 0.5, 1.5])
+def test_a_demo_that_is_stopped_while_it_starts_leaves_no_folder(tmp_path: Path, soon: float) -> None:
+    command = [
+        sys.executable, "-m", "mapweave", "server", "--demo", "--http", str(free_port()),
+        "--listen", f"tcp/127.0.0.1:{free_port()}",
+    ]  # fmt: skip
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as server:
+        assert server.stdout is not None and "for people" in server.stdout.readline()
+        assert [*tmp_path.iterdir()], "it keeps its files there"
+        time.sleep(soon)
+        server.send_signal(signal.SIGTERM)
+        server.communicate(timeout=60)
+    assert not [*tmp_path.iterdir()]
+
+
 def test_the_recording_is_small_and_whole() -> None:
     assert RECORDING.stat().st_size < 200_000
     maps = recorded_maps()
