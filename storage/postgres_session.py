@@ -48,6 +48,7 @@ NOISE = re.compile(
     r"| Is the server running .*?\?"
 )
 """What libpq says around a reason, when host and port are named already."""
+NO_PASSWORD = "no password supplied"
 
 # It logs what it ignores when a connection is lost; the error itself is raised and reported.
 logging.getLogger("psycopg").setLevel(logging.ERROR)
@@ -200,6 +201,8 @@ def _reason(error: psycopg.Error) -> str:
     if isinstance(error, psycopg.errors.LockNotAvailable):
         return "another session holds what is to be changed; perhaps it waits for a standby"
     reason = " ".join(str(error).split())
+    if reason.endswith(NO_PASSWORD):
+        reason += ": ~/.pgpass (PGPASSFILE) has none for this host, port, database and user"
     _, *attempts = ATTEMPT.split(reason)
     hosts, ports, reasons = attempts[::3], attempts[1::3], attempts[2::3]
     if not reasons:

@@ -10,7 +10,7 @@ import pytest
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 from tests.postgres import PostgresServer, started
-from tests.waiting import free_port
+from tests.waiting import eventually, free_port
 
 
 @pytest.mark.parametrize(
@@ -53,6 +53,29 @@ def test_a_standby_is_named_as_one_that_only_reads(tmp_path: Path) -> None:
         with pytest.raises(InvalidFile, match=r"session is read-only; ") as away:
             _ = PostgresSession(address, "test").connection
         assert str(away.value).count("session is read-only") == 1
+    finally:
+        servers.close()
+
+
+def test_a_password_that_is_missing_is_looked_for_in_its_file() -> None:
+    servers = started()
+    server = next(servers)
+    try:
+        (server.data / "pg_hba.conf").write_text("local all all scram-sha-256\n")
+        with psycopg.connect(server.address(), autocommit=True) as connection:
+            connection.execute("SELECT pg_reload_conf()")
+        address = PostgresAddress.read(server.address())
+
+        def refused() -> str:
+            session = PostgresSession(address, "test")
+            try:
+                return str(session.connection.info.status)
+            except InvalidFile as error:
+                return str(error)
+            finally:
+                session.close()
+
+        eventually(lambda: "no password supplied: ~/.pgpass (PGPASSFILE) has none" in refused())
     finally:
         servers.close()
 
