@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from collections.abc import Mapping
 from contextlib import closing
@@ -16,7 +17,8 @@ import pytest
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.cli import main
-from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.change import ChangeBody, NodeRetired
+from mapweave.hybridmap.node import NodeId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.opened_map import open_map
@@ -29,7 +31,7 @@ from mapweave.wire.log_messages import Scalar, decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.postgres_server import PostgresServer, binaries
-from tests.mapserver.log.acknowledged_fleet import AGENT, life
+from tests.mapserver.log.acknowledged_fleet import AGENT, life, node
 from tests.mapserver.log.test_front_servers import FrontServer, logs_of
 from tests.mapweave.test_map_commands import logs
 from tests.waiting import eventually
@@ -122,6 +124,45 @@ def test_either_of_two_servers_may_be_killed(
     assert sorted(path.name for path in (tmp_path / "maps").iterdir()) == [
         "r0.1.mapweave", "r1.1.mapweave", "r2.1.mapweave",
     ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_what_a_robot_retired_after_a_backup_goes_when_that_is_restored(
+    postgres: PostgresServer, tmp_path: Path
+) -> None:
+    """The robot has dropped the retirement, since the server had it."""
+    folder = binaries()
+    if folder is None or not all((folder / name).exists() for name in ("pg_dump", "pg_restore", "psql")):
+        pytest.skip("this PostgreSQL comes without pg_dump, pg_restore and psql")
+    address, hub = postgres.database(), MemoryHub()
+    database = str(psycopg.conninfo.conninfo_to_dict(address)["dbname"])
+    server = FrontServer(hub, address, "s0")
+    journal = Journal(tmp_path / "r0", "r0")
+    map_id, rng = journal.open_map(1), np.random.default_rng(3)
+    robot = Replicator(MemoryBus(hub), KEYS, journal, map_id, ("s0",), AGENT)
+    robot.submit([node(map_id, number, rng) for number in range(1, 6)], 1)
+    assert robot.wait_acknowledged(60)
+    dump = str(postgres.folder / f"{database}.dump")
+    postgres.run("pg_dump", "--format=custom", "--file", dump, database)
+    robot.submit([NodeRetired(NodeId(*map_id, 2)), node(map_id, 6, rng)], 2)
+    assert robot.wait_acknowledged(60)
+    now = content_hash(open_map(address).content)
+    assert journal.prune(map_id, ["s0"]) == 2
+    server.close()
+
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute(f"DROP DATABASE {database}")
+        people.execute(f"CREATE DATABASE {database}")
+    postgres.run("pg_restore", "--exit-on-error", "--dbname", database, dump)
+    page = (Path(__file__).parents[2] / "docs" / "operations.md").read_text()
+    (command,) = re.findall(r"^\$ sudo -u postgres psql maps -c '(INSERT .*)'$", page, re.MULTILINE)
+    postgres.run("psql", "--dbname", database, "--set", "ON_ERROR_STOP=1", "-c", command)
+
+    server = FrontServer(hub, address, "s0")
+    eventually(lambda: content_hash(open_map(address).content) == now, PATIENCE)
+    robot.close()
+    server.close()
+    journal.close()
 
 
 @pytest.mark.slow
