@@ -94,6 +94,7 @@ CASES: list[tuple[str, str, str]] = [
     ("avoid", "r0.1.1 r0.1.3 --connect {closed}", WITHOUT_SERVER),
     ("closures", "--map {merged}", "nothing is closed"),
     ("floor", "ground r0.1.1 --connect {closed}", WITHOUT_SERVER),
+    ("map backup", "{tmp}/none.sqlite --out {tmp}/copy.sqlite", "no such file"),
     ("map show", "{own}", "nodes"),
     ("map show", "{own}", VIZ),  # the picture is left out, and that is said
     ("map show", "{own} --out {tmp}/own.png", VIZ),
