@@ -101,6 +101,10 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (USAGE, "{map} -o map.gif"), (NO, "{map} --component 99"), (FAILED, "{tmp}/none.mapweave"),
     ],
     "map diff": [(USAGE, "{map}"), (FAILED, "{map} {tmp}/none.mapweave")],
+    "map backup": [
+        (USAGE, "{map}"), (USAGE, "postgresql://db1/maps -o {tmp}/b"), (FAILED, "{map} -o {tmp}/b"),
+        (FAILED, "{tmp}/none.sqlite -o {tmp}/b"),
+    ],
     "map fetch": [(USAGE, ""), (USAGE, "{out} --connect nowhere"), (FAILED, "{out} --connect {at}")],
     "map explain": [
         (USAGE, "r0.1"), (USAGE, "r0.1.1 r1.1.1 --map {map} --draw x.gif"), (USAGE, "r0.1 r1.1 --timeout 0"),
