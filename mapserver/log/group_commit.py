@@ -7,6 +7,7 @@ hundred changes a second, one for all that wait takes in thousands.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,10 @@ from mapweave.mapserver.log.intake import Full, Intakes
 from mapweave.mapserver.log.store import Run, Store
 
 log = logging.getLogger(__name__)
+
+LONG = 5.0
+"""s after which a commit that waits is reported: one that takes longer waits for more than a busy disk."""
+WAITS = "a commit waits: the disk does not answer, or no standby of PostgreSQL confirms"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +52,13 @@ class GroupCommit:
             intakes: what is kept of each robot.
         """
         self._store, self._intakes = store, intakes
+        self._since: float | None = None
+
+    @property
+    def delay(self) -> str:
+        """What holds up the commit that is under way, if it waits too long; from any thread."""
+        since = self._since
+        return WAITS if since is not None and time.monotonic() - since > LONG else ""
 
     def fitting(self, run: NextRun) -> NextRun:
         """What the robot's quota has room for of a run.
@@ -74,6 +86,7 @@ class GroupCommit:
         return results
 
     def _apply(self, runs: Sequence[Run]) -> list[Applied | MapweaveError]:
+        self._since = time.monotonic()
         try:
             return self._store.apply_all(runs)
         except Exception as error:  # a defect with one log must not end the ingest of all
@@ -83,3 +96,5 @@ class GroupCommit:
             return [
                 InvalidFile(f"changes of {names} cannot be stored ({type(error).__name__})") for _ in runs
             ]
+        finally:
+            self._since = None

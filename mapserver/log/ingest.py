@@ -161,7 +161,7 @@ class Ingest:
     @property
     def failure(self) -> str:
         """Why the disk does not take changes at present; empty if it does."""
-        return self._failure
+        return self._failure or self._group.delay
 
     def follow(self, news: News) -> None:
         """Pass on what other servers have written to the store; from any thread, in the ingest's own."""

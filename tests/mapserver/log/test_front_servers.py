@@ -18,7 +18,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.explainer import ConstraintRecord
-from mapweave.mapserver.log import postgres_follower
+from mapweave.mapserver.log import group_commit, postgres_follower
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.server import MapServer
@@ -217,6 +217,36 @@ def test_robots_keep_what_they_have_while_postgresql_is_away(journals: list[Jour
         robot.close()
     server.close()
     servers.close()
+
+
+def test_a_commit_that_waits_for_a_standby_is_reported(
+    journals: list[Journal], postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It neither fails nor ends, so that no error tells of it."""
+    monkeypatch.setattr(group_commit, "LONG", 0.5)
+    hub = MemoryHub()
+    server = FrontServer(hub, postgres.database(), "s0")
+    map_id = journals[0].open_map(1)
+    robot = Replicator(MemoryBus(hub), KEYS, journals[0], map_id, ("s0",), AGENT)
+    rng = np.random.default_rng(3)
+    robot.submit(life(map_id, rng, 10), 1)
+    assert robot.wait_acknowledged(30) and not server.ingest.failure
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute("ALTER SYSTEM SET synchronous_standby_names = 'absent'")
+        people.execute("SELECT pg_reload_conf()")
+        try:
+            # The setting is in force a little later.
+            eventually(lambda: people.execute("SHOW synchronous_standby_names").fetchone() == ("absent",))
+            robot.submit(life(map_id, rng, 10), 2)
+            eventually(lambda: "no standby of PostgreSQL confirms" in server.ingest.failure)
+            assert not robot.wait_acknowledged(0.0)
+        finally:
+            people.execute("ALTER SYSTEM RESET synchronous_standby_names")
+            people.execute("SELECT pg_reload_conf()")
+    assert robot.wait_acknowledged(60)
+    eventually(lambda: not server.ingest.failure)
+    robot.close()
+    server.close()
 
 
 def test_a_frozen_server_does_not_lead_for_ever(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
