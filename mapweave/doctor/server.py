@@ -24,6 +24,7 @@ PATIENCE = 1.5
 def examine(network: NetworkSettings) -> Iterator[Finding]:
     """Knock at each endpoint, then ask the map server how it is."""
     from mapweave.identities.key_file import read_key_file
+    from mapweave.identities.validity import out_of_date
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.zenoh_bus import ZenohBus
 
@@ -35,6 +36,10 @@ def examine(network: NetworkSettings) -> Iterator[Finding]:
         )  # fmt: skip
         return
     credentials = read_key_file(Path(network.keys)).credentials if network.keys else None
+    if old := out_of_date(credentials):
+        reason, _, advice = old.partition(": ")
+        yield wrong(SUBJECT, reason, advice)
+        return
     attempt = PATIENCE / len(network.endpoints)
     bus = ZenohBus(BusSettings(endpoints=network.endpoints, credentials=credentials, attempt=attempt))
     try:

@@ -35,6 +35,7 @@ from mapweave.wire.log_messages import encode_record
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.drivers.emulators import ArduinoSketch
+from tests.mapweave.expired_key import EXPIRED, expired_key
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
@@ -342,6 +343,16 @@ def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
     record["version"] = version("mapweave")
     assert doctor(capfd, *asked)[1]["server"].verdict is Verdict.GOOD
     serving.close()
+
+
+def test_the_own_certificate_that_has_expired_is_named(tmp_path, capfd) -> None:
+    path = expired_key(tmp_path / "keys")
+    with socket.create_server(("127.0.0.1", 0)) as there:
+        endpoint = f"tls/127.0.0.1:{there.getsockname()[1]}"
+        words = ("--connect", endpoint, "--keys", path, "--data", tmp_path)
+        status, findings, first = doctor(capfd, *words)
+    assert (status, first, findings["server"].detail) == (NO, "server", EXPIRED)
+    assert findings["server"].advice.startswith("`mapweave keys add r0 --role robot` at the server")
 
 
 def test_nothing_listens(tmp_path, capfd) -> None:
