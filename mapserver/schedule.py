@@ -24,9 +24,9 @@ IdleJob = Callable[[], float | None]
 """Does a piece of work that can wait. Returns how long to pause, s; None: nothing is left to do."""
 QUIET = 0.02
 """Idle work begins when nothing was posted for so long, s: a burst is taken in as a whole."""
-GIVEN_WAY = 0.02
-"""Longest pause for what is more urgent, s: jobs and their pieces take 4 to 20 ms, so a sixth of the speed is
-left."""
+GIVEN_WAY = 0.1
+"""Longest pause for what is more urgent, s: jobs and their pieces take 4 to 20 ms, so a twentieth to a sixth
+of the speed is left where something always is."""
 ENDING = 30.0
 """Longest wait at the end for a piece of work, s: a pose graph of 100 000 nodes is solved meanwhile."""
 GLANCE = 0.002
