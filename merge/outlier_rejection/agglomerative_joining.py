@@ -114,12 +114,12 @@ def agglomerate(
         waiting = [link for link in waiting if link.key not in through]
     keys = {link.key for link in kept}
     left = [link for links in asked.values() for link in links if link.key not in keys]
-    kept = _with_borne_out(solver, kept, left, agreed, chance, s)
+    kept = _update_chance_support(solver, kept, left, agreed, chance, s)
     keys = {link.key for link in kept}
     return kept, [r for pair, r in refused.items() if pair not in keys]
 
 
-def _with_borne_out(
+def _update_chance_support(
     solver: ComponentSolver,
     kept: Sequence[Link],
     refused: Sequence[Link],
@@ -127,7 +127,7 @@ def _with_borne_out(
     chance: Mapping[MapId, ChanceSupport],
     s: ConsistencySettings,
 ) -> list[Link]:
-    """Kept links, with the refused ones that the joined map bears out after all, until there is none.
+    """Refused links that the joined map bears out after all, until there is none.
 
     Of hundreds of links that are right some two will miss each other's gate by chance, and a clique keeps but
     one of them. What all others make of the map is a better judge than any one of them.
