@@ -307,6 +307,7 @@ class Ingest:
         objections = (self._objection(e.change.body) for e in run.entries if isinstance(e.change, Change))
         if reason := next(filter(None, objections), ""):
             agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)
+            self._acknowledge_unaware([agent_log])
             self._acks.refuse(agent_log.map, agent_log.log_id, reason)
             return None
         try:
@@ -347,9 +348,13 @@ class Ingest:
                 self._observe_ack(time.monotonic() - at)
             if run.full is not None:
                 self._rest(run.log, run.full)
-        for agent_log in self._unaware.values():
-            self._acks.acknowledge(agent_log)
-        self._unaware.clear()
+        self._acknowledge_unaware([*self._unaware.values()])
+
+    def _acknowledge_unaware(self, logs: Iterable[AgentLog]) -> None:
+        """Before a refusal, which an acknowledgement behind it would take back."""
+        for agent_log in logs:
+            if self._unaware.pop(agent_log.map, None) is not None:
+                self._acks.acknowledge(agent_log)
 
     def _recover(self, agent_log: AgentLog, first: int, piece: Piece) -> None:
         """Put damaged changes in their places again, or verify others, and pass on what that changes."""
@@ -395,6 +400,7 @@ class Ingest:
 
     def _rest(self, agent_log: AgentLog, full: Full) -> None:
         """There is no room for more of a log now: it stays on the robot's disk."""
+        self._acknowledge_unaware([agent_log])
         self._quotas.hold_back(agent_log.map.agent, full.what)
         agent_log.forget_ahead()
         agent_log.resting_until = time.monotonic() + QUOTA_PAUSE

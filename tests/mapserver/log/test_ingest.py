@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
+import pytest
+
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
@@ -119,6 +121,29 @@ def test_beacons_that_wait_become_one(server: Server, agent: HandAgent) -> None:
     go_on.set()
     eventually(lambda: [ack.watermark for ack in agent.acks][-1:] == [2])
     assert [ack.watermark for ack in agent.acks] == [1, 2]
+
+
+def test_a_refusal_is_behind_the_acknowledgement_that_a_beacon_asks_for(
+    server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An acknowledgement behind it would tell the robot that its log is taken again."""
+    held, go_on = threading.Event(), threading.Event()
+
+    def hold(change: Change) -> None:
+        held.set()
+        assert go_on.wait(30)
+
+    server.on_change = hold
+    agent.publish(1)
+    assert held.wait(30)
+    monkeypatch.setattr(server.ingest, "_objection", lambda body: "not this one")
+    agent.publish(2)
+    agent.beacon(2)
+    eventually(lambda: server.ingest.waiting == 2)
+    go_on.set()
+    eventually(lambda: any(ack.refusals for ack in agent.acks))
+    eventually(lambda: not server.ingest.waiting and not server.ingest.busy)
+    assert [(ack.watermark, bool(ack.refusals)) for ack in agent.acks] == [(1, False), (1, False), (0, True)]
 
 
 def test_a_restarted_server_replays_and_goes_on(server: Server, agent: HandAgent) -> None:
