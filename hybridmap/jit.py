@@ -56,9 +56,9 @@ _OPTIONS = {"error_model": "numpy", "fastmath": {"contract"}}
 KERNELS: list[Kernel[..., Any]] = []
 """All kernels of the modules that are imported."""
 
-UNCOMPILED = 1000
-"""Calls of a kernel of whole numbers before it is compiled. The landmarks of a node take three, which cost
-1.1 ms uncompiled and 0.4 ms compiled; so these calls cost half of what importing numba does."""
+UNCOMPILED = 300
+"""Calls of a kernel of whole numbers before it is compiled. To read the landmarks of a node is one, which
+costs 1.1 ms uncompiled and 0.1 ms compiled; so these calls cost as much as importing numba does."""
 
 
 class Kernel(Generic[P, R]):
@@ -143,6 +143,11 @@ class Kernel(Generic[P, R]):
 def compiled(function: Callable[P, R]) -> Kernel[P, R]:
     """Compile a function whose annotations name its types: `Matrix` and the like, numbers, named tuples."""
     return Kernel(function, function)
+
+
+def compiled_form_of(python: Callable[P, R]) -> Callable[[Callable[P, R]], Kernel[P, R]]:
+    """Have numba compile a function with loops, and run another that does the same in NumPy without it."""
+    return lambda function: Kernel(function, python)
 
 
 def for_each(function: Callable[Concatenate[Index, P], None]) -> Kernel[Concatenate[int, P], None]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -29,16 +28,8 @@ from mapweave.hybridmap.quantization import (
     restore_landmarks,
     round_landmarks,
 )
-from mapweave.wire.rans import (
-    BitReader,
-    Column,
-    Columns,
-    Frequencies,
-    Ints,
-    LaneReader,
-    LaneWriter,
-    pack_bits,
-)
+from mapweave.wire.landmark_reader import Layout, Numbers, read
+from mapweave.wire.rans import Column, Frequencies, Ints, LaneWriter, pack_bits
 
 HEAD = struct.Struct("<BBHHHHH")
 """Version, flags, count, least x, reach of x, least y, reach of y."""
@@ -46,6 +37,9 @@ HEAD = struct.Struct("<BBHHHHH")
 CHECK_BYTES = 4
 ASCENDING, WITH_DEPTHS = 1, 2
 """Flags: whether y never falls; whether there are depths."""
+
+MOST_STEPS = 65535
+"""Greatest coordinate of a pixel."""
 
 MAX_LANDMARKS_BYTES = MAX_LANDMARKS * ((CODE_BYTES + 3) * TOTAL_BITS + 32) // 8 + HEAD.size + CHECK_BYTES
 """Nothing costs more than this, however unlikely its symbols."""
@@ -67,8 +61,9 @@ def unpack_landmarks(data: bytes, camera: Camera) -> Landmarks:
     Raises:
         InvalidMessage: damaged, of another version, or views' features.
     """
-    rounded, codes = _unpack(data, with_depths=True)
-    return restore_landmarks(rounded, codes, camera)
+    numbers = _unpack(data, with_depths=True)
+    rounded = QuantizedLandmarks(numbers.x, numbers.y, numbers.share, numbers.depth)
+    return restore_landmarks(rounded, numbers.codes, camera)
 
 
 def pack_features(pixels: NDArray[np.float32], codes: NDArray[np.uint8], camera: Camera) -> bytes:
@@ -90,8 +85,8 @@ def unpack_features(data: bytes, camera: Camera) -> tuple[NDArray[np.float32], N
     Raises:
         InvalidMessage: damaged, of another version, or landmarks.
     """
-    rounded, codes = _unpack(data, with_depths=False)
-    return PixelGrid.of(camera).restore(rounded.x, rounded.y), codes
+    numbers = _unpack(data, with_depths=False)
+    return PixelGrid.of(camera).restore(numbers.x, numbers.y), numbers.codes
 
 
 @cache
@@ -102,13 +97,6 @@ def _code_columns() -> tuple[Column, ...]:
 @cache
 def _depth_columns() -> tuple[Column, Column]:
     return Column(landmark_tables().shares), Column(landmark_tables().cells)
-
-
-@cache
-def _read_columns() -> tuple[Columns, Columns, Columns]:
-    """Of codes, shares and cells."""
-    shares, cells = _depth_columns()
-    return Columns.of(_code_columns()), Columns.of([shares]), Columns.of([cells])
 
 
 @cache
@@ -143,7 +131,7 @@ def _pack(rounded: QuantizedLandmarks, codes: NDArray[np.uint8], with_depths: bo
     return data + zlib.crc32(data).to_bytes(CHECK_BYTES, "little")
 
 
-def _unpack(data: bytes, with_depths: bool) -> tuple[QuantizedLandmarks, NDArray[np.uint8]]:
+def _unpack(data: bytes, with_depths: bool) -> Numbers:
     if len(data) < HEAD.size + CHECK_BYTES:
         raise InvalidMessage(f"landmarks: {len(data)} bytes are too few")
     version, flags, count, least_x, reach_x, least_y, reach_y = HEAD.unpack_from(data)
@@ -158,43 +146,20 @@ def _unpack(data: bytes, with_depths: bool) -> tuple[QuantizedLandmarks, NDArray
         raise InvalidMessage(f"{count} landmarks, at most {MAX_LANDMARKS} are allowed")
     ascending = bool(flags & ASCENDING)
     low = _low_bits(count, reach_y) if ascending else reach_y.bit_length()
-    lay = _Layout(count, _lane_size(reach_x, low), reach_y >> low if ascending else None, with_depths)
-    seeds, high, codes, share, depth = _read(body[HEAD.size :], lay)
-    x, y = least_x + (seeds >> low), least_y + (high << low | seeds & ((1 << low) - 1))
-    if x.max(initial=0) > min(least_x + reach_x, 65535) or y.max(initial=0) > min(least_y + reach_y, 65535):
-        raise InvalidMessage("landmarks: a pixel is out of range")
-    return QuantizedLandmarks(x, y, share, depth), codes
-
-
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """Contents of the head.
-
-    Attributes:
-        count: landmarks.
-        size: bits of a lane.
-        steps: of the row of high parts; None without a row.
-        with_depths: whether there are any.
-    """
-
-    count: int
-    size: int
-    steps: int | None
-    with_depths: bool
-
-
-_Parts = tuple[Ints, Ints, NDArray[np.uint8], Ints, Ints]
-"""What the lanes began with, high parts of y, (N, 32) codes, shares, depths."""
-
-
-def _read(data: bytes, lay: _Layout) -> _Parts:
-    bits, nothing = BitReader(data), np.zeros(lay.count, np.int64)
-    high = nothing if lay.steps is None else _read_row(bits, lay.count, lay.steps)
-    lanes = LaneReader(bits, lay.count, lay.size)
-    codes = np.ascontiguousarray(lanes.pop(_read_columns()[0]).T)
-    share, depth = _pop_depths(lanes) if lay.with_depths else (nothing, nothing)
-    bits.end()
-    return lanes.states - (1 << lay.size), high, codes, share, depth
+    return read(
+        body[HEAD.size :],
+        Layout(
+            count,
+            _lane_size(reach_x, low),
+            low,
+            reach_y >> low if ascending else -1,
+            int(with_depths),
+            least_x,
+            min(least_x + reach_x, MOST_STEPS),
+            least_y,
+            min(least_y + reach_y, MOST_STEPS),
+        ),
+    )
 
 
 def _push_depths(lanes: LaneWriter, rounded: QuantizedLandmarks) -> None:
@@ -205,17 +170,6 @@ def _push_depths(lanes: LaneWriter, rounded: QuantizedLandmarks) -> None:
     lanes.push_plain(depth & ((1 << fine) - 1), fine, with_depth)
     lanes.push((depth >> fine).astype(np.uint8)[None], cells, with_depth)
     lanes.push(rounded.share.astype(np.uint8)[None], shares)
-
-
-def _pop_depths(lanes: LaneReader) -> tuple[Ints, Ints]:
-    _, shares, cells = _read_columns()
-    share = lanes.pop(shares)[0].astype(np.int64)
-    with_depth = np.flatnonzero(share)
-    fine = FINE_BITS[share[with_depth]]
-    depth = np.zeros(len(share), np.int64)
-    cell = lanes.pop(cells, with_depth)[0].astype(np.int64)
-    depth[with_depth] = (cell << fine) | lanes.pop_plain(fine, with_depth)
-    return share, depth
 
 
 def _low_bits(count: int, reach: int) -> int:
@@ -233,12 +187,3 @@ def _row_of(high: Ints, steps: int) -> Ints:
     row = np.zeros(len(high) + steps if len(high) else 0, np.int64)
     row[high + np.arange(len(high))] = 1
     return row
-
-
-def _read_row(bits: BitReader, count: int, steps: int) -> Ints:
-    row = bits.read(np.ones(count + steps if count else 0, np.int64))
-    ones = np.flatnonzero(row)
-    if len(ones) != count:
-        raise InvalidMessage(f"landmarks: the rows are not those of {count} landmarks")
-    high: Ints = ones - np.arange(count)
-    return high

@@ -4,8 +4,7 @@ Each lane is a state in [2^m, 2^(m+1)) to which symbols are pushed and from whic
 first out (Duda, arXiv:1311.2540, the variant with ranges; side by side after Giesen, arXiv:1402.3392). A
 symbol of frequency f of 2^12 costs 12 - log2(f) bits. What does not fit into the state any more goes to the
 stream bit by bit; so a lane costs its m bits at the end and hardly half a bit more, and its first state may
-hold m bits of something else. All lanes move together: a column is a few operations on arrays, which numba
-compiles where it is installed.
+hold m bits of something else. All lanes move together: a column is a few operations on arrays.
 """
 
 from __future__ import annotations
@@ -96,7 +95,6 @@ class Columns(NamedTuple):
         return Columns(symbols, widths, places, missing.astype(np.uint16))
 
 
-@compiled
 def pop_columns(
     columns: Columns, windows: Ints, at: int, end: int, size: int, states: Ints, symbols: Bytes
 ) -> int:
