@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import secrets
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -24,7 +25,7 @@ RETRY = 1.0
 OPTIONS = {
     # What is looked for is this program's own, whatever else is in the database.
     "search_path": "mapweave",
-    # A frozen process must not hold up the other servers that share a record.
+    # A frozen process must not hold up other servers on the same record. No time is measured in a pipeline.
     "idle_in_transaction_session_timeout": "10s",
     "lock_timeout": "5s",
     # A machine that lost its power says no goodbye: its session, with all locks, ends after some 11 s.
@@ -33,7 +34,7 @@ OPTIONS = {
     "tcp_keepalives_count": "3",
     "tcp_user_timeout": "11s",
 }
-"""Of each session, at PostgreSQL's side."""
+"""Of each session, at PostgreSQL's side. Set once it is connected: pgbouncer takes none before."""
 KEEPALIVE = {
     "keepalives_idle": 5,
     "keepalives_interval": 2,
@@ -41,6 +42,24 @@ KEEPALIVE = {
     "tcp_user_timeout": 11_000,
 }
 """The same at this side."""
+CLAIM = (
+    "SELECT set_config('mapweave.session', "
+    "coalesce(nullif(current_setting('mapweave.session', true), ''), %s), false)"
+)
+"""Marks a session that has no mark; returns the mark that it has then."""
+SET = "SELECT set_config(name, value, false) FROM unnest(%s::text[], %s::text[]) AS one (name, value)"
+OWN = "SELECT 1 / (current_setting('mapweave.session', true) IS NOT DISTINCT FROM %s)::int"
+"""Fails without this mark, and with it what is sent behind it: no answer has to be waited for."""
+ELSEWHERE = (
+    psycopg.errors.DivisionByZero,
+    psycopg.errors.InvalidSqlStatementName,
+    psycopg.errors.DuplicatePreparedStatement,
+)
+"""Errors of what is sent to a session and arrives at another."""
+SHARED = (
+    "a pooler gives one session to several clients: in pgbouncer set pool_mode = session and "
+    "server_reset_query = DISCARD ALL, or name PostgreSQL's own port"
+)
 ATTEMPT = re.compile(r" ?- host: (?:'(.*?)'|None), port: (?:'(.*?)'|None), hostaddr: (?:'.*?'|None): ")
 """What psycopg writes before the reason why one of several hosts is not connected."""
 NOISE = re.compile(
@@ -95,23 +114,26 @@ class PostgresAddress:
         places = _places(str(host).split(","), port.split(","))
         return PostgresAddress(parameters, f"{SCHEME}{','.join(places)}/{parameters.get('dbname', '')}")
 
-    def conninfo(self, name: str, options: dict[str, str], writes: bool) -> str:
+    def conninfo(self, name: str, writes: bool) -> str:
         """For libpq.
 
         Args:
             name: of the session, as PostgreSQL's lists show it.
-            options: besides those of every session.
             writes: of several hosts connect to the one that takes changes.
         """
-        settings = " ".join(f"-c {key}={value}" for key, value in (OPTIONS | options).items())
         defaults: dict[str, Any] = {"connect_timeout": CONNECT_TIMEOUT, "application_name": name, **KEEPALIVE}
         if writes:
             defaults["target_session_attrs"] = "read-write"
-        return make_conninfo("", **(defaults | self.parameters), options=settings)
+        return make_conninfo("", **(defaults | self.parameters))
 
 
 class PostgresSession:
-    """One connection at a time. Threads take turns: it is used under the caller's lock."""
+    """One connection at a time. Threads take turns: it is used under the caller's lock.
+
+    Locks, notifications and settings are PostgreSQL's session's. A pooler that gives each transaction another
+    session loses them, so two servers could hold the same lock. So a session is marked, and one with
+    another's mark is not used.
+    """
 
     def __init__(
         self,
@@ -126,13 +148,15 @@ class PostgresSession:
         Args:
             address: of the database.
             name: of the session, as PostgreSQL's lists show it.
-            options: settings at PostgreSQL's side.
+            options: settings at PostgreSQL's side, besides those of every session.
             writes: of several hosts connect to the one that takes changes.
-            prepare: called with each new connection.
+            prepare: called with each new connection, in a transaction.
         """
         self.address = address
-        self._conninfo = address.conninfo(name, options or {}, writes)
+        self._conninfo = address.conninfo(name, writes)
+        self._options = OPTIONS | (options or {})
         self._prepare = prepare
+        self._mark = ""
         self._connection: psycopg.Connection | None = None
         self._failure, self._retry_at = "", 0.0
         self._closed = False
@@ -158,7 +182,9 @@ class PostgresSession:
         try:
             with self.guard():
                 self._connection = psycopg.connect(self._conninfo, autocommit=True)
-                self._prepare(self._connection)
+                with self._connection.transaction():
+                    self._claim(self._connection)
+                    self._prepare(self._connection)
         except InvalidFile as error:
             self._drop()
             self._failure, self._retry_at = str(error), time.monotonic() + RETRY
@@ -173,14 +199,35 @@ class PostgresSession:
         except psycopg.Error as error:
             if self._connection is not None and self._connection.broken:
                 self._drop()
-            raise InvalidFile(
-                f"{self.address.words}: the map store cannot be used ({_reason(error)})"
-            ) from None
+            raise self._unusable(_reason(error)) from None
+
+    @contextmanager
+    def transaction(self) -> Iterator[psycopg.Connection]:
+        """A transaction, which fails where a pooler has given it another session.
+
+        Raises:
+            InvalidFile: there is no connection.
+            psycopg.Error: anything else, see `guard`.
+        """
+        connection = self.connection
+        with connection.transaction():
+            connection.execute(OWN, (self._mark,), prepare=False)
+            yield connection
 
     def close(self) -> None:
         """End the connection for good. Idempotent."""
         self._closed = True
         self._drop()
+
+    def _claim(self, connection: psycopg.Connection) -> None:
+        self._mark = secrets.token_hex(8)
+        row = connection.execute(CLAIM, (self._mark,)).fetchone()
+        if row is None or row[0] != self._mark:
+            raise self._unusable(SHARED)
+        connection.execute(SET, ([*self._options], [*self._options.values()]))
+
+    def _unusable(self, reason: str) -> InvalidFile:
+        return InvalidFile(f"{self.address.words}: the map store cannot be used ({reason})")
 
     def _drop(self) -> None:
         connection, self._connection = self._connection, None
@@ -200,6 +247,8 @@ def _reason(error: psycopg.Error) -> str:
     """An error in one line; of several hosts, each with its reason."""
     if isinstance(error, psycopg.errors.LockNotAvailable):
         return "another session holds what is to be changed; perhaps it waits for a standby"
+    if isinstance(error, ELSEWHERE):
+        return SHARED
     reason = " ".join(str(error).split())
     if reason.endswith(NO_PASSWORD):
         reason += ": ~/.pgpass (PGPASSFILE) has none for this host, port, database and user"

@@ -30,6 +30,15 @@ FROZEN = "5s"
 """After so long without a sign of life PostgreSQL ends the session of a leader, and another leads."""
 POLL = 5.0
 """s between two looks at everything: a notification may be lost with its session."""
+STUCK = "10s"
+"""So long a transaction of another server may wait for its server, with the logs that it has locked."""
+END_STUCK = (
+    "SELECT application_name, pg_terminate_backend(pid) FROM pg_stat_activity "
+    "WHERE datname = current_database() AND usename = current_user AND pid <> %s "
+    "AND application_name LIKE %s AND xact_start IS NOT NULL AND wait_event = 'ClientRead' "
+    "AND clock_timestamp() - state_change > %s::interval"
+)
+"""A frozen server's; `idle_in_transaction_session_timeout` does not end transactions in a pipeline."""
 
 
 class PostgresFollower:
@@ -82,7 +91,7 @@ class PostgresFollower:
         while not self._stopping.is_set():
             try:
                 with self._session.guard():
-                    self._follow(self._session.connection)
+                    self._follow()
                 self._failure = ""
             except InvalidFile as error:
                 self._leads = False
@@ -94,21 +103,32 @@ class PostgresFollower:
                 log.exception("what other servers have written could not be followed")
                 self._stopping.wait(RETRY)
 
-    def _follow(self, connection: psycopg.Connection) -> None:
+    def _follow(self) -> None:
         """Once: try to lead, then wait for news."""
         # Also while it is held, which changes nothing: it is the sign of life.
-        row = connection.execute("SELECT pg_try_advisory_lock(%s)", (LEADER_LOCK,)).fetchone()
+        with self._session.transaction() as connection:
+            row = connection.execute("SELECT pg_try_advisory_lock(%s)", (LEADER_LOCK,)).fetchone()
         holds = bool(row and row[0])
         if holds and not self._leads:
             self._look_at_everything()
             log.info("%s: this server leads", self._session.address.words)
         self._leads = holds
         if time.monotonic() >= self._polled_at + POLL:
+            self._end_stuck(connection)
             self._look_at_everything()
         notified = [*connection.notifies(timeout=BEAT, stop_after=1)]
         words = [one.payload for one in notified if one.pid != self._own_session()]
         if words:
             self._changed(_news(words))
+
+    def _end_stuck(self, connection: psycopg.Connection) -> None:
+        for name, _ in connection.execute(END_STUCK, (self._own_session(), "mapweave %", STUCK)):
+            log.warning(
+                "%s: ended the session of %s, which held a transaction open for %s: is that server frozen?",
+                self._session.address.words,
+                name,
+                STUCK,
+            )
 
     def _look_at_everything(self) -> None:
         self._changed(EVERYTHING)

@@ -144,11 +144,11 @@ class PostgresStore(SqlStore):
     def _prepare(self, connection: psycopg.Connection) -> None:
         """A writer's session: what is acknowledged must survive."""
         connection.add_notice_handler(self._note)
-        self._session_id = connection.info.backend_pid
+        # The number that libpq knows is that of a pooler, if there is one.
         settings = connection.execute(
-            "SELECT current_setting('synchronous_commit'), current_setting('fsync')"
+            "SELECT pg_backend_pid(), current_setting('synchronous_commit'), current_setting('fsync')"
         ).fetchone()
-        synchronous, fsync = settings or ("", "")
+        self._session_id, synchronous, fsync = settings or (0, "", "")
         if synchronous in ("off", "local"):
             connection.execute("SET synchronous_commit = on")
         if fsync == "off" and not self._warned:
@@ -183,11 +183,10 @@ class PostgresStore(SqlStore):
     @contextmanager
     def _transaction(self) -> Iterator[None]:
         with self._write_lock, self._writer.guard():
-            connection = self._writer.connection
             self._touched.clear()
-            self._writing = threading.get_ident()
             try:
-                with connection.pipeline(), connection.transaction():
+                with self._writer.connection.pipeline(), self._writer.transaction() as connection:
+                    self._writing = threading.get_ident()
                     yield
                     self._notify(connection)
                     self._warnings.clear()

@@ -95,6 +95,18 @@ def test_a_lock_that_another_session_holds_is_explained(postgres: PostgresServer
     session.close()
 
 
+def test_a_session_that_a_pooler_gave_to_another_is_not_used(postgres: PostgresServer) -> None:
+    session = PostgresSession(PostgresAddress.read(postgres.database()), "test")
+    with session.guard(), session.transaction() as connection:
+        connection.execute("CREATE TABLE public.kept (number INT)")
+    connection.execute("SELECT set_config('mapweave.session', 'of another', false)")
+    shared = "a pooler gives one session to several"
+    with pytest.raises(InvalidFile, match=shared), session.guard(), session.transaction():
+        connection.execute("INSERT INTO public.kept VALUES (1)")
+    assert connection.execute("SELECT count(*) FROM public.kept").fetchone() == (0,)
+    session.close()
+
+
 def test_a_connection_that_is_lost_in_a_pipeline_says_no_more_than_its_error(
     postgres: PostgresServer, caplog: pytest.LogCaptureFixture
 ) -> None:

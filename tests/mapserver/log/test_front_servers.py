@@ -14,18 +14,22 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.explainer import ConstraintRecord
 from mapweave.mapserver.log import group_commit, postgres_follower
+from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.postgres_store import PostgresStore
+from mapweave.mapserver.log.store import Run
 from mapweave.mapserver.server import MapServer
 from mapweave.opened_map import open_map
 from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
 from tests.mapserver.log.acknowledged_fleet import AGENT, KEYS, ROBOTS, SERVER, life
+from tests.mapserver.log.test_store import MAP, entry
 from tests.postgres import PostgresServer, started
 from tests.waiting import eventually
 
@@ -247,6 +251,23 @@ def test_a_commit_that_waits_for_a_standby_is_reported(
     eventually(lambda: not server.ingest.failure)
     robot.close()
     server.close()
+
+
+def test_a_server_that_freezes_while_it_writes_does_not_hold_up_others(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(postgres_follower, "STUCK", "1s")
+    monkeypatch.setattr(postgres_follower, "POLL", 0.2)
+    frozen, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
+    with pytest.raises(InvalidFile), frozen._transaction():
+        frozen._begin([Run(MAP, 5, [entry(1)])])
+        other.follow(lambda news: None)
+        (result,) = other.apply_all([Run(MAP, 5, [entry(1)])])
+        assert isinstance(result, Applied), result
+    (late,) = frozen.apply_all([Run(MAP, 5, [entry(1), entry(2)])])
+    assert isinstance(late, Applied) and (late.before, late.watermark) == (1, 2)
+    other.close()
+    frozen.close()
 
 
 def test_a_frozen_server_does_not_lead_for_ever(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
