@@ -39,7 +39,13 @@ _T = TypeVar("_T")
 
 
 class Schedule(Protocol):
-    """Runs jobs. All methods may be called from any thread."""
+    """Runs jobs. All methods may be called from any thread.
+
+    Attributes:
+        gathering: for how long what is only noted may be gathered, to be processed at once, s; 0: not at all.
+    """
+
+    gathering: float
 
     def monotonic(self) -> float:
         """A clock that only grows, s."""
@@ -107,6 +113,8 @@ def _run(job: Job) -> None:
 
 class LiveSchedule:
     """Threads and the machine's clock."""
+
+    gathering = 0.05
 
     def __init__(self) -> None:
         """Prepare; nothing runs yet."""
@@ -249,6 +257,8 @@ class LockstepSchedule:
 
     What a server answers then depends on what it was sent before, and not on how quick the machine is.
     """
+
+    gathering = 0.0
 
     def __init__(self) -> None:
         """Start at time zero."""
