@@ -12,7 +12,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from mapweave.agent.replication.ack_timer import AckTimer
@@ -69,6 +69,8 @@ SETTLED_BEACONS = 20
 that has lost it learns so."""
 COMPACTED = 1000
 """After so many further changes that servers have, what later ones undo is dropped from the disk."""
+LOOK = 0.1
+"""Between two looks whether a wait for acknowledgements is still worthwhile, s."""
 RAREST = 4
 """A beacon on which nothing follows is sent again after twice the time, up to so many times that of the
 first: the beacons of a fleet that a server cannot keep up with must not hold it up further."""
@@ -168,22 +170,30 @@ class Replicator:
             goal = self._submitted
             return self._changed.wait_for(lambda: self._committed >= goal, timeout)
 
-    def wait_acknowledged(self, timeout: float) -> bool:
+    def wait_acknowledged(self, timeout: float, worthwhile: Callable[[], bool] = lambda: True) -> bool:
         """Wait until every map is on every required server's disk; False if the time is over first.
 
         Beacons do not wait for overdue acknowledgements meanwhile.
+
+        Args:
+            timeout: s.
+            worthwhile: asked about ten times a second whether to wait on.
         """
-        pause, end = self._settings.beacon_interval, time.monotonic() + timeout
+        pause, now = self._settings.beacon_interval, time.monotonic()
+        beacon, end = now + pause, now + timeout
         with self._changed:
             goal = self._submitted
             while not self._changed.wait_for(
                 lambda: self._committed >= goal and self._unacknowledged() == 0,
-                max(0.0, min(pause, end - time.monotonic())),
+                max(0.0, min(LOOK, beacon - now, end - now)),
             ):
-                if time.monotonic() >= end:
+                now = time.monotonic()
+                if now >= end or not worthwhile():
                     return False
-                self._work.put(False)
-                pause = min(2 * pause, RAREST * self._settings.beacon_interval)
+                if now >= beacon:
+                    self._work.put(False)
+                    pause = min(2 * pause, RAREST * self._settings.beacon_interval)
+                    beacon = now + pause
         return True
 
     def status(self) -> ReplicationStatus:

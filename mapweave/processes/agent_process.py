@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 
 SILENCE = 2.0
 """s; a longer wait for the robot is reported."""
+
+ARRIVAL = 2.0
+"""s that an agent at its end waits for a map server to come in reach: a session takes a moment to find it."""
 
 
 def run_agent(
@@ -144,12 +148,25 @@ def _hand_over(
         return  # nothing was mapped, and no server may be there
     if options.patience <= 0:
         line = "offline: the map stays in the journal and is sent when a server can be reached"
-    elif not bus.wait_connected(min(2.0, options.patience)):
-        line = "no server in reach: the map stays in the journal and is sent when one can be reached"
-    elif replicator.wait_acknowledged(options.patience):
+    elif replicator.wait_acknowledged(options.patience, _lately(lambda: agent.server_in_reach)):
         line = f"server {options.server} has it all"
+    elif not bus.connected():
+        line = "no server in reach: the map stays in the journal and is sent when one can be reached"
     elif not agent.server_in_reach:
         line = f"no map server {options.server} in reach: the map stays in the journal until it can be sent"
     else:
         line = f"server {options.server} has not acknowledged everything: the rest stays in the journal"
     say(f"{options.name}: {line}")
+
+
+def _lately(holds: Callable[[], bool]) -> Callable[[], bool]:
+    """Whether something has held within the last ARRIVAL seconds, or has not been asked for longer."""
+    held_at = time.monotonic()
+
+    def lately() -> bool:
+        nonlocal held_at
+        if holds():
+            held_at = time.monotonic()
+        return time.monotonic() - held_at < ARRIVAL
+
+    return lately

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.processes import agent_process
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_files import epochs_of_files
 from mapweave.processes.agent_process import run_agent
@@ -338,14 +340,41 @@ def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_pat
     journal.close()
 
 
-def test_an_agent_that_ends_without_a_map_server_says_so(tmp_path: Path, capfd) -> None:
-    """There is a router. Before, it said that the server has not acknowledged everything."""
-    bus = ZenohBus(BusSettings(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",)))
-    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.3)
+@pytest.mark.parametrize(
+    ("router", "words"), [(True, "no map server s0 in reach"), (False, "no server in reach")]
+)
+def test_an_agent_that_ends_without_a_map_server_says_so_and_does_not_wait_for_it(
+    router: bool, words: str, tmp_path: Path, capfd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It said that the server has not acknowledged everything, and ended only after all its patience."""
+    monkeypatch.setattr(agent_process, "ARRIVAL", 0.3)
+    at = (f"tcp/127.0.0.1:{free_port()}",)
+    bus = ZenohBus(BusSettings(mode="router", listen=at) if router else BusSettings(endpoints=at))
+    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=20.0)
+    began = time.monotonic()
     run_agent(Carried(60), bus, KEYS, AgentSettings(), options, threading.Event())
+    assert time.monotonic() - began < options.patience
     bus.close()
     output = capfd.readouterr()
-    assert "r0: no map server s0 in reach: the map stays in the journal" in output.out + output.err
+    assert f"r0: {words}: the map stays in the journal" in output.out + output.err
+
+
+def test_an_agent_that_has_handed_over_everything_ends_at_once_without_its_server(
+    tmp_path: Path, capfd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It looked for the server again, and said that the map will be sent."""
+    journal = Journal(tmp_path / "r0.sqlite", "r0")
+    journal.append(map_id := journal.open_map(1), one_node(), 0)
+    journal.acknowledge("s0", map_id, 1)
+    journal.close()
+    bus = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
+    monkeypatch.setattr(agent_process, "ARRIVAL", 60.0)
+    options, began = AgentOptions("r0", tmp_path, patience=60.0), time.monotonic()
+    run_agent(Ended(tmp_path / "none"), bus, KEYS, AgentSettings(), options, threading.Event())
+    assert time.monotonic() - began < options.patience
+    bus.close()
+    output = capfd.readouterr()
+    assert "r0: server s0 has it all" in output.out + output.err
 
 
 def test_an_agent_that_has_mapped_nothing_says_of_no_server_that_it_has_it_all(tmp_path, capfd):

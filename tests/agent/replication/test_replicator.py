@@ -255,6 +255,20 @@ def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: Han
     other.bus.close()
 
 
+def test_acknowledgements_are_waited_for_while_that_is_worthwhile(agent: Agent, server: HandServer) -> None:
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    before, looks = len(server.heads), iter([True, True, False])
+    began = time.monotonic()
+    assert not agent.replicator.wait_acknowledged(30, lambda: next(looks))
+    assert not list(looks) and time.monotonic() - began < 30
+    # Beacons go on meanwhile.
+    assert len(server.heads) > before
+    server.acknowledge(agent.log_id, 3)
+    assert agent.replicator.wait_acknowledged(30)
+    assert agent.replicator.wait_acknowledged(30, lambda: False), "nothing is waited for"
+
+
 def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer) -> None:
     agent = Agent(hub, path, ())
     agent.replicator.submit(bodies(1, 3), 0)
