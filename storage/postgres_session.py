@@ -49,13 +49,7 @@ CLAIM = (
 """Marks a session that has no mark; returns the mark that it has then."""
 SET = "SELECT set_config(name, value, false) FROM unnest(%s::text[], %s::text[]) AS one (name, value)"
 OWN = "SELECT 1 / (current_setting('mapweave.session', true) IS NOT DISTINCT FROM %s)::int"
-"""Fails without this mark, and with it what is sent behind it: no answer has to be waited for."""
-ELSEWHERE = (
-    psycopg.errors.DivisionByZero,
-    psycopg.errors.InvalidSqlStatementName,
-    psycopg.errors.DuplicatePreparedStatement,
-)
-"""Errors of what is sent to a session and arrives at another."""
+"""Fails without this mark, and with it what follows in its transaction: no answer has to be waited for."""
 SHARED = (
     "a pooler gives one session to several clients: in pgbouncer set pool_mode = session and "
     "server_reset_query = DISCARD ALL, or name PostgreSQL's own port"
@@ -181,7 +175,9 @@ class PostgresSession:
             raise InvalidFile(self._failure)
         try:
             with self.guard():
-                self._connection = psycopg.connect(self._conninfo, autocommit=True)
+                # A prepared statement is known by a number: with a pooler it could be another session's. Who
+                # uses transactions of `transaction` only may prepare some.
+                self._connection = psycopg.connect(self._conninfo, autocommit=True, prepare_threshold=None)
                 with self._connection.transaction():
                     self._claim(self._connection)
                     self._prepare(self._connection)
@@ -247,7 +243,7 @@ def _reason(error: psycopg.Error) -> str:
     """An error in one line; of several hosts, each with its reason."""
     if isinstance(error, psycopg.errors.LockNotAvailable):
         return "another session holds what is to be changed; perhaps it waits for a standby"
-    if isinstance(error, ELSEWHERE):
+    if isinstance(error, psycopg.errors.DivisionByZero):
         return SHARED
     reason = " ".join(str(error).split())
     if reason.endswith(NO_PASSWORD):

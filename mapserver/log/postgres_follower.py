@@ -61,9 +61,8 @@ class PostgresFollower:
                 seconds, and before this server leads, with everything.
         """
         self._own_session, self._changed = own_session, changed
-        self._session = PostgresSession(
-            address, f"mapweave {name} follows", {"idle_session_timeout": FROZEN}, prepare=self._listen
-        )
+        ends = dict.fromkeys(("idle_session_timeout", "idle_in_transaction_session_timeout"), FROZEN)
+        self._session = PostgresSession(address, f"mapweave {name} follows", ends, prepare=self._listen)
         self._leads = False
         self._failure = ""
         self._polled_at = 0.0

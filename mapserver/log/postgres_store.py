@@ -55,6 +55,8 @@ TYPES = {
 }
 """Of columns that are no numbers."""
 TABLES_THERE = "SELECT tablename FROM pg_tables WHERE schemaname = 'mapweave'"
+PREPARED_AFTER = 5
+"""Uses of a statement, by a session that writes."""
 SCHEMA_LOCK = 0x4D575354
 """Advisory lock of who makes the tables: 'MWST'."""
 
@@ -144,6 +146,7 @@ class PostgresStore(SqlStore):
     def _prepare(self, connection: psycopg.Connection) -> None:
         """A writer's session: what is acknowledged must survive."""
         connection.add_notice_handler(self._note)
+        connection.prepare_threshold = PREPARED_AFTER
         # The number that libpq knows is that of a pooler, if there is one.
         settings = connection.execute(
             "SELECT pg_backend_pid(), current_setting('synchronous_commit'), current_setting('fsync')"

@@ -51,6 +51,26 @@ def test_settings_of_a_session_pass_a_pooler(postgres: PostgresServer) -> None:
             session.close()
 
 
+def test_a_query_is_not_taken_for_that_of_another_session(postgres: PostgresServer) -> None:
+    with pooled(postgres, "session") as pooler:
+        address = PostgresAddress.read(pooler.through(postgres.database()))
+        sessions = [PostgresSession(address, name) for name in ("s0", "s1")]
+
+        def asked() -> list[tuple[int, int]]:
+            return [
+                session.connection.execute(f"SELECT {k}, pg_backend_pid() WHERE %s", [True]).fetchall()[0]
+                for k, session in enumerate(sessions)
+            ]
+
+        for _ in range(10):
+            asked()
+        pooler.pool("transaction")
+        eventually(lambda: len({session for _, session in asked()}) == 1)
+        assert [number for number, _ in asked()] == [0, 1]
+        for session in sessions:
+            session.close()
+
+
 def test_pooled_transactions_are_refused(postgres: PostgresServer) -> None:
     with pooled(postgres, "transaction") as pooler:
         address = pooler.through(postgres.database())
