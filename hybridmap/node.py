@@ -16,8 +16,8 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import Name, Number
 from mapweave.hybridmap.pose import Array, PoseGaussian
-from mapweave.hybridmap.ranges import Ranges
-from mapweave.hybridmap.trajectory_segment import TrajectorySegment
+from mapweave.hybridmap.ranges import NO_RANGES, Ranges
+from mapweave.hybridmap.trajectory_segment import NO_SEGMENT, TrajectorySegment
 
 CODE_BYTES = 32
 """Length of a compact descriptor in memory, a byte for each coordinate (mapweave.hybridmap.descriptor)."""
@@ -215,8 +215,8 @@ class Node:
     landmarks: Landmarks
     clock: str = ""
     radius: float = 0.0
-    ranges: Ranges = field(default_factory=Ranges)
-    segment: TrajectorySegment = field(default_factory=TrajectorySegment)
+    ranges: Ranges = NO_RANGES
+    segment: TrajectorySegment = NO_SEGMENT
 
     def __post_init__(self) -> None:
         """Refuse a trajectory segment of other sensors.

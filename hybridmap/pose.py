@@ -106,12 +106,15 @@ class PoseGaussian:
             InvalidValue: wrong shape, not finite, not symmetric or not positive semi-definite.
         """
         p = np.asarray(self.covariance, dtype=np.float64)
-        finite = map(math.isfinite, (self.mean.x, self.mean.y, self.mean.heading))
-        if p.shape != (3, 3) or not np.isfinite(p).all() or not all(finite):
+        numbers: list[float] = p.ravel().tolist()
+        mean = self.mean
+        if p.shape != (3, 3) or not all(map(math.isfinite, (mean.x, mean.y, mean.heading, *numbers))):
             raise InvalidValue("a pose needs finite numbers and a (3, 3) covariance")
-        if not _is_covariance(*p.ravel().tolist()):
+        if not _is_covariance(*numbers):
             raise InvalidValue("a pose's covariance must be symmetric and positive semi-definite")
-        object.__setattr__(self, "covariance", 0.5 * (p + p.T))
+        _, xy, xh, yx, _, yh, hx, hy, _ = numbers
+        symmetric = (xy, xh, yh) == (yx, hx, hy)
+        object.__setattr__(self, "covariance", p.copy() if symmetric else 0.5 * (p + p.T))
 
     def __matmul__(self, other: PoseGaussian) -> PoseGaussian:
         """Compose two independent Gaussian poses to first order."""

@@ -65,3 +65,7 @@ class Ranges:
             return Ranges()
         distances = np.clip(np.asarray(proximity, np.float64), 0.0, reach) + radius
         return Ranges(np.array(bearings, np.float64), distances, reach + radius)
+
+
+NO_RANGES = Ranges()
+"""Of a robot without proximity sensors."""

@@ -51,3 +51,7 @@ class TrajectorySegment:
     def __len__(self) -> int:
         """How many moments."""
         return len(self.ages)
+
+
+NO_SEGMENT = TrajectorySegment()
+"""Of a node whose robot shares no clock with others."""

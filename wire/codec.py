@@ -22,8 +22,8 @@ from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER, MAX_STAMP_NS, Key, Name, Number, Stamp
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
-from mapweave.hybridmap.ranges import Ranges
-from mapweave.hybridmap.trajectory_segment import TrajectorySegment
+from mapweave.hybridmap.ranges import NO_RANGES
+from mapweave.hybridmap.trajectory_segment import NO_SEGMENT
 from mapweave.wire.landmark_codec import MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
 from mapweave.wire.packing import Limit, pack, unpack
 from mapweave.wire.pose_codec import MAX_MEASURED, pack_camera, pack_pose, unpack_camera, unpack_pose
@@ -211,7 +211,7 @@ def _node_message(node: Node) -> _NodePut:
 
 def _read_node(message: _NodePut, landmarks: Landmarks | None) -> Node:
     camera = unpack_camera(message.camera)
-    ranges = Ranges() if message.ranges is None else unpack_ranges(message.ranges)
+    ranges = NO_RANGES if message.ranges is None else unpack_ranges(message.ranges)
     return Node(
         message.id,
         message.stamp_ns,
@@ -221,7 +221,7 @@ def _read_node(message: _NodePut, landmarks: Landmarks | None) -> Node:
         message.clock or "",
         message.radius_mm / 1000.0,
         ranges,
-        TrajectorySegment() if message.segment is None else unpack_trajectory(message.segment, ranges),
+        NO_SEGMENT if message.segment is None else unpack_trajectory(message.segment, ranges),
     )
 
 
