@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
 from mapweave.mapserver.log.sql_store import SqlStore
@@ -23,6 +23,8 @@ APPLICATION_ID = 0x4D575354
 """'MWST' in the file's header."""
 
 VERSION = 2
+MOST_MAPS = 4096
+"""Of which it is remembered how many landmarks each node has."""
 ADVICE = (
     "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: robots send "
     "again what they keep"
@@ -43,6 +45,8 @@ class SqliteStore(SqlStore):
         """
         super().__init__()
         self._lock = threading.RLock()
+        self._landmarks: dict[MapId, dict[int, int]] = {}
+        """By map and number, of all nodes of some maps: each node and edge that comes asks for some."""
         self._database = Database(path, "map store", APPLICATION_ID, VERSION, SCHEMA, repair, ADVICE)
         for gap in self.damaged():
             log.error("%s: %s", path, _words(gap))
@@ -58,6 +62,20 @@ class SqliteStore(SqlStore):
     def follow(self, changed: Callable[[News], None]) -> None:
         """Nothing: no other server writes to the file."""
 
+    def landmarks(self, node: NodeId) -> int | None:
+        """How many landmarks a node has; None if there is no such node."""
+        with self._lock:
+            counts = self._landmarks.get(node.map)
+            if counts is None:
+                query = "SELECT number, landmarks FROM node WHERE agent = ? AND epoch = ?"
+                counts = dict(self._read(query, node.map))
+                # A change may name maps that are not there: they take no room.
+                if counts:
+                    if len(self._landmarks) >= MOST_MAPS:
+                        del self._landmarks[next(iter(self._landmarks))]
+                    self._landmarks[node.map] = counts
+            return counts.get(node.number)
+
     def close(self) -> None:
         """Close the file. Idempotent."""
         with self._lock:
@@ -69,8 +87,13 @@ class SqliteStore(SqlStore):
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        with self._lock, self._database.transaction():
-            yield
+        with self._lock:
+            try:
+                with self._database.transaction():
+                    yield
+            except BaseException:
+                self._landmarks.clear()
+                raise
 
     def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
         query = "SELECT log_id, watermark FROM log WHERE agent = ? AND epoch = ?"
@@ -90,9 +113,15 @@ class SqliteStore(SqlStore):
 
     def _write(self, query: str, values: Sequence[object]) -> None:
         self._database.connection.execute(query, values)
+        if "FROM node " in query:
+            self._landmarks.clear()
 
-    def _put(self, table: str, values: Sequence[object]) -> None:
+    def _put(self, table: str, values: Sequence[Any]) -> None:
         insert(self._database.connection, table, values)
+        if table == "node":
+            agent, epoch, number, landmarks = values
+            if (counts := self._landmarks.get(MapId(agent, epoch))) is not None:
+                counts[number] = landmarks
 
 
 def _words(gap: Gap) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,15 +14,16 @@ from hypothesis import strategies as st
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue, MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.log import sql_store
+from mapweave.mapserver.log import sql_store, sqlite_store
 from mapweave.mapserver.log.entry import Applied, Entry
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
+from mapweave.mapserver.log.sql_sizes import SqlSizes
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import ROW_BYTES, Run, Store
 from mapweave.wire.codec import encode_body, encode_change
@@ -398,3 +401,46 @@ def test_reasons_of_refusals_are_bounded(store: Store, monkeypatch: pytest.Monke
     assert store.refused() == 10 and store.watermark(MAP) == 40
     assert [refusal.sequence for refusal in store.refusals(MAP)] == [1, 2, 3, *range(34, 41)]
     assert store.stored_bytes(MAP, 0, 40) < 10 * (ROW_BYTES + 200)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from([MAP, OTHER]), st.integers(1, 4)), max_size=20))
+def test_what_is_remembered_of_nodes_is_what_the_rows_say(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, MapId, int]]
+) -> None:
+    store = SqliteStore(tmp_path_factory.mktemp("store") / "s")
+    nodes = [NodeId(*map_id, number) for map_id in (MAP, OTHER) for number in range(1, 5)]
+    log_ids = {MAP: 5, OTHER: 6}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sqlite_store, "MOST_MAPS", 1)
+        for count, (kind, map_id, number) in enumerate(steps, 1):
+            put = node_put(number, count, map_id)
+            last = store.watermark(map_id)
+            coming = Entry.read(map_id, last + 1, encode_change(Change(map_id, last + 1, 7, put)))
+            run = Run(map_id, log_ids[map_id], [coming])
+            if kind <= 1:
+                assert not isinstance(store.apply_all([run])[0], MapweaveError)
+            elif kind == 2:
+                with patch.context() as failing:
+                    failing.setattr(store, "_apply", failing_behind(store._apply))
+                    with pytest.raises(ZeroDivisionError):
+                        store.apply_all([run])
+            elif kind == 3:
+                store.prune([NodeId(*map_id, number)], [], {})
+            elif kind == 4 and last:
+                store.drop(map_id, [sequence for sequence, _ in store.superseded(map_id, 100)])
+            elif last:
+                list(store.restore(map_id, last, last, [replace(coming, sequence=last)]))
+                store.verify(map_id, 1, last - 1, {1})
+            assert [store.landmarks(n) for n in nodes] == [SqlSizes.landmarks(store, n) for n in nodes]
+    store.close()
+
+
+def failing_behind(apply: Callable[..., object]) -> Callable[..., object]:
+    """What has been written by then is rolled back."""
+
+    def fail(*args: Any) -> object:
+        apply(*args)
+        raise ZeroDivisionError
+
+    return fail
