@@ -32,12 +32,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.node import NAME, MapId, check_name
 
 VERSION = "1"
 MAX_EPOCH = 2**53
+MAX_KEY = 256
+"""Characters of a key that is read."""
+KEYS_KEPT = 8192
+"""Keys of which the meaning is kept: they come again and again."""
 
 
 def check_epoch(epoch: int) -> int:
@@ -274,8 +279,7 @@ class Keys:
         return f"{self.root}/agent/{check_name(map_id.agent)}/{what}/{check_epoch(map_id.epoch)}"
 
     def _parse_map(self, what: str, key: str) -> MapId:
-        agent, epoch = self._chunks(f"agent/*/{what}/*", key)
-        return MapId(_name(agent, key), _number(epoch, key))
+        return _map_of(self, what, key)
 
     def _parse_names(self, form: str, key: str) -> list[str]:
         return [_name(chunk, key) for chunk in self._chunks(form, key)]
@@ -283,14 +287,25 @@ class Keys:
     def _chunks(self, form: str, key: str) -> list[str]:
         """The chunks that match `*` of the form."""
         wanted = [*self.root.split("/"), *form.split("/")]
-        given = key.split("/") if len(key) <= 256 else []
+        given = key.split("/") if len(key) <= MAX_KEY else []
         if len(given) != len(wanted) or any(w not in ("*", g) for w, g in zip(wanted, given, strict=True)):
-            raise InvalidMessage(f"key {key[:256]!r} is not of the form {self.root}/{form}")
+            raise InvalidMessage(f"key {key[:MAX_KEY]!r} is not of the form {self.root}/{form}")
         return [g for w, g in zip(wanted, given, strict=True) if w == "*"]
+
+
+@lru_cache(KEYS_KEPT)
+def _map_of(keys: Keys, what: str, key: str) -> MapId:
+    agent, epoch = keys._chunks(f"agent/*/{what}/*", key)
+    return MapId(_name(agent, key), _number(epoch, key))
 
 
 def robot_of(key: str) -> str:
     """In whose name a message or a question comes: a robot's, or a person's with a key; else empty."""
+    return _robot_in(key) if len(key) <= MAX_KEY else _robot_in.__wrapped__(key)
+
+
+@lru_cache(KEYS_KEPT)
+def _robot_in(key: str) -> str:
     match key.split("/")[3:]:
         case ["agent" | "robot", name, *_] | ["server", _, _, name] if NAME.fullmatch(name):
             return name
