@@ -99,7 +99,7 @@ def start(folder: Path, queries: Sequence[Query], places: Sequence[Place], bar: 
         finally:
             bus.close()
         began = time.monotonic()
-        children.end(NAME, 600.0)
+        children.end(NAME, patience=600.0)
         out["end_s"] = time.monotonic() - began
     return out
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -72,17 +73,18 @@ class Children:
                     f"{name} ended with status {process.returncode}: {last} ({self._log(name)})"
                 )
 
-    def end(self, name: str, patience: float = 20.0) -> None:
-        """Ask one to end, wait, and kill it if it does not."""
-        process = self._running.pop(name, None)
-        if process is None:
-            return
-        with process:
+    def end(self, *names: str, patience: float = 20.0) -> None:
+        """Ask some to end, all at once, wait, and kill those that do not."""
+        processes = [self._running.pop(name) for name in names if name in self._running]
+        for process in processes:
             process.terminate()
-            try:
-                process.wait(patience)
-            except subprocess.TimeoutExpired:
-                process.kill()
+        until = time.monotonic() + patience
+        for process in processes:
+            with process:
+                try:
+                    process.wait(max(0.0, until - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    process.kill()
 
     def kill(self, name: str) -> None:
         """End one at once, without a word (SIGKILL)."""

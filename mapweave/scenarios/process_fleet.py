@@ -117,8 +117,8 @@ class ProcessFleet:
 
     def end(self) -> None:
         """Agents first: they hand over what they have; the server last."""
-        for name in (*self._stage.robots, "sim", "server"):
-            self._children.end(name)
+        self._children.end(*self._stage.robots)
+        self._children.end("sim", "server")
         for emulator in self._emulators.values():
             emulator.close()
         self._emulators.clear()

@@ -75,6 +75,40 @@ def test_a_child_is_ended_and_a_failed_one_is_reported(tmp_path: Path) -> None:
             eventually(children.check)
 
 
+LAST = """
+import signal, sys, time
+from pathlib import Path
+folder, name = Path(sys.argv[1]), sys.argv[2]
+def end(*_):
+    (folder / f"{name}.asked").touch()
+    while len(list(folder.glob("*.asked"))) < 3:
+        time.sleep(0.01)
+    print("all were asked", flush=True)
+    sys.exit()
+signal.signal(signal.SIGTERM, end)
+print("ready", flush=True)
+time.sleep(60.0)
+"""
+"""A child that ends only once all three have been asked to."""
+
+
+def test_children_are_asked_to_end_before_any_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One after the other took as long as all of them together."""
+    popen, command, names = subprocess.Popen, [sys.executable, "-c", LAST, str(tmp_path)], ["a", "b", "c"]
+    monkeypatch.setattr(subprocess, "Popen", lambda args, **more: popen([*command, *args[3:]], **more))
+    with Children(tmp_path) as children:
+        for name in names:
+            children.start(name, [name])
+        logs = [tmp_path / f"{name}.log" for name in names]
+        eventually(lambda: all("ready" in log.read_text() for log in logs))
+        pids = [children.pid(name) for name in names]
+        children.end(*names, "none", patience=30.0)
+        assert not any(runs(pid) for pid in pids)
+    assert all("all were asked" in log.read_text() for log in logs)
+
+
 def test_the_stdin_of_all_others_means_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(parent_watchdog.NAME, raising=False)
     stop = threading.Event()
