@@ -22,7 +22,6 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.command_line import command_line
-from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
 from mapweave.agent.observation import Odometry
@@ -96,6 +95,9 @@ class Theirs:
 
     def __init__(self, run: MappingRun) -> None:
         """Start with all landmarks of the first image, from our priors."""
+        # It imports scipy.stats, which takes as long as a sixth of all that the tests import.
+        from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
+
         s = plain(run)
         self._filter = FilterPyMapping(
             run.camera, AXLE, WHEEL_NOISE, run.pixels[0], s.pixel_sigma, PRIOR_DEPTH, PRIOR_SPREAD

@@ -7,7 +7,6 @@ import pytest
 
 from benchmarks.ekf_speed import benchmark as ekf_speed
 from benchmarks.ekf_speed.benchmark import Ours, Theirs, gap, plain, race
-from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
 from mapweave.hybridmap.camera import Camera
 from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, draw_run
 from tests.quick import first_quick
@@ -43,6 +42,9 @@ def test_transition_is_the_motions_derivative() -> None:
     """FilterPy's dense F against central differences of its own motion."""
     run = draw_run(np.random.default_rng(23), "arc", steps=20, landmarks=5, camera=AHEAD)
     step = run.odometry[-1]
+    # Here, since it takes half a second to import.
+    from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
+
     filter_ = FilterPyMapping(run.camera, AXLE, WHEEL_NOISE, run.pixels[0], 0.7, 2.5, 1.2)
     at = filter_.x.copy()
     filter_.move(step)

@@ -161,6 +161,8 @@ def test_a_router_that_lets_no_one_in_without_a_key_is_no_missing_router(tmp_pat
             lines = (line for line in agent.stderr if "finds no router" in line)
             said = next(lines, "")
             agent.send_signal(signal.SIGINT)
+            # Else the agent ends only when Zenoh gives up the attempt to connect, after 10 s.
+            there.close()
             agent.communicate()
             watchdog.cancel()
     assert f"r0 finds no router at {endpoint}: what listens there does not let this in" in said
