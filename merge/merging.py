@@ -4,7 +4,7 @@
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
 3. Pieces are joined, best supported first, and the links between the larger pieces are sorted again. Links
    within one piece must agree with it.
-4. Each component is optimised. Where few links are refused, each is tried once more by solving with it.
+4. Each component is optimised.
 5. Where two robots would have been at the same place at the same time, the links that cause this are
    refuted, and the merge continues at 2 with the rest.
 6. Drives of a robot among others' nodes are checked against the result.
@@ -26,7 +26,6 @@ from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
-from mapweave.merge.outlier_rejection.readmission import readmitted
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
@@ -174,11 +173,7 @@ def _joined(
 ) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
     """Join and optimise: the components, the links that are kept, and those that are not."""
     kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
-    solver.solve(kept, whole=whole)
-    tried = [r.link for r in unjoined if r.link is not None]
-    kept += readmitted(solver, kept, tried, s.consistency)
-    keys = {link.key for link in kept}
-    return solver.solve(kept), kept, [r for r in unjoined if r.pair not in keys]
+    return solver.solve(kept, whole=whole), kept, unjoined
 
 
 def _weighed(

@@ -92,17 +92,6 @@ RULES = (
         ),
     ),
     Rule(
-        "readmission",
-        "merge/outlier_rejection/readmission.py",
-        (
-            (
-                "chi-square over the optimum of Manhattan in four: {graphs/readmission/manhattan:.3f} "
-                "instead of {graphs/all rules/manhattan:.6f}",
-                "rules_graphs",
-            ),
-        ),
-    ),
-    Rule(
         "mutual exclusion",
         "merge/mutual_exclusion/",
         (_trials("mutual exclusion", "twin-corridor"),),

@@ -42,9 +42,8 @@ MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "chance support": ((Sorted, "beyond_chance", _as_it_is),),
     "dominance": ((pairwise_consistency, "_rival", _nothing),),
     "refused links heard again": (
-        (agglomerative_joining, "_update_chance_support", lambda _solver, kept, *_: list(kept)),
+        (agglomerative_joining, "_with_borne_out", lambda _solver, kept, *_: list(kept)),
     ),
-    "readmission": ((merging, "readmitted", _nothing),),
 }
 """Rules on links, for fleets without images."""
 TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {

@@ -114,12 +114,12 @@ def agglomerate(
         waiting = [link for link in waiting if link.key not in through]
     keys = {link.key for link in kept}
     left = [link for links in asked.values() for link in links if link.key not in keys]
-    kept = _update_chance_support(solver, kept, left, agreed, chance, s)
+    kept = _with_borne_out(solver, kept, left, agreed, chance, s)
     keys = {link.key for link in kept}
     return kept, [r for pair, r in refused.items() if pair not in keys]
 
 
-def _update_chance_support(
+def _with_borne_out(
     solver: ComponentSolver,
     kept: Sequence[Link],
     refused: Sequence[Link],
@@ -127,7 +127,7 @@ def _update_chance_support(
     chance: Mapping[MapId, ChanceSupport],
     s: ConsistencySettings,
 ) -> list[Link]:
-    """Refused links that the joined map bears out after all, until there is none.
+    """Kept links, with the refused ones that the joined map bears out after all, until there is none.
 
     Of hundreds of links that are right some two will miss each other's gate by chance, and a clique keeps but
     one of them. What all others make of the map is a better judge than any one of them.
@@ -268,5 +268,5 @@ def borne_out(
     out = [bool(good) and link.key in agreed for link, good in zip(links, fits, strict=True)]
     asked = [k for k, good in enumerate(out) if not good]
     for k, standpoint in zip(asked, standpoints([links[k] for k in asked], graph, kept=False), strict=True):
-        out[k] = bool(standpoint.log_factor > least)
+        out[k] = bool(standpoint.log_factor > least and standpoint.residual2 < s.gate)
     return out

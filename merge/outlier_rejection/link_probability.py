@@ -51,6 +51,8 @@ class Standpoint(NamedTuple):
         strain2: `off` in the link's own uncertainty, chi-square with 3 degrees of freedom.
         alone: whether only this link connects the two.
         log_factor: natural logarithm of Bayes' factor for the link, 0 if it is alone.
+        residual2: of the link in a map that is solved with it, in its own uncertainty and `FLOOR`, chi-square
+            with 3 degrees of freedom: what is left where the map yields as far as it is uncertain.
     """
 
     merged_a_from_b: PoseGaussian
@@ -58,6 +60,7 @@ class Standpoint(NamedTuple):
     strain2: float
     alone: bool
     log_factor: float
+    residual2: float
 
 
 def prior_odds(merged: MergedMap) -> float:
@@ -124,7 +127,7 @@ def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> St
         information = np.linalg.inv(merged.covariance) - weight
         scale = np.linalg.inv(np.linalg.cholesky(weight))
         if np.linalg.eigvalsh(scale @ information @ scale.T)[0] < NO_INFORMATION:
-            return Standpoint(merged, off, strain2, True, 0.0)
+            return Standpoint(merged, off, strain2, True, 0.0, 0.0)
         rest = np.linalg.inv(information)
         moved = rest @ np.linalg.solve(merged.covariance, off)
     spread = own + rest + FLOOR
@@ -132,6 +135,7 @@ def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> St
     anywhere = -math.log(area * 2.0 * math.pi)
     log_density = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * spread)[1])
     if log_density <= anywhere:
-        return Standpoint(merged, off, strain2, True, 0.0)
-    factor = log_density - 0.5 * float(moved @ np.linalg.solve(spread, moved)) - anywhere
-    return Standpoint(merged, off, strain2, False, factor)
+        return Standpoint(merged, off, strain2, True, 0.0, 0.0)
+    weighed = np.linalg.solve(spread, moved)
+    factor = log_density - 0.5 * float(moved @ weighed) - anywhere
+    return Standpoint(merged, off, strain2, False, factor, float(weighed @ (own + FLOOR) @ weighed))

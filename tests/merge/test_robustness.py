@@ -6,13 +6,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.links import Link
 from synthetic.city import draw_grid
-from synthetic.fleet import FleetSettings, draw_fleet
+from synthetic.fleet import BARE, CAMERA, FleetSettings, draw_fleet
 from synthetic.gnc import wrong_measurements
 from synthetic.merge_rivals import RIVALS, error, oracle, precision_recall
 from synthetic.pose_graph import batch_optimum, chi2_of, factors_of, split
@@ -100,3 +103,46 @@ def test_links_that_are_all_right_end_at_the_batch_optimum(heading_sigma: float)
     merged = merge_maps(maps, links)
     assert len(merged.links) == len(links)
     assert chi2_of(factors_of(graph), merged, nodes) == pytest.approx(batch_optimum(graph), rel=1e-3)
+
+
+@pytest.mark.parametrize("side", [10.0, 1000.0])
+def test_many_links_of_one_place_make_no_refused_link_likelier(side: float) -> None:
+    """They are dependent: a link that all of them contradict stays refused, however many they are.
+
+    However large the floor is: there a false link would hardly be so near, but one that is badly measured is.
+    """
+    place = [Pose2(0.1 * k, 0.0, 0.0) for k in range(10)]
+    maps = {
+        MapId(agent, 1): _drive(agent, [*place, Pose2(side, 0.0, 0.0), Pose2(side, side, 0.0)])
+        for agent in "ab"
+    }
+    links = [
+        Link(
+            NodeId("a", 1, j),
+            NodeId("b", 1, k),
+            PoseGaussian.from_sigmas(place[j].inverse() @ place[k], 0.01, 0.003),
+        )
+        for j in range(10)
+        for k in range(10)
+    ]
+    sigmas = np.array([0.06, 0.12, 0.03])
+    # 4.6 standard deviations from where everything else has it: 99.9 % of right links are within four.
+    off = Pose2.from_vector(sigmas * 4.6 / np.sqrt(3.0) * [1.0, -1.0, 1.0])
+    wrong = replace(links[0], a_from_b=PoseGaussian(off, np.diag(sigmas**2)))
+    merged = merge_maps(maps, [wrong, *links[1:]])
+    assert [link.pair for link in merged.links] == [link.pair for link in links[1:]]
+
+
+def _drive(agent: str, poses: list[Pose2]) -> HybridMap:
+    """A map whose way is known to millimetres."""
+    out = HybridMap()
+    for k, pose in enumerate(poses):
+        here = NodeId(agent, 1, k)
+        out.apply(
+            NodePut(Node(here, k * 1_000_000_000, PoseGaussian.from_sigmas(pose, 0.003, 0.001), CAMERA, BARE))
+        )
+        if k:
+            step = PoseGaussian.from_sigmas(poses[k - 1].inverse() @ pose, 0.003, 0.001)
+            edge_id = EdgeId(agent, 1, len(poses) + k)
+            out.apply(EdgePut(Edge(edge_id, NodeId(agent, 1, k - 1), here, step, EdgeKind.MAPPED)))
+    return out

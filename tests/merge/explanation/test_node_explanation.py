@@ -126,6 +126,25 @@ def test_leaving_a_link_out_is_as_good_as_solving_without_it(merged: MergedMap) 
         assert one.log_factor == pytest.approx(math.log(density * area * 2 * np.pi), abs=0.1)
 
 
+def test_what_is_left_of_a_residual_is_foretold_without_solving(merged: MergedMap) -> None:
+    own = [m for fragment in fragments_of(merged.maps) for m in fragment.measurements]
+    links = between(merged)
+    rng = np.random.default_rng(5)
+    for link in links[::3]:
+        wrong = link.a_from_b.mean @ Pose2.from_vector(rng.normal(0.0, [0.2, 0.2, 0.1]))
+        rest = own + [Measurement(*x.pair, x.a_from_b, robust=True) for x in links if x is not link]
+        asked = Link(*link.pair, PoseGaussian(wrong, link.a_from_b.covariance), link.shared, link.evidence)
+        (foretold,) = standpoints([asked], solve_graph(link.a, Pose2(), rest), kept=False)
+        floored = asked.a_from_b.covariance + FLOOR
+        solved = solve_graph(
+            link.a, Pose2(), [*rest, Measurement(*link.pair, PoseGaussian(wrong, floored), robust=True)]
+        )
+        off = (wrong.inverse() @ Pose2.from_vector(solved.relative([link.a], [link.b]).means[0])).vector
+        floored += np.diag(LEAST_SIGMAS**2)
+        # The graph is not quite linear.
+        assert foretold.residual2 == pytest.approx(off @ np.linalg.solve(floored, off), rel=0.02, abs=0.05)
+
+
 def test_a_link_that_alone_joins_has_the_odds_of_all_links(merged: MergedMap) -> None:
     link = between(merged)[0]
     graph = solve_graph(
