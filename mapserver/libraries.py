@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 
 from mapweave.hybridmap import jit
@@ -13,8 +15,13 @@ SLOW = (
 """Imported by the functions that use them. A second together, in which a server can show its map already."""
 
 
-def load_libraries() -> None:
-    """Import the libraries and compile the kernels: no robot that asks waits for an import or a compiler."""
-    for name in SLOW:
-        import_module(name)
-    jit.load()
+def library_jobs() -> list[Callable[[], None]]:
+    """Jobs that import the libraries and compile the kernels: no robot that asks waits for these.
+
+    Each is a job by itself, so that a server which is stopped meanwhile ends without the rest.
+    """
+    return [*(partial(_load, name) for name in SLOW), jit.load]
+
+
+def _load(name: str) -> None:
+    import_module(name)

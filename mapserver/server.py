@@ -32,7 +32,7 @@ from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.cluster.cluster import Cluster
 from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
-from mapweave.mapserver.libraries import load_libraries
+from mapweave.mapserver.libraries import library_jobs
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, News
@@ -208,7 +208,8 @@ class MapServer:
         clock.every(EVERY, self._places.save_if_worthwhile)
         self._store.follow(self._follow)
         # Behind the reading of the store: its map can be seen meanwhile.
-        clock.post(load_libraries)
+        for job in library_jobs():
+            clock.post(job)
         return self
 
     def __exit__(

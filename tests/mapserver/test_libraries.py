@@ -1,0 +1,50 @@
+"""Libraries that take long to import are loaded behind the reading of the store, one after the other."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from mapweave.mapserver import libraries, server
+from mapweave.mapserver.libraries import SLOW, library_jobs
+from mapweave.mapserver.server import MapServer
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+
+
+def test_all_are_loaded_and_the_kernels_behind_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[str] = []
+    monkeypatch.setattr(libraries, "import_module", loaded.append)
+    monkeypatch.setattr(libraries.jit, "load", lambda: loaded.append("kernels"))
+    for job in library_jobs():
+        job()
+    assert loaded == [*SLOW, "kernels"]
+
+
+def test_a_server_loads_all_of_them(hub: MemoryHub, tmp_path: Path) -> None:
+    bus = MemoryBus(hub)
+    with MapServer(bus, Keys("fleet"), tmp_path / "s0.sqlite", "s0") as running:
+        assert running.settle(60)
+        assert set(SLOW) <= sys.modules.keys()
+    bus.close()
+
+
+def test_a_server_that_is_stopped_meanwhile_ends_without_the_rest(
+    hub: MemoryHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was one job, and who stopped a server at its start waited for two seconds of it."""
+    began, more, ran = threading.Event(), threading.Event(), list[int]()
+
+    def first() -> None:
+        began.set()
+        more.wait(0.5)
+
+    monkeypatch.setattr(server, "library_jobs", lambda: [first, lambda: ran.append(2), lambda: ran.append(3)])
+    bus = MemoryBus(hub)
+    with MapServer(bus, Keys("fleet"), tmp_path / "s0.sqlite", "s0"):
+        assert began.wait(30)
+    bus.close()
+    assert not ran
