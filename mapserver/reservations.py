@@ -264,7 +264,7 @@ def _free(stops: Points, radius: float, others: Mapping[str, _Lease]) -> tuple[i
     """How many stops of a way may be driven to, the points up to there, and who holds the next part."""
     from scipy.spatial import cKDTree
 
-    held, length = stops[:1], 0.0
+    parts, length = [stops[:1]], 0.0
     trees = {name: cKDTree(other.held) for name, other in others.items()}
     for number, (a, b) in enumerate(pairwise(stops)):
         length += float(np.linalg.norm(b - a))
@@ -272,21 +272,25 @@ def _free(stops: Points, radius: float, others: Mapping[str, _Lease]) -> tuple[i
         for name, other in sorted(others.items()):
             width = radius + other.radius + MARGIN
             if _touches(part, stops[0], trees[name], other, width):
-                return number, held, name
+                return number, np.vstack(parts), name
         if number and length > AHEAD:
-            return number, held, ""
-        held = np.vstack([held, part])
-    return len(stops) - 1, held, ""
+            break
+        parts.append(part)
+    else:
+        number = len(stops) - 1
+    return number, np.vstack(parts), ""
 
 
 def _touches(part: Points, here: Points, tree: cKDTree, other: _Lease, width: float) -> bool:
     """Whether a robot on a part of its way would touch another; it may always drive away from it."""
-    distances, nearest = tree.query(part)
+    distances, nearest = tree.query(part, distance_upper_bound=width)
     close = distances < width
+    if not close.any():
+        return False
     # Where the other stands: only to come nearer to it is forbidden.
-    stands = np.linalg.norm(other.held[nearest] - other.here, axis=1) < STEP
-    leaves = distances >= np.linalg.norm(here - other.here) - 1e-9
-    return bool((close & ~(stands & leaves)).any())
+    stands = np.linalg.norm(other.held[nearest[close]] - other.here, axis=1) < STEP
+    leaves = distances[close] >= np.linalg.norm(here - other.here) - 1e-9
+    return not bool((stands & leaves).all())
 
 
 def _place_aside(lease: _Lease, others: Sequence[_Lease], router: Router) -> _Aside | None:
