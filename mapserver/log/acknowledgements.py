@@ -67,7 +67,7 @@ class Acknowledgements:
     def _tell_newest(self, request: Request) -> None:
         _, agent = self._keys.parse_ack(request.key)
         try:
-            maps = (*self._store.maps(), *self._taken)
+            maps = (*self._store.maps(agent), *self._taken)
         except InvalidFile as error:
             request.refuse(str(error))
             return

@@ -67,7 +67,7 @@ class KeptBytes:
             InvalidFile: the store cannot be read.
         """
         if self._behind is None:
-            self._behind = {map_id for map_id in self._store.maps() if map_id.agent == self._agent}
+            self._behind = set(self._store.maps(self._agent))
         while self._behind:
             map_id = next(iter(self._behind))
             kept = self._maps.setdefault(map_id, _Kept())

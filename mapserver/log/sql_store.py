@@ -45,9 +45,11 @@ OLDEST_REASON = (
 class SqlStore(SqlSizes, Store):
     """The logs, and the server's own results."""
 
-    def maps(self) -> list[MapId]:
-        """All maps of which something is known."""
-        return [MapId(*row) for row in self._read("SELECT agent, epoch FROM log ORDER BY agent, epoch")]
+    def maps(self, agent: str | None = None) -> list[MapId]:
+        """All maps of a robot, or of all robots, of which something is known."""
+        where, values = ("", ()) if agent is None else ("WHERE agent = ? ", (agent,))
+        rows = self._read(f"SELECT agent, epoch FROM log {where}ORDER BY agent, epoch", values)
+        return [MapId(*row) for row in rows]
 
     def positions(self, maps: Collection[MapId] | None = None) -> dict[MapId, Position]:
         """Which log is kept of each of these maps, or of all, and how far it is settled."""

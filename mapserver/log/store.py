@@ -94,8 +94,8 @@ class Store(Protocol):
         Before this server leads, it is called once more: what the leader before wrote is known then.
         """
 
-    def maps(self) -> list[MapId]:
-        """All maps of which something is known."""
+    def maps(self, agent: str | None = None) -> list[MapId]:
+        """All maps of a robot, or of all robots, of which something is known."""
 
     def positions(self, maps: Collection[MapId] | None = None) -> dict[MapId, Position]:
         """Which log is kept of each of these maps, or of all, and how far it is settled."""

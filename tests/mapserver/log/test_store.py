@@ -106,6 +106,7 @@ def test_all_is_there_after_a_restart(place: Path | str) -> None:
     store = open_store(place)
     assert store.id == store_id
     assert store.maps() == [MAP, OTHER]
+    assert (store.maps("r1"), store.maps("r")) == ([OTHER], [])
     assert (store.watermark(MAP), store.log_id(MAP)) == (3, 2**64 - 1)
     replayed = list(store.replay(MAP))
     assert [(c.sequence, c.stamp_ns) for c in replayed] == [(1, 7), (3, 7)]
