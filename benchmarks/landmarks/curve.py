@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -145,6 +143,10 @@ def _view(place: SimulatedPlace, sift: Sift, rng: np.random.Generator) -> tuple[
 
 def draw(curve: dict[str, dict[str, float]], seed: int, out: Path) -> Path:
     """Write a PNG into a folder, which is made; returns its path."""
+    # It takes long to import, which tests that draw nothing do not wait for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(6.0, 4.0), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()

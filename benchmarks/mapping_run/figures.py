@@ -6,16 +6,18 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse, Polygon
 
 from benchmarks.mapping_run.scene import MappingDrive
 from benchmarks.mapping_run.score import LastKnown, track_errors
 from mapweave.hybridmap.pose import Array, wrap_angle
+
+if TYPE_CHECKING:
+    # It takes long to import, which tests that draw nothing do not wait for.
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Ellipse
 
 ESTIMATE, TRUTH, WHEELS, GREEN, PERSON = "#1f77b4", "#222222", "#d95f02", "#2a9d4b", "#f3d9d6"
 COLOURS = ("#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0")
@@ -36,6 +38,9 @@ def draw(run: MappingDrive, out: Path) -> tuple[Path, ...]:
 
 @contextmanager
 def _sheet(run: MappingDrive, title: str, path: Path, size: tuple[float, float]) -> Iterator[Figure]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=size, dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(f"{run.name}: {title}", fontsize=11)
@@ -137,6 +142,8 @@ def _draw_landmarks(run: MappingDrive, path: Path) -> None:
 
 def _draw_map(run: MappingDrive, path: Path) -> None:
     """The plan, in the anchor's frame: ways, and landmarks as they were known last, with their ellipses."""
+    from matplotlib.patches import Polygon
+
     anchor_from_world, known = run.world_from_anchor.inverse(), LastKnown.of(run)
     true, _ = run.truth(known.ids)
     with _sheet(run, "plan, in the anchor's frame", path, (11, 8)) as figure:
@@ -263,6 +270,8 @@ def _recent_tracks(run: MappingDrive, number: int) -> dict[int, Array]:
 
 def _ellipse(point: Array, covariance: Array, alpha: float) -> Ellipse:
     """Two standard deviations in the plane."""
+    from matplotlib.patches import Ellipse
+
     values, vectors = np.linalg.eigh(covariance)
     width, height = 4.0 * np.sqrt(np.maximum(values, 0.0))
     angle = math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.navigate.drives import Outcome
@@ -31,6 +29,10 @@ def draw(outcomes: Sequence[Outcome], mapped: Mapped, plan: FloorPlan, folder: P
 
 def _draw_views(outcomes: Sequence[Outcome], path: Path) -> None:
     """Figure 11: a drive a row: desired view, reached view, their difference."""
+    # It takes long to import, which tests that draw nothing do not wait for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     numbers = sorted(range(len(outcomes)), key=lambda k: (outcomes[k].success, k))[:MOST]
     figure = Figure(figsize=(10, 2.75 * len(numbers)), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
