@@ -121,7 +121,7 @@ class Roster:
     def status_period(self) -> float:
         """How much time between two statuses of a robot there should be, s; 0: as they like, 0.5 s.
 
-        Statuses of a thousand robots, twice a second, take the server a quarter of a core.
+        Statuses of a thousand robots, twice a second, take the server a fifth of a core.
         """
         with self._turn:
             period = len(self._alive) / STATUSES_PER_S
