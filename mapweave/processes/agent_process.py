@@ -148,7 +148,7 @@ def _hand_over(
         return  # nothing was mapped, and no server may be there
     if options.patience <= 0:
         line = "offline: the map stays in the journal and is sent when a server can be reached"
-    elif replicator.wait_acknowledged(options.patience, _lately(lambda: agent.server_in_reach)):
+    elif replicator.wait_acknowledged(options.patience, _recently(lambda: agent.server_in_reach)):
         line = f"server {options.server} has it all"
     elif not bus.connected():
         line = "no server in reach: the map stays in the journal and is sent when one can be reached"
@@ -159,14 +159,14 @@ def _hand_over(
     say(f"{options.name}: {line}")
 
 
-def _lately(holds: Callable[[], bool]) -> Callable[[], bool]:
+def _recently(holds: Callable[[], bool]) -> Callable[[], bool]:
     """Whether something has held within the last ARRIVAL seconds, or has not been asked for longer."""
     held_at = time.monotonic()
 
-    def lately() -> bool:
+    def recently() -> bool:
         nonlocal held_at
         if holds():
             held_at = time.monotonic()
         return time.monotonic() - held_at < ARRIVAL
 
-    return lately
+    return recently
