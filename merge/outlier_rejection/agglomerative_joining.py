@@ -13,7 +13,6 @@ from collections.abc import Container, Mapping, Sequence, Set
 import networkx as nx
 
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.merge.outlier_rejection.closing_links import misfits
 from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
 from mapweave.merge.outlier_rejection.link_probability import standpoints
@@ -68,18 +67,12 @@ def agglomerate(
     waiting = [link for key, links in asked.items() if key[0] != key[1] for link in links]
     between = {key: group.sorted for key, group in groups.items() if group.first is not group.second}
     chance = _chance_support(groups, standing)
-    agreed = {
-        link.key
-        for key in asked
-        if key in between
-        for link in _beyond_chance(between[key], [between[key]], chance[key[0].map], s).kept
-    }
     sorted_before: dict[Key, tuple[PoseGraph, PoseGraph, int, Sorted]] = {}
     while True:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in waiting if by_node[link.a] is by_node[link.b]]
         waiting = [link for link in waiting if by_node[link.a] is not by_node[link.b]]
-        borne_out = _borne_out(inside, by_node, agreed, chance, s)
+        borne_out = _borne_out(inside, by_node, chance, s)
         kept += borne_out
         fits = {link.pair for link in borne_out}
         for link in inside:
@@ -114,7 +107,7 @@ def agglomerate(
         waiting = [link for link in waiting if link.key not in through]
     keys = {link.key for link in kept}
     left = [link for links in asked.values() for link in links if link.key not in keys]
-    kept = _with_borne_out(solver, kept, left, agreed, chance, s)
+    kept = _with_borne_out(solver, kept, left, chance, s)
     keys = {link.key for link in kept}
     return kept, [r for pair, r in refused.items() if pair not in keys]
 
@@ -123,7 +116,6 @@ def _with_borne_out(
     solver: ComponentSolver,
     kept: Sequence[Link],
     refused: Sequence[Link],
-    agreed: set[tuple[NodeId, NodeId]],
     chance: Mapping[MapId, ChanceSupport],
     s: ConsistencySettings,
 ) -> list[Link]:
@@ -136,7 +128,7 @@ def _with_borne_out(
     while refused:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in refused if by_node[link.a] is by_node[link.b]]
-        back = _borne_out(inside, by_node, agreed, chance, s)
+        back = _borne_out(inside, by_node, chance, s)
         if not back:
             return kept
         kept += back
@@ -227,13 +219,10 @@ def _ranked(weights: Mapping[Key, float]) -> list[Key]:
 def _borne_out(
     links: Sequence[Link],
     by_node: Mapping[NodeId, Fragment],
-    agreed: set[tuple[NodeId, NodeId]],
     chance: Mapping[MapId, ChanceSupport],
     s: ConsistencySettings,
 ) -> list[Link]:
-    """The links within pieces that these bear out: others of their group agree with them and they fit, or how
-    well they fit makes it likely enough that they are true.
-    """
+    """The links within pieces that these bear out: likely ones to which they can be bent without strain."""
     inside: dict[NodeId, tuple[PoseGraph, list[Link]]] = {}
     for link in links:
         piece = by_node[link.a]
@@ -241,32 +230,10 @@ def _borne_out(
     out: list[Link] = []
     for graph, inside_links in inside.values():
         least = max(0.0, LEAST_EVIDENCE - chance[inside_links[0].a.map].log_odds)
-        good = borne_out(inside_links, graph, agreed, least, s)
-        out += [link for link, yes in zip(inside_links, good, strict=True) if yes]
-    return out
-
-
-def borne_out(
-    links: Sequence[Link],
-    graph: PoseGraph,
-    agreed: Container[tuple[NodeId, NodeId]],
-    least: float,
-    s: ConsistencySettings,
-) -> list[bool]:
-    """Of links within one piece, which it bears out.
-
-    Args:
-        links: with both ends in the piece.
-        graph: the piece.
-        agreed: links that others of their group agree with.
-        least: natural logarithm of Bayes' factor from which any other one is likely enough.
-        s: when links are accepted.
-    """
-    if not links:
-        return []
-    fits = misfits(links, graph, s) < s.gate
-    out = [bool(good) and link.key in agreed for link, good in zip(links, fits, strict=True)]
-    asked = [k for k, good in enumerate(out) if not good]
-    for k, standpoint in zip(asked, standpoints([links[k] for k in asked], graph, kept=False), strict=True):
-        out[k] = bool(standpoint.log_factor > least and standpoint.residual2 < s.gate)
+        rated = standpoints(inside_links, graph, kept=False)
+        out += [
+            link
+            for link, one in zip(inside_links, rated, strict=True)
+            if one.log_factor > least and one.residual2 < s.gate
+        ]
     return out
