@@ -32,20 +32,16 @@ endif
 demo: setup
 	$(BIN)/mapweave demo
 
-# Three workers more than cores, five at the most: many tests wait for processes. Each takes up to 1 GB.
+# Two workers more than cores, four at the most: many tests wait for processes. Each takes up to 1 GB.
 # `make test WORKERS=0` is one process.
-WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 3)
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 2)
 test: setup
 	@$(COMPILE)
-	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 5 --dist worksteal
+	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 4 --dist worksteal
 
-# A third worker while the two others wait for processes. What measures how smooth the page is has the machine
-# to itself, behind all others; only its files are read for that.
-ALONE = $(shell grep -rlF --include='test_*.py' pytest.mark.alone tests)
 slow: setup
 	@$(COMPILE)
-	$(BIN)/python -m pytest -m "slow and not alone" -n 3 --dist worksteal
-	$(BIN)/python -m pytest -m "slow and alone" $(ALONE)
+	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
 
 # About three quarters of an hour on two cores: every scenario, in real processes, and the longest tests.
 scenarios: setup

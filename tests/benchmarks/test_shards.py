@@ -20,13 +20,12 @@ def test_recovery_by_hand() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(420)
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra cluster: Ray")
 def test_a_small_run() -> None:
     arguments = "--shards 2 --robots 4 --nodes 12 --seconds 1 --ray-nodes 2 --kills shard --seed 1 --json"
     run = subprocess.run(
         [sys.executable, "-m", "benchmarks.shards", *arguments.split()],
-        capture_output=True, text=True, timeout=400,
+        capture_output=True, text=True, timeout=220,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-3000:]
     figures = json.loads(run.stdout)

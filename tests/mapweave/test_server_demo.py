@@ -123,15 +123,8 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
                 "const m = mapweave.model, row = m.rowOf('ada.1.9');"
                 "mapweave.viewport.show(m.x[row], m.y[row], 150)"
             )
-
-            def chosen() -> bool:
-                """As a person does it: again, where a robot that drives over the node was hit."""
-                if "Node ada.1.9" in page.run(TEXT.format("selected")):
-                    return True
-                page.run(CLICK.format("m.x[m.rowOf('ada.1.9')], m.y[m.rowOf('ada.1.9')]"))
-                return False
-
-            eventually(chosen)
+            page.run(CLICK.format("m.x[m.rowOf('ada.1.9')], m.y[m.rowOf('ada.1.9')]"))
+            eventually(lambda: "Node ada.1.9" in page.run(TEXT.format("selected")))
             landmarks = page.run("return document.querySelectorAll('#selected svg circle').length")
             assert landmarks == get(http, "nodes/ada.1.9")["landmarks"]
             page.run(

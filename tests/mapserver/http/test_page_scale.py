@@ -47,7 +47,6 @@ STRAY = "const b = mapweave.model.bounds(); return Math.max(b[2] - b[0], b[3] - 
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_20_000_nodes_are_smooth(tmp_path: Path) -> None:
     services = StubServices()
