@@ -169,7 +169,9 @@ class MissionControl:
                 return None
             order = report.order
             wanted = ordered = as_mission(order) if self._active(order) else Idle()
-            gone = now - self._linked_at > GONE and not isinstance(wanted, Carried)
+            # A stop holds: a robot that a person has stopped must not drive off by itself.
+            stays = order.kind is MissionKind.STOP or isinstance(wanted, Carried)
+            gone = now - self._linked_at > GONE and not stays
             self._interruption = ""
             if gone and self._alone is WithoutServer.HOME and home is not None:
                 wanted, self._interruption = GoTo(home), f"goes home: no map server for {GONE:g} s"

@@ -309,14 +309,26 @@ def test_a_robot_that_stands_or_goes_home_says_that_it_is_for_the_server(
     assert control.explained(DRIVING) == DRIVING
 
 
-def test_a_robot_that_was_stopped_stands_for_that_and_not_for_the_server() -> None:
-    control = Disk().robot(WithoutServer.STAND)
+@pytest.mark.parametrize("setting", [WithoutServer.STAND, WithoutServer.HOME])
+def test_a_robot_that_was_stopped_stands_for_that_and_not_for_the_server(setting: WithoutServer) -> None:
+    control = Disk().robot(setting)
     control.take(order(1, MissionKind.STOP))
-    control.next(True, 0.0, HOME)
-    control.next(False, GONE + 0.1, HOME)
+    assert control.next(True, 0.0, HOME) == Idle()
+    assert control.next(False, GONE + 0.1, HOME) is None, "it must not drive off by itself"
     assert control.explained(NO_MISSION) == NO_MISSION
     control.follow(NO_MISSION)
     assert control.report is not None and control.report.reason == "no mission; no camera"
+
+
+def test_a_stop_ends_the_drive_home_of_a_robot_whose_server_is_gone() -> None:
+    control = Disk().robot(WithoutServer.HOME)
+    control.take(order(1))
+    control.next(True, 0.0, HOME)
+    assert control.next(False, GONE + 0.1, HOME) == GoTo(HOME)
+    control.take(order(2, MissionKind.STOP))
+    assert control.next(False, GONE + 0.2, HOME) == Idle()
+    control.follow(NO_MISSION)
+    assert control.report is not None and control.report.state is MissionState.DONE
 
 
 def test_a_recording_takes_no_orders() -> None:
