@@ -190,7 +190,8 @@ def check_pairs(a: Array, b: Array, covariance: Array, scale: float | None = Non
     """Refuse pairs that do not determine a transform.
 
     Raises:
-        InvalidValue: they are too few, too near to each other, in a line, or a mirror image fits better.
+        InvalidValue: they are too few, too near to each other, in a line, or contradict each other or the
+            given scale; or a mirror image fits better.
     """
     if len(a) < LEAST:
         raise InvalidValue(f"{len(a)} pairs are too few: click {LEAST} or more")
@@ -209,7 +210,14 @@ def check_pairs(a: Array, b: Array, covariance: Array, scale: float | None = Non
             f"the pairs are too near to each other: they lie within {spread:.2f} m, which leaves the plan's "
             f"rotation uncertain by {math.degrees(proper.sigmas[2]):.1f} deg; click some further apart"
         )
-    if lead < CLEARLY and proper.chi2 > CLEARLY * max(proper.freedom, 1):
+    if lead < CLEARLY and _unlikely(proper):
+        free = fit_similarity(a, b, covariance)
+        if scale is not None and not _unlikely(free):
+            raise InvalidValue(
+                f"the given scale of {scale:g} m/px does not fit: the pairs agree on "
+                f"{free.a_from_b.scale:.4g} m/px, and with the given one the residuals are "
+                f"{proper.rms:.2f} m; correct it, or leave it out"
+            )
         raise InvalidValue(
             f"the pairs contradict each other: residuals of {proper.rms:.2f} m; one is wrong, click more "
             "pairs to learn which"
@@ -218,6 +226,11 @@ def check_pairs(a: Array, b: Array, covariance: Array, scale: float | None = Non
         raise InvalidValue(
             "the pairs lie in a line, so a plan and its mirror image fit alike: click one beside the line"
         )
+
+
+def _unlikely(fit: SimilarityFit) -> bool:
+    """Whether the residuals are far larger than the points' covariance explains."""
+    return fit.chi2 > CLEARLY * max(fit.freedom, 1)
 
 
 def _closed_form(a: Array, b: Array, variances: Array, scale: float | None) -> Similarity:

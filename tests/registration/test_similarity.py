@@ -169,6 +169,20 @@ def test_a_stretched_plan_contradicts_its_scale() -> None:
     assert sum(one > 1.0 for one in off) >= 8
 
 
+@pytest.mark.parametrize("count", [3, 4])
+@pytest.mark.parametrize("given", [0.02, 0.1])
+def test_pairs_that_agree_on_another_scale_than_the_given_one_are_not_called_wrong(
+    count: int, given: float
+) -> None:
+    a, b, covariance = world(11, count, correlated=False)
+    words = f"the given scale of {given:g} m/px does not fit: .* agree on 0.0(49|50)"
+    with pytest.raises(InvalidValue, match=words):
+        check_pairs(a, b, covariance, given)
+    a[1] += 20.0, -10.0
+    with pytest.raises(InvalidValue, match="contradict each other"):
+        check_pairs(a, b, covariance, given)
+
+
 def test_pairs_that_determine_nothing_are_refused() -> None:
     plane = np.array([[0.0, 0.0], [400.0, 0.0], [100.0, 300.0], [350.0, 500.0]])
     loose = 0.01 * np.eye(8)
