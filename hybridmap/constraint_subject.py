@@ -271,9 +271,7 @@ class RetiredWindow:
 
     def __str__(self) -> str:
         """For example `map r0.1 from 2026-03-01 12:00:00 UTC until 2026-03-01 12:05:00 UTC`."""
-        begin = f" from {_time(self.begin_ns)}" if self.begin_ns else ""
-        end = f" until {_time(self.end_ns)}" if self.end_ns < MAX_STAMP_NS else ""
-        return f"map {self.map}{begin}{end}"
+        return f"map {self.map} {period_in_words(self.begin_ns, self.end_ns)}".rstrip()
 
 
 Subject = Apart | Linked | RetiredMap | RetiredNodes | RetiredArea | RetiredWindow
@@ -371,6 +369,13 @@ def nodes_in_words(nodes: Iterable[NodeId]) -> str:
 
 def _upper(covariance: Array) -> tuple[float, ...]:
     return tuple(float(value) for value in covariance[np.triu_indices(3)])
+
+
+def period_in_words(begin_ns: int, end_ns: int) -> str:
+    """For example `from 2026-03-01 12:00:00 UTC until 2026-03-01 12:05:00 UTC`; empty for all times."""
+    begin = f"from {_time(begin_ns)}" if begin_ns else ""
+    end = f"until {_time(end_ns)}" if end_ns < MAX_STAMP_NS else ""
+    return " ".join(part for part in (begin, end) if part)
 
 
 def _time(stamp_ns: int) -> str:

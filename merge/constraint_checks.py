@@ -14,6 +14,7 @@ from mapweave.hybridmap.constraint_subject import (
     RetiredMap,
     RetiredNodes,
     RetiredWindow,
+    period_in_words,
 )
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -142,6 +143,9 @@ def _checked_retirement(
     fresh = found.keys() - constraints.nodes.keys()
     if not fresh:
         why = "all of its nodes are retired already" if found else "no node lies in it"
+        if not found and isinstance(about, RetiredWindow):
+            stamps = [node.stamp_ns for node in merged.maps[about.map].nodes.values()]
+            why += f"; the nodes of {about.map} are {period_in_words(min(stamps), max(stamps))}"
         raise InvalidValue(f"{about}: {why}")
     count = "1 node" if len(fresh) == 1 else f"{len(fresh)} nodes"
     effects = [f"{count} of {', '.join(map(str, sorted({node.map for node in fresh})))}"]

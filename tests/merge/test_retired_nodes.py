@@ -191,7 +191,7 @@ def test_a_map_that_only_loops_hold_together_falls_apart_and_that_is_said_before
     for about, words in (
         (RetiredNodes((nodes[1],)), "is retired already"),
         (RetiredNodes((NodeId("r0", 1, 999),)), "has no node 999"),
-        (RetiredWindow(map_id, 1, 2), "no node lies in it"),
+        (RetiredWindow(map_id, 1, 2), f"no node lies in it; the nodes of {map_id} are until .* UTC"),
         (RetiredArea(Area(nodes[1], ((0, 0), (1, 0), (0, 1)))), "is out of use"),
         (RetiredArea(Area(nodes[0], ((500, 0), (501, 0), (500, 1)))), "no node lies in it"),
     ):
