@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.agent_status import AgentStatus
     from mapweave.hybridmap.mission_order import MissionReport
 
+NOT_TAKEN = "4 if it did not, or the map server refused it, 1 if neither can be asked."
 STATUS = (
-    "Exit status: 0 if the robot took the mission (with --wait: has done it within --timeout), 4 if it did "
-    "not, or the map server refused it, 1 if neither can be asked."
+    "Exit status: 0 if the robot took the mission (with --wait: has done it within --timeout), " + NOT_TAKEN
 )
 
 
@@ -62,7 +62,8 @@ def add_to(commands: Any) -> None:
         "stop",
         help="stop a robot, or all",
         description="Stop a robot, `mapweave stop r0`, or all, `mapweave stop --all`. The order goes to the "
-        f"robots directly, and works without a map server. {STATUS}",
+        "robots directly, and works without a map server. Exit status: 0 if every robot took it, "
+        f"{NOT_TAKEN}",
     )
     which = stop.add_mutually_exclusive_group(required=True)
     which.add_argument("robot", nargs="?", help="the robot's name, for example r0")

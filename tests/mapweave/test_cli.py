@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 
@@ -23,6 +24,9 @@ def test_every_command_has_help(command, capfd):
     out = capfd.readouterr().out
     assert f"usage: mapweave {command}" in out
     assert len(out.splitlines()) > 5
+    usage, _, rest = out.partition("\n\n")
+    for option in re.findall(r"\bwith\s+(--[a-z-]+)", rest):
+        assert option in usage, f"{option} is none of its options"
 
 
 @pytest.mark.parametrize(
