@@ -175,7 +175,8 @@ class MissionControl:
             self._interruption = ""
             if gone and self._alone is WithoutServer.HOME and home is not None:
                 wanted, self._interruption = GoTo(home), f"goes home: no map server for {GONE:g} s"
-            elif gone and self._alone is not WithoutServer.GO_ON:
+            elif gone and self._alone is not WithoutServer.GO_ON and report.open:
+                # A robot that is done stands already, and as one that is parked it knows where.
                 wanted, self._interruption = Idle(), f"stands: no map server for {GONE:g} s"
             if wanted == ordered:
                 self._interruption = ""

@@ -320,6 +320,15 @@ def test_a_robot_that_was_stopped_stands_for_that_and_not_for_the_server(setting
     assert control.report is not None and control.report.reason == "no mission; no camera"
 
 
+def test_a_robot_that_has_parked_stays_parked_while_the_server_is_gone_and_after() -> None:
+    control = Disk().robot(WithoutServer.STAND)
+    control.take(order(1))
+    assert isinstance(control.next(True, 0.0, HOME), GoTo)
+    control.follow(status(finished=True))
+    for linked, now in ((False, GONE + 0.1), (False, GONE + 0.2), (True, GONE + 0.3)):
+        assert control.next(linked, now, HOME) is None, "it stands already, and knows where"
+
+
 def test_a_stop_ends_the_drive_home_of_a_robot_whose_server_is_gone() -> None:
     control = Disk().robot(WithoutServer.HOME)
     control.take(order(1))
