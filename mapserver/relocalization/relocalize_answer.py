@@ -157,5 +157,6 @@ def _nearest_refusal(registration: Registration) -> str:
     """The reason of the node that came nearest to being recognised."""
     if not registration.refusals:
         return "the similar nodes are gone"
-    node, refusal = max(registration.refusals, key=lambda item: (item[1].inliers, item[1].matches, item[0]))
+    # Of equals the first, as in `similar_places`.
+    node, refusal = min(registration.refusals, key=lambda item: (-item[1].inliers, -item[1].matches, item[0]))
     return f"not recognised; nearest is {node}: {refusal.reason}"

@@ -1,5 +1,7 @@
 """The verdict names its outcome, and the answer says it in words."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -104,3 +106,13 @@ def test_an_unknown_view_looks_like_places_with_a_turn_to_each(
     assert not service.answer(few(LEAST - 1)).similar
     monkeypatch.setattr(verdict, "ALONE", 18)
     assert not service.answer(VIEW).similar, "it is found"
+
+
+def test_the_reason_names_the_place_that_is_listed_first() -> None:
+    twin = replace(NODE, id=NodeId("r0", 1, 3))
+    nodes = {node.id: node for node in (NODE, twin)}
+    found = Retrieved(*((node, 2.0) for node in nodes))
+    answer = Relocalizer(found, nodes.get, MergedMap.empty()).answer(OTHER_WAY)
+    first, second = answer.similar
+    assert first.matches == second.matches
+    assert f"nearest is {first.node}: {first.lacks}" in answer.reason
