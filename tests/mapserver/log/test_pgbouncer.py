@@ -22,7 +22,8 @@ def test_servers_share_a_store_by_pooled_sessions(postgres: PostgresServer) -> N
         heard: list[list[News]] = [[], []]
         for store, news in zip(stores, heard, strict=True):
             store.follow(news.append)
-        eventually(lambda: any(store.leads for store in stores))
+        # Each hears what is written from its first look at everything on.
+        eventually(lambda: any(store.leads for store in stores) and all(heard))
         leader, other = sorted(stores, key=lambda store: not store.leads)
         assert not other.leads
         assert leader.apply(MAP, 5, [entry(1), entry(2)]).watermark == 2
