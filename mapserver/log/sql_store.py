@@ -120,11 +120,7 @@ class SqlStore(SqlSizes, Store):
                         (*map_id, *names, *some),
                     )
             for map_id, some in node_numbers:
-                marks = ", ".join("?" * len(some))
-                self._write(
-                    f"DELETE FROM node WHERE agent = ? AND epoch = ? AND number IN ({marks})",
-                    (*map_id, *some),
-                )
+                self._delete_nodes(map_id, some)
             for name, value in results.items():
                 self._put("result", (name, value))
         self._count_again()
@@ -189,11 +185,9 @@ class SqlStore(SqlSizes, Store):
                 if kind in RETIREMENTS and not self._read(put, (*map_id, kind, number)):
                     body = RETIREMENTS[kind](NodeId(*map_id, number))
                     retired[kind, number] = Change(map_id, sequence, stamp_ns, body)
-            for kind, number in retired:
-                if kind == NodePut.__name__:
-                    self._write(
-                        "DELETE FROM node WHERE agent = ? AND epoch = ? AND number = ?", (*map_id, number)
-                    )
+            gone = [NodeId(*map_id, number) for kind, number in retired if kind == NodePut.__name__]
+            for _, some in _numbers(gone):
+                self._delete_nodes(map_id, some)
             unverified = self.unverified(map_id)
             self._write("DELETE FROM unverified WHERE agent = ? AND epoch = ?", map_id)
             if unverified is not None and covered < unverified.last:
@@ -268,6 +262,13 @@ class SqlStore(SqlSizes, Store):
             if count >= most:
                 raise InvalidValue(f"the record of {table.replace('_', ' ')}s is full: {most}")
             self._put(table, (newest + 1, body))
+
+    def _delete_nodes(self, map_id: MapId, numbers: Sequence[int]) -> None:
+        """Of one map, no more than `_numbers` gives at once."""
+        marks = ", ".join("?" * len(numbers))
+        self._write(
+            f"DELETE FROM node WHERE agent = ? AND epoch = ? AND number IN ({marks})", (*map_id, *numbers)
+        )
 
     def _take(
         self,

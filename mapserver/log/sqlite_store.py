@@ -113,8 +113,10 @@ class SqliteStore(SqlStore):
 
     def _write(self, query: str, values: Sequence[object]) -> None:
         self._database.connection.execute(query, values)
-        if "FROM node " in query:
-            self._landmarks.clear()
+
+    def _delete_nodes(self, map_id: MapId, numbers: Sequence[int]) -> None:
+        super()._delete_nodes(map_id, numbers)
+        self._landmarks.pop(map_id, None)
 
     def _put(self, table: str, values: Sequence[Any]) -> None:
         insert(self._database.connection, table, values)

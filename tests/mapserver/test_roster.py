@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 
 import pytest
 
@@ -73,15 +74,21 @@ def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone()
         eventually(lambda: not roster.alive("r3"))
 
 
+@contextmanager
+def gathering() -> Iterator[tuple[MemoryBus, Roster, list[AgentStatus], Quotas]]:
+    """A roster at time 7 that gathers statuses, its bus, what it has heard and its quotas."""
+    heard, quotas = list[AgentStatus](), Quotas()
+    with (
+        closing(MemoryBus(MemoryHub())) as bus,
+        closing(Roster(bus, KEYS, lambda: 7.0, heard.append, quotas, gather=True)) as roster,
+    ):
+        yield bus, roster, heard, quotas
+
+
 def test_gathered_statuses_are_taken_in_order_and_a_bad_one_costs_no_other(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with ExitStack() as stack:
-        bus, quotas = MemoryBus(MemoryHub()), Quotas()
-        stack.callback(bus.close)
-        heard: list[AgentStatus] = []
-        roster = Roster(bus, KEYS, lambda: 7.0, heard.append, quotas, gather=True)
-        stack.callback(roster.close)
+    with gathering() as (bus, roster, heard, _):
         said = [AgentStatus(Status("mapping", "", n, 0, Pose2(), False), n, "r3") for n in range(4)]
         for status in said:
             bus.publish(KEYS.agent_status("r3"), encode(status))
@@ -98,12 +105,7 @@ def test_gathered_statuses_are_taken_in_order_and_a_bad_one_costs_no_other(
 
 
 def test_a_robot_that_floods_with_statuses_is_named_and_keeps_no_other_from_being_heard() -> None:
-    with ExitStack() as stack:
-        bus, quotas = MemoryBus(MemoryHub()), Quotas()
-        stack.callback(bus.close)
-        heard: list[AgentStatus] = []
-        roster = Roster(bus, KEYS, lambda: 0.0, heard.append, quotas, gather=True)
-        stack.callback(roster.close)
+    with gathering() as (_, roster, heard, quotas):
         flood, other = (
             AgentStatus(Status("mapping", "", 1, 0, Pose2(), False), 1, name) for name in ("r3", "r5")
         )

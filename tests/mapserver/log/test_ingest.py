@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -100,8 +102,9 @@ def test_a_beacon_with_a_low_watermark_gets_another_acknowledgement(server: Serv
     assert {ack.watermark for ack in agent.acks} == {1}
 
 
-def test_beacons_that_wait_become_one(server: Server, agent: HandAgent) -> None:
-    """Each would be acknowledged, and hold up the changes of others."""
+@contextmanager
+def held_up(server: Server, agent: HandAgent) -> Iterator[None]:
+    """The ingest is at the agent's first change until the block ends."""
     held, go_on = threading.Event(), threading.Event()
 
     def hold(change: Change) -> None:
@@ -111,14 +114,20 @@ def test_beacons_that_wait_become_one(server: Server, agent: HandAgent) -> None:
     server.on_change = hold
     agent.publish(1)
     assert held.wait(30)
-    agent.serve(2)
-    for newest in (1, 1, 1, 2, 2):
-        agent.beacon(newest)
-    eventually(lambda: server.ingest.waiting == 1)
-    # The last of them has come.
-    agent.publish(2)
-    eventually(lambda: server.ingest.waiting == 2)
+    yield
     go_on.set()
+
+
+def test_beacons_that_wait_become_one(server: Server, agent: HandAgent) -> None:
+    """Each would be acknowledged, and hold up the changes of others."""
+    with held_up(server, agent):
+        agent.serve(2)
+        for newest in (1, 1, 1, 2, 2):
+            agent.beacon(newest)
+        eventually(lambda: server.ingest.waiting == 1)
+        # The last of them has come.
+        agent.publish(2)
+        eventually(lambda: server.ingest.waiting == 2)
     eventually(lambda: [ack.watermark for ack in agent.acks][-1:] == [2])
     assert [ack.watermark for ack in agent.acks] == [1, 2]
 
@@ -127,20 +136,11 @@ def test_a_refusal_is_behind_the_acknowledgement_that_a_beacon_asks_for(
     server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An acknowledgement behind it would tell the robot that its log is taken again."""
-    held, go_on = threading.Event(), threading.Event()
-
-    def hold(change: Change) -> None:
-        held.set()
-        assert go_on.wait(30)
-
-    server.on_change = hold
-    agent.publish(1)
-    assert held.wait(30)
-    monkeypatch.setattr(server.ingest, "_objection", lambda body: "not this one")
-    agent.publish(2)
-    agent.beacon(2)
-    eventually(lambda: server.ingest.waiting == 2)
-    go_on.set()
+    with held_up(server, agent):
+        monkeypatch.setattr(server.ingest, "_objection", lambda body: "not this one")
+        agent.publish(2)
+        agent.beacon(2)
+        eventually(lambda: server.ingest.waiting == 2)
     eventually(lambda: any(ack.refusals for ack in agent.acks))
     eventually(lambda: not server.ingest.waiting and not server.ingest.busy)
     assert [(ack.watermark, bool(ack.refusals)) for ack in agent.acks] == [(1, False), (1, False), (0, True)]
