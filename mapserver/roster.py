@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import NamedTuple
 
 from mapweave.hybridmap.agent_status import (
@@ -21,15 +20,13 @@ from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.inbox import Inbox
 from mapweave.mapserver.log.known_logs import Lag
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import MOST_ROBOTS, Quotas
 from mapweave.merge.explanation.map_standing import MapStanding, map_standings
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Sample
-from mapweave.wire.dispatch import guarded
-from mapweave.wire.keys import Keys, robot_of
+from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode
 
 OWN_PERIOD = 0.5
@@ -38,8 +35,6 @@ STATUSES_PER_S = 400.0
 """Of all robots that a server wants: up to 200 robots each as it likes, of a thousand one every 2.5 s."""
 MOST_ALIVE = 8
 """Maps under which a robot is alive at once: it makes one, and two while it begins the next."""
-AT_ONCE = 256
-"""Statuses that are processed at once: at 20 times a second ten times as many as a server wants."""
 NO_LAG = Lag(0, 0.0)
 UNKNOWN = MapStanding(None, 0, "")
 """Of a map that is not merged yet."""
@@ -70,7 +65,6 @@ class Roster:
         hear: Callable[[AgentStatus], None],
         quotas: Quotas,
         lags: Callable[[], Mapping[str, Lag]] = dict,
-        gather: bool = False,
     ) -> None:
         """Begin to listen.
 
@@ -81,8 +75,6 @@ class Roster:
             hear: called with each status.
             quotas: of robots.
             lags: how far the store is behind each of them.
-            gather: let statuses wait until `take_waiting` is called. To process 20 of them at once takes a
-                third of the time of one by one, each in a thread that has to be woken for it.
         """
         self._lags = lags
         self._standings: tuple[MergedMap, Mapping[MapId, MapStanding]] = MergedMap.empty(), {}
@@ -91,9 +83,8 @@ class Roster:
         self._turn = threading.Lock()
         self._alive: dict[str, set[MapId]] = {}
         self._heard: dict[str, tuple[AgentStatus, float]] = {}
-        self._waiting: Inbox[Sample] = Inbox()
         self._closing = [
-            bus.subscribe(keys.agent_statuses(), self._gather if gather else self._take, direct=gather),
+            bus.subscribe(keys.agent_statuses(), self._take),
             bus.watch(keys.agents_alive(), self._see),
         ]
 
@@ -101,12 +92,6 @@ class Roster:
         """Stop listening."""
         for closing in self._closing:
             closing.close()
-
-    def take_waiting(self) -> None:
-        """Process statuses that have been gathered, in order for each robot."""
-        for _, samples in self._waiting.take(AT_ONCE, 0.0):
-            for sample in samples:
-                guarded(partial(self._take, sample), sample.key)
 
     def alive(self, robot: str) -> bool:
         """Whether an agent of this name is there."""
@@ -178,12 +163,6 @@ class Roster:
             standings = map_standings(merged)
             self._standings = merged, standings
         return standings
-
-    def _gather(self, sample: Sample) -> None:
-        """A status has come; in the bus's thread."""
-        robot = robot_of(sample.key)
-        if not self._waiting.put(robot, sample, len(sample.payload)):
-            self._quotas.hold_back(robot, "statuses")
 
     def _take(self, sample: Sample) -> None:
         robot = self._keys.parse_agent_status(sample.key)

@@ -39,13 +39,7 @@ _T = TypeVar("_T")
 
 
 class Schedule(Protocol):
-    """Runs jobs. All methods may be called from any thread.
-
-    Attributes:
-        gathering: for how long what is only noted may be gathered, to be processed at once, s; 0: not at all.
-    """
-
-    gathering: float
+    """Runs jobs. All methods may be called from any thread."""
 
     def monotonic(self) -> float:
         """A clock that only grows, s."""
@@ -113,8 +107,6 @@ def _run(job: Job) -> None:
 
 class LiveSchedule:
     """Threads and the machine's clock."""
-
-    gathering = 0.05
 
     def __init__(self) -> None:
         """Prepare; nothing runs yet."""
@@ -257,8 +249,6 @@ class LockstepSchedule:
 
     What a server answers then depends on what it was sent before, and not on how quick the machine is.
     """
-
-    gathering = 0.0
 
     def __init__(self) -> None:
         """Start at time zero."""

@@ -166,9 +166,8 @@ class MapServer:
         base = self._base
         self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
         self._roster = Roster(
-            self._bus, self._keys, clock.monotonic, self._hear, self._quotas, lambda: self._ingest.lags(),
-            gather=clock.gathering > 0.0,
-        )  # fmt: skip
+            self._bus, self._keys, clock.monotonic, self._hear, self._quotas, lambda: self._ingest.lags()
+        )
         self._missions.roster = self._roster
         self._ingest = Ingest(
             self._bus, self._keys, self._store, self._name, worker.take, None,
@@ -201,8 +200,6 @@ class MapServer:
         self._views = NodeViews(self._bus, self._keys, lambda: worker.current().merged)
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         self._metrics.read(self._sources())
-        if clock.gathering > 0.0:
-            clock.every(clock.gathering, self._roster.take_waiting)
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
         clock.every(EVERY, self._places.save_if_worthwhile)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack
 
 import pytest
 
@@ -13,13 +12,11 @@ from mapweave.hybridmap.mission_order import MAX_VIA, MissionKind, MissionOrder,
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.inbox import MOST
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
-from mapweave.mapserver.roster import AT_ONCE, MOST_ALIVE, Roster
+from mapweave.mapserver.roster import MOST_ALIVE, Roster
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.bus import Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
@@ -72,48 +69,3 @@ def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone()
         for token in tokens:
             token.close()
         eventually(lambda: not roster.alive("r3"))
-
-
-@contextmanager
-def gathering() -> Iterator[tuple[MemoryBus, Roster, list[AgentStatus], Quotas]]:
-    """A roster at time 7 that gathers statuses, its bus, what it has heard and its quotas."""
-    heard, quotas = list[AgentStatus](), Quotas()
-    with (
-        closing(MemoryBus(MemoryHub())) as bus,
-        closing(Roster(bus, KEYS, lambda: 7.0, heard.append, quotas, gather=True)) as roster,
-    ):
-        yield bus, roster, heard, quotas
-
-
-def test_gathered_statuses_are_taken_in_order_and_a_bad_one_costs_no_other(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    with gathering() as (bus, roster, heard, _):
-        said = [AgentStatus(Status("mapping", "", n, 0, Pose2(), False), n, "r3") for n in range(4)]
-        for status in said:
-            bus.publish(KEYS.agent_status("r3"), encode(status))
-        bus.publish(KEYS.agent_status("r3"), b"\xc1")
-        bus.publish(KEYS.agent_status("r4"), encode(said[0]))
-        bus.publish(KEYS.agent_status("r5"), encode(AgentStatus(said[0].status, 9, "r5")))
-        eventually(lambda: len(roster._waiting) == 7)
-        assert roster.status("r3") is None and not heard
-        roster.take_waiting()
-        assert [status for status in heard if status.robot == "r3"] == said
-        assert roster.status("r3") == said[-1] and roster.status("r5") and roster.status("r4") is None
-        assert {name: known.age for name, known in roster.presence().items()} == {"r3": 0.0, "r5": 0.0}
-        assert "agent/r3/status: " in caplog.text and "a status of r4 is about r3" in caplog.text
-
-
-def test_a_robot_that_floods_with_statuses_is_named_and_keeps_no_other_from_being_heard() -> None:
-    with gathering() as (_, roster, heard, quotas):
-        flood, other = (
-            AgentStatus(Status("mapping", "", 1, 0, Pose2(), False), 1, name) for name in ("r3", "r5")
-        )
-        sample = Sample(KEYS.agent_status("r3"), encode(flood))
-        for _ in range(MOST + 10):
-            roster._gather(sample)
-        roster._gather(Sample(KEYS.agent_status("r5"), encode(other)))
-        assert len(roster._waiting) == MOST + 1
-        assert quotas.over() == {"r3": "over its quota: 10 statuses"}
-        roster.take_waiting()
-        assert len(heard) == AT_ONCE and other in heard
