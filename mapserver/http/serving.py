@@ -108,9 +108,17 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Go on, unless what comes was refused."""
-        if not self._refused:
-            super().data_received(data)
+        """Go on, unless what comes was refused.
+
+        The parser counts the bytes of a head only while its end is missing. A long head that came in one read
+        would pass, and in two reads it would not. So no more than a head is given to it before the head is there.
+        """
+        while data and not self._refused:
+            room = len(data)
+            if self.conn.their_state is h11.IDLE:
+                room = max(MAX_HEAD_BYTES - len(self.conn.trailing_data[0]), 1)
+            super().data_received(data[:room])
+            data = data[room:]
 
     def eof_received(self) -> bool:  # type: ignore[override]
         """A peer that has sent a whole request may still wait for the answer."""
@@ -247,7 +255,8 @@ class HttpThread:
             server_header=False,
             date_header=False,
             headers=list(HEADERS.items()),
-            h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+            # A head whose end is not among so many bytes is longer.
+            h11_max_incomplete_event_size=MAX_HEAD_BYTES - 1,
             timeout_graceful_shutdown=1,
             # A proxy on this machine names the client for which it asks.
             forwarded_allow_ips="127.0.0.1,::1",

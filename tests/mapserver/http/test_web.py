@@ -10,6 +10,7 @@ import struct
 import time
 import tracemalloc
 import zlib
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -301,7 +302,8 @@ def test_the_page_and_the_status(served: Web) -> None:
         ("POST", "/nothing", 404),
         ("DELETE", "/", 405),
         ("BREW", "/", 405),
-        ("GET", "/" + "x" * 70_000, 404),
+        ("GET", "/" + "x" * 16_000, 404),
+        ("GET", "/" + "x" * 70_000, 400),
         ("GET", "/" + "x" * 900_000, 400),
         ("GET", "/static", 404),
         ("GET", "/static/", 404),
@@ -319,6 +321,24 @@ def test_missing_pages(served: Web, method: str, path: str, status: int) -> None
     got, headers, content = ask(served, method, path, b"x" if method == "POST" else None)
     assert (got, headers["Content-Type"]) == (status, "application/json")
     assert json.loads(content)["error"]
+
+
+@pytest.mark.parametrize("pieces", [(), (1,), (60,), (4096, 9000), (16_383,), (16_384,), (16_385,)])
+@pytest.mark.parametrize(("size", "status"), [(16_384, 404), (16_385, 400), (70_000, 400)])
+def test_a_long_head_is_refused_however_it_arrives(
+    served: Web, size: int, status: int, pieces: tuple[int, ...]
+) -> None:
+    frame = "GET /{} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    request = frame.format("x" * (size - len(frame) + 2)).encode()
+    assert len(request) == size
+    bounds = [0, *(piece for piece in pieces if piece < size), size]
+    with socket.create_connection(("127.0.0.1", served.port), timeout=20) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for start, end in pairwise(bounds):
+            connection.sendall(request[start:end])
+            time.sleep(0.02)
+        answer = connection.makefile("rb").readline()
+    assert answer.startswith(f"HTTP/1.1 {status} ".encode())
 
 
 def test_pages_load_nothing_but_files_of_this_server(served: Web) -> None:
