@@ -6,7 +6,8 @@ EXTRA ?= dev
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed-$(EXTRA)
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Python compiles a module when it is first imported. Compiling all of them doubles the time of the installation.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 # Compiles what runs often where it is not compiled yet: no robot and no test waits for it.
 COMPILE := $(BIN)/python -c 'import mapweave.agent.runner; from mapweave.hybridmap import jit; jit.load()'

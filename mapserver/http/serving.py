@@ -110,8 +110,8 @@ class Connection(H11Protocol):
     def data_received(self, data: bytes) -> None:
         """Go on, unless what comes was refused.
 
-        The parser counts the bytes of a head only while its end is missing. A long head that came in one read
-        would pass, and in two reads it would not. So no more than a head is given to it before the head is there.
+        The parser counts the bytes of a head only while its end is missing: a long head that comes in one
+        read would pass, and in two it would not. So it gets no more than a head before the head is there.
         """
         while data and not self._refused:
             room = len(data)
