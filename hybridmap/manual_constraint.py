@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from mapweave.hybridmap.constraint_subject import (
@@ -22,6 +22,8 @@ from mapweave.hybridmap.wall_time import utc_words
 
 MOST_WORDS = 300
 """Characters of a reason."""
+FEW = 4
+"""Nodes that are written out in a command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +214,49 @@ def event_words(constraint: ManualConstraint) -> str:
         case Linked():
             return f"{about}: the link by hand is taken back, {how}"
     return reason_of(constraint) if constraint.holds else f"{about} {verb_of(about)} in use again, {how}"
+
+
+def to_take_back(made: Sequence[ManualConstraint], number: int) -> Subject:
+    """What the constraint of this number is about, so that it can be taken back.
+
+    Args:
+        made: the record, in order.
+        number: from 1.
+
+    Raises:
+        InvalidValue: there is none of this number, it takes another one back, or it was taken back already:
+            a later constraint about the same is another decision, which has its own number.
+    """
+    if not 1 <= number <= len(made):
+        raise InvalidValue(f"there is no constraint {number}: the record has {len(made)}")
+    asked = made[number - 1]
+    if not asked.holds:
+        raise InvalidValue(
+            f"constraint {number} takes another one back ({event_words(asked)}): there is nothing to undo"
+        )
+    same = [(k, one) for k, one in enumerate(made[number:], number + 1) if one.about.key == asked.about.key]
+    withdrawal = next((one for _, one in same if not one.holds), None)
+    if withdrawal is None:
+        return asked.about
+    words = f"constraint {number} was taken back already {decided(withdrawal)}"
+    last, newest = same[-1]
+    if newest.holds:
+        words += f"; what holds now is number {last}, {decided(newest)}"
+    raise InvalidValue(words)
+
+
+def retired_words(constraint: ManualConstraint) -> str:
+    """Who has retired what, when and why, and how it comes back into use, in one sentence."""
+    about = constraint.about
+    match about:
+        case RetiredMap(which):
+            how = f"`mapweave map retire {which} --undo` brings it back"
+        case RetiredNodes(nodes) if len(nodes) <= FEW:
+            back = "them" if len(nodes) > 1 else "it"
+            how = f"`mapweave map retire {' '.join(map(str, nodes))} --undo` brings {back} back"
+        case _:
+            how = "`mapweave map undo` lists it with the number that takes it back"
+    return f"{reason_of(constraint)}; {how}"
 
 
 def verb_of(about: Subject) -> str:

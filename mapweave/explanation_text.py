@@ -20,7 +20,7 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     Standing,
 )
-from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.manual_constraint import ManualConstraint, retired_words
 from mapweave.hybridmap.pose import Array, PoseGaussian
 
 MOST_LINKS = 12
@@ -78,7 +78,7 @@ def pair_words(explanation: PairExplanation) -> list[str]:
     if len(explanation.other_links) > MOST_LINKS:
         lines.append(f"    and {len(explanation.other_links) - MOST_LINKS} more; --json lists all")
     lines += [f"  {claim}" for claim in explanation.claims]
-    lines += [f"  {_constraint(constraint)}" for constraint in explanation.constraints]
+    lines += _record(explanation.constraints, explanation.reason)
     return lines
 
 
@@ -101,7 +101,7 @@ def _selection(links: Sequence[LinkAgreement]) -> list[LinkAgreement]:
 def maps_words(explanation: MapsExplanation) -> list[str]:
     """The explanation of two maps, line by line."""
     lines = [explanation.reason]
-    if not explanation.joined:
+    if explanation.refused or explanation.unverified:
         lines.append(
             f"  {explanation.refused} links refused, "
             f"{explanation.unverified} candidate pairs without a common pose"
@@ -109,7 +109,7 @@ def maps_words(explanation: MapsExplanation) -> list[str]:
     if explanation.nearest:
         lines.append("  weakest links:" if explanation.joined else "  nearest to a link:")
     lines += [f"    {_near(near_miss, explanation.reason)}" for near_miss in explanation.nearest]
-    lines += [f"  {_constraint(constraint)}" for constraint in explanation.constraints]
+    lines += _record(explanation.constraints, explanation.reason)
     return lines
 
 
@@ -160,6 +160,13 @@ def _near(near_miss: NearMiss, reason: str) -> str:
     """The common reason is not repeated for each."""
     lacks = "".join(f"; {words}" for words in near_miss.lacks.split("; ") if words not in reason)
     return f"{near_miss.a} - {near_miss.b}: {near_miss.matches} match, {near_miss.inliers} agree{lacks}"
+
+
+def _record(constraints: Sequence[ManualConstraint], reason: str) -> list[str]:
+    """A line for each constraint, but for what is retired if the reason says so already."""
+    return [
+        f"  {_constraint(one)}" for one in constraints if not one.holds or retired_words(one) not in reason
+    ]
 
 
 def _constraint(constraint: ManualConstraint) -> str:

@@ -17,10 +17,17 @@ from mapweave.hybridmap.constraint_subject import (
     read_window,
 )
 from mapweave.hybridmap.errors import InvalidValue, Refused
-from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
+from mapweave.hybridmap.manual_constraint import (
+    ConstraintList,
+    ConstraintRequest,
+    ManualConstraint,
+    event_words,
+    to_take_back,
+)
 from mapweave.hybridmap.named_nodes import own_ids_of, retired_of
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.refusals import refusals
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import sent_by
@@ -99,13 +106,18 @@ class FleetConstraints(FleetAnnotations):
             what: the constraint, or its number in `constraints()`, from 1.
             because: why.
             check: only say what it would do.
+
+        Raises:
+            Refused: there is none of this number, or it was taken back already; the words say when, and who did so.
         """
-        if isinstance(what, int):
-            record = self.constraints()
-            if not 1 <= what <= len(record):
-                raise Refused(f"there is no constraint {what}: the record has {len(record)}")
-            what = record[what - 1]
-        return self.constrain(what.about, False, because, check=check)
+        record = self.constraints()
+        if not isinstance(what, int):
+            if what not in record:
+                raise Refused(f"the record does not have this constraint: {event_words(what)}")
+            what = record.index(what) + 1
+        with refusals():
+            about = to_take_back(record, what)
+        return self.constrain(about, False, because, check=check)
 
     def constraints(self) -> tuple[ManualConstraint, ...]:
         """What people have linked, unmerged, retired and taken back, in order; the first is number 1.

@@ -31,7 +31,7 @@ from mapweave.hybridmap.constraint_subject import (
     read_window,
 )
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint, to_take_back
 from mapweave.hybridmap.named_nodes import Record, Resolve, own_ids_of, retired_of
 from mapweave.hybridmap.node import NodeId
 from mapweave.wire.conversion import json_value
@@ -96,15 +96,9 @@ def read_request(
     ]
     if len(given) + numbered != 1:
         raise InvalidValue(f"give one of {ONE}")
-    about = _numbered(asked.undo, record) if numbered else _subject(asked, now_ns, annotations, resolve)
+    about = to_take_back(record, asked.undo) if numbered else _subject(asked, now_ns, annotations, resolve)
     constraint = ManualConstraint(about, asked.undo is False, asked.by or by, now_ns, asked.because)
     return ConstraintRequest(constraint, asked.check)
-
-
-def _numbered(number: int, record: Sequence[ManualConstraint]) -> Subject:
-    if not 1 <= number <= len(record):
-        raise InvalidValue(f"there is no constraint {number}: the record has {len(record)}")
-    return record[number - 1].about
 
 
 def _subject(asked: _Body, now_ns: int, annotations: Record, resolve: Resolve) -> Subject:

@@ -25,15 +25,15 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """List, or take back."""
-    from mapweave.hybridmap.errors import Refused
-    from mapweave.hybridmap.manual_constraint import event_words
+    from mapweave.hybridmap.manual_constraint import event_words, to_take_back
     from mapweave.mapserver.http.json_values import constraint_values
+    from mapweave.refusals import refusals
 
     record = constraints_of(arguments)
     if arguments.number is not None:
-        if not 1 <= arguments.number <= len(record.made):
-            raise Refused(f"there is no constraint {arguments.number}: `mapweave map undo` lists them")
-        constrain(arguments, record.made[arguments.number - 1].about)
+        with refusals():
+            about = to_take_back(record.made, arguments.number)
+        constrain(arguments, about)
         return 0
     if arguments.json:
         print(json.dumps(constraint_values(record)))

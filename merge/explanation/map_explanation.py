@@ -13,7 +13,7 @@ import networkx as nx
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import MapsExplanation, NearMiss
-from mapweave.hybridmap.manual_constraint import reason_of
+from mapweave.hybridmap.manual_constraint import reason_of, retired_words
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.reachability import reachability_of
 from mapweave.merge.explanation.component_changes import joined_maps
@@ -57,7 +57,8 @@ def explain_maps(
 def explain_fleet(
     merged: MergedMap, most: int, verification: RecognitionSettings | None = None
 ) -> tuple[MapsExplanation, ...]:
-    """Explain each two maps: those first that are not one, of these those with the most refused links.
+    """Explain each two maps: those first that are not one, of these those with the most refused links, and
+    last those of which one is retired.
 
     Args:
         merged: the merged map.
@@ -71,9 +72,12 @@ def explain_fleet(
         if r.a.map != r.b.map:
             (alike if r.link is None else refused)[min(r.a.map, r.b.map), max(r.a.map, r.b.map)] += 1
 
-    def interest(pair: Pair) -> tuple[bool, int, int, Pair]:
+    retired = merged.constraints.retired
+
+    def interest(pair: Pair) -> tuple[bool, bool, int, int, Pair]:
         first, second = (part_of.get(map_id) for map_id in pair)
-        return first is not None and first == second, -refused[pair], -alike[pair], pair
+        joined = first is not None and first == second
+        return joined, not retired.keys().isdisjoint(pair), -refused[pair], -alike[pair], pair
 
     pairs = heapq.nsmallest(most, combinations(sorted(merged.maps), 2), key=interest)
     between = _between(merged, pairs)
@@ -177,8 +181,9 @@ def _why_apart(
 ) -> str:
     head = f"{first} and {second} are not one map"
     constraints = merged.constraints
+    if retired := [words for one in (first, second) if (words := _retired(merged, one))]:
+        return f"{head}: {'; '.join(retired)}"
     constraint = constraints.standing(Apart((first, second)))
-    constraint = constraint or constraints.retired.get(first) or constraints.retired.get(second)
     if constraint is not None:
         return f"{head}: {reason_of(constraint)}"
     if refused:
@@ -198,6 +203,18 @@ def _why_apart(
         many = "1 pair of nodes looks" if len(unverified) == 1 else f"{len(unverified)} pairs of nodes look"
         return f"{head}: {many} similar and no two have a common pose{best}"
     return f"{head}: no node of one shares enough similar features with any of the other to be compared"
+
+
+def _retired(merged: MergedMap, which: MapId) -> str:
+    """Who has retired a map, as a whole or by all of its nodes, and how it comes back; else empty."""
+    constraints = merged.constraints
+    if which in constraints.retired:
+        return retired_words(constraints.retired[which])
+    retiring = [constraints.nodes.get(node) for node in merged.maps[which].nodes]
+    by = dict.fromkeys(one for one in retiring if one is not None)
+    if not by or None in retiring:
+        return ""
+    return f"no node of {which} is left: {'; '.join(retired_words(one) for one in by)}"
 
 
 def _strongest(refused: Sequence[RefusedLink]) -> tuple[NearMiss, ...]:

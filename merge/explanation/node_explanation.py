@@ -11,7 +11,7 @@ from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import LinkAgreement, Misfit, PairExplanation, Standing
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.manual_constraint import reason_of
+from mapweave.hybridmap.manual_constraint import reason_of, retired_words
 from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.explanation.own_edges import claims, consequences, edge_in_words, own_edge
@@ -65,7 +65,7 @@ def explain_nodes(
     )
     retired = merged.constraints.retires(first.id) or merged.constraints.retires(second.id)
     if retired is not None:
-        return replace(explanation, standing=Standing.UNDONE, reason=reason_of(retired))
+        return replace(explanation, standing=Standing.UNDONE, reason=retired_words(retired))
     other_links: tuple[LinkAgreement, ...] = ()
     verified = geometry is not None and (own is None or own.kind in CLAIMS)
     if geometry is None and explanation.a_from_b is not None:

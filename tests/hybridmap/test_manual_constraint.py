@@ -20,7 +20,12 @@ from mapweave.hybridmap.constraint_subject import (
 )
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import MAX_STAMP_NS
-from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, event_words
+from mapweave.hybridmap.manual_constraint import (
+    ManualConstraint,
+    ManualConstraints,
+    event_words,
+    to_take_back,
+)
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
@@ -53,6 +58,30 @@ def test_a_constraint_on_maps_holds_for_all_their_nodes() -> None:
     )
     assert constraints.against(A, NodeId("b", 2, 5)) is None
     assert constraints.about(B, A) == constraints.about(MapId("b", 1), MapId("a", 1)) == constraints.made
+
+
+def test_what_was_taken_back_already_is_not_taken_back_again() -> None:
+    apart, other = Apart((A.map, B.map)), RetiredMap(A.map)
+    made = [
+        ManualConstraint(apart, True, "anna", 0),
+        ManualConstraint(other, True, "anna", 1),
+        ManualConstraint(apart, False, "bob", 3_600_000_000_000, "one kitchen"),
+    ]
+    assert to_take_back(made, 2) == other
+    back = 'constraint 1 was taken back already by bob on 1970-01-01 01:00 UTC: "one kitchen"'
+    with pytest.raises(InvalidValue, match=f"^{back}$"):
+        to_take_back(made, 1)
+    made.append(ManualConstraint(apart, True, "carl", 7_200_000_000_000))
+    with pytest.raises(InvalidValue, match=f"^{back}; what holds now is number 4, by carl on 1970-01-01"):
+        to_take_back(made, 1)
+    assert to_take_back(made, 4) == apart
+    with pytest.raises(
+        InvalidValue, match="constraint 3 takes another one back .*: there is nothing to undo"
+    ):
+        to_take_back(made, 3)
+    for number in (0, 5):
+        with pytest.raises(InvalidValue, match=f"there is no constraint {number}: the record has 4"):
+            to_take_back(made, number)
 
 
 subjects = st.sampled_from(

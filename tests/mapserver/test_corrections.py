@@ -19,7 +19,7 @@ from mapweave.exit_status import NO
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.constraint_subject import Linked, RetiredArea, RetiredNodes
-from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
@@ -156,7 +156,11 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         area = Area(NodeId("a", 1, 1), ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)))
         assert "map a.1 has no node left" in asking.fleet.retire(area=area)
         assert {node.map for node in asking.merged().poses} == {B}
-        asking.fleet.undo(5)
+        with pytest.raises(Refused, match='constraint 2 was taken back already by carl on .*: "it was not'):
+            asking.fleet.undo(2)
+        status, answer = asking.http("POST", {"undo": 1})
+        assert status == 400 and "constraint 1 was taken back already by carl" in answer["error"]
+        asking.fleet.undo(asking.fleet.constraints()[4])
         assert asking.merged().poses.keys() == content.poses.keys()
         kinds = [type(one.about) for one in asking.fleet.constraints()]
         assert kinds == [Linked, RetiredNodes, RetiredNodes, Linked, RetiredArea, RetiredArea]

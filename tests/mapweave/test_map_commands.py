@@ -184,6 +184,20 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     assert links(tmp_path / "one.mapweave") == [other for other in links(path) if other != pair]
 
 
+def test_an_entry_that_was_taken_back_is_not_undone_again(
+    files: list[Path], said: Said, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "m.mapweave"
+    path.write_bytes(files[3].read_bytes())
+    for undo, who in (([], "anna"), (["--undo"], "bob"), ([], "carl")):
+        said("map", "unmerge", "r0.1", "r1.1", *undo, "--by", who, "--map", path)
+    before = path.read_bytes()
+    assert main(["map", "undo", "1", "--map", str(path)]) == NO
+    err = capfd.readouterr().err
+    assert "constraint 1 was taken back already by bob on 20" in err and "number 3, by carl" in err
+    assert path.read_bytes() == before, "what carl decided holds"
+
+
 def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp_path: Path) -> None:
     path = tmp_path / "m.mapweave"
     path.write_bytes(files[3].read_bytes())
@@ -197,6 +211,18 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     assert "not one map: map r1.1 is retired by anna on 20" in out and '"rebuilt"' in out
     out = said("map", "explain", "r0.1.1", "r1.1.1", "--map", path)
     assert "are not linked: map r1.1 is retired by anna" in out
+    # The explanation says who did it, why, and how it comes back, once; other maps come first.
+    why = '"rebuilt"; `mapweave map retire r1.1 --undo` brings it back'
+    lines = said("map", "explain", "r0.1", "r1.1", "--map", path).splitlines()
+    assert len(lines) == 1 and "not one map: map r1.1 is retired by anna on 20" in lines[0], lines
+    assert lines[0].endswith(why)
+    lines = said("map", "explain", "r0.1.1", "r1.1.1", "--map", path).splitlines()
+    assert lines[0].endswith(why) and not any("anna" in line for line in lines[1:])
+    assert said("map", "explain", "--map", path).startswith("r0.1 and r2.1 are not one map: no node")
+    nodes = sorted(node for node in merged_of(before).poses if node.map == R1)
+    said("map", "retire", *nodes, "--map", files[3], "-o", tmp_path / "nodes.mapweave")
+    out = said("map", "explain", "r0.1", "r1.1", "--map", tmp_path / "nodes.mapweave")
+    assert "not one map: no node of r1.1 is left: nodes r1.1.1, " in out and "--undo` brings them back" in out
     # A later merge with others applies it too.
     said("map", "merge", path, "-o", path)
     assert not links(path)
