@@ -25,6 +25,7 @@ from mapweave.fleet_plans import FleetPlans
 from mapweave.hybridmap.agent_status import SILENT, AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.hybridmap.mission_order import (
+    MAX_KEPT,
     MissionKind,
     MissionOrder,
     MissionReport,
@@ -162,6 +163,8 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         checked = Keys(check_name(fleet))
         self._key_holder = read_key_file(Path(keys)).credentials if keys else None
         self._by = author(self._key_holder, by)[:64]
+        # Final reports that the map server may not have heard of yet, by robot and id.
+        self._finished: dict[tuple[str, str], MissionReport] = {}
         self._own: ZenohBus | None = None
         if bus is None:
             endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
@@ -201,7 +204,8 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
-        """The missions that the map server knows of, oldest first.
+        """The missions that the map server knows of, oldest first; none is in an older state than `wait` has
+        returned.
 
         Args:
             robot: of this robot alone.
@@ -210,7 +214,8 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             NotConnected: no map server answers.
             Refused: no such robot was ever heard of.
         """
-        reports = decode(self._question(self._keys.any_missions(), b"", ANSWERED), Missions).reports
+        relayed = decode(self._question(self._keys.any_missions(), b"", ANSWERED), Missions).reports
+        reports = (self._finished.get(_key(one), one) if one.open else one for one in relayed)
         found = tuple(report for report in reports if robot in ("", report.order.robot))
         if robot and not found:
             known = [entry.robot for entry in self.status().robots]
@@ -309,6 +314,10 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
                     on_silence(now - heard[0])
         finally:
             listening.close()
+        if not last[0].open:
+            while len(self._finished) >= MAX_KEPT:
+                self._finished.pop(next(iter(self._finished)), None)
+            self._finished[_key(last[0])] = last[0]
         return last[0]
 
     def _give(
@@ -355,6 +364,10 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             report = decode(reply.payload, AgentStatus).mission
             return 0 if report is None else report.order.stamp_ns
         return 0
+
+
+def _key(report: MissionReport) -> tuple[str, str]:
+    return report.order.robot, report.order.id
 
 
 def _node(goal: str) -> NodeId | None:

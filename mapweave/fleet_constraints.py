@@ -108,7 +108,8 @@ class FleetConstraints(FleetAnnotations):
             check: only say what it would do.
 
         Raises:
-            Refused: there is none of this number, or it was taken back already; the words say when, and who did so.
+            Refused: there is none of this number, or it was taken back already: the words say who did so, and
+                when.
         """
         record = self.constraints()
         if not isinstance(what, int):

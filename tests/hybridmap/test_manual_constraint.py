@@ -76,7 +76,7 @@ def test_what_was_taken_back_already_is_not_taken_back_again() -> None:
         to_take_back(made, 1)
     assert to_take_back(made, 4) == apart
     with pytest.raises(
-        InvalidValue, match="constraint 3 takes another one back .*: there is nothing to undo"
+        InvalidValue, match=r"constraint 3 takes another one back .*: there is nothing to undo"
     ):
         to_take_back(made, 3)
     for number in (0, 5):

@@ -156,7 +156,7 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         area = Area(NodeId("a", 1, 1), ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)))
         assert "map a.1 has no node left" in asking.fleet.retire(area=area)
         assert {node.map for node in asking.merged().poses} == {B}
-        with pytest.raises(Refused, match='constraint 2 was taken back already by carl on .*: "it was not'):
+        with pytest.raises(Refused, match=r'constraint 2 was taken back already by carl on .*: "it was not'):
             asking.fleet.undo(2)
         status, answer = asking.http("POST", {"undo": 1})
         assert status == 400 and "constraint 1 was taken back already by carl" in answer["error"]

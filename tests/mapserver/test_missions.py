@@ -58,6 +58,31 @@ def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
     link.close()
 
 
+def test_no_mission_is_older_than_what_waiting_for_it_has_returned(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, control = house.robot()
+    report = house.person.go("r0", str(THERE))
+    # A server that is slow: the person hears the robot's last status first.
+    monkeypatch.setattr(house.server._missions, "hear", lambda status: None)
+    control.next(True, 0.0, None)
+    control.follow(Status("gave up", "a wall", 7, 0, Pose2(), False, given_up=True))
+    done = threading.Event()
+
+    def go_on_reporting() -> None:
+        while not done.wait(0.02):
+            link.report(Status("gave up", "a wall", 7, 0, Pose2(), False), 2)
+
+    reporting = threading.Thread(target=go_on_reporting)
+    reporting.start()
+    waited = house.person.wait(report, 20.0)
+    done.set()
+    reporting.join()
+    assert waited.state is MissionState.FAILED
+    assert house.person.missions() == (waited,)
+    link.close()
+
+
 @pytest.mark.parametrize(
     ("goal", "reason"),
     [
