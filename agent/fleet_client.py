@@ -14,6 +14,7 @@ from mapweave.agent.mission import Answer, AnswerContent, Driven, Question, Wher
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.queries import best, decode_answer, encode_query, settles
 from mapweave.agent.teleoperation import Teleoperation
+from mapweave.agent.troubles import Troubles
 from mapweave.hybridmap.agent_status import AgentStatus, Status, one_line
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
@@ -83,7 +84,7 @@ class FleetClient:
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
         self._stamp_ns = self._skipped = 0
         self._battery: float | None = None
-        self._trouble, self._trouble_at = "", 0.0
+        self._troubles = Troubles()
         self._missions = missions
         self._unsent, self._placed, self._failure = unsent, placed, failure
         self._timeout = answer_timeout
@@ -131,6 +132,8 @@ class FleetClient:
         """
         self._status = replace(status, doing=one_line(status.doing), detail=one_line(status.detail))
         self._stamp_ns, self._battery, self._skipped = stamp_ns, battery, skipped
+        mission = self._missions.report
+        self._troubles.mission(None if mission is None else (mission.order.id, mission.state))
         if publish:
             self._bus.publish(self._keys.agent_status(self._agent), encode(self.status()))
 
@@ -165,7 +168,7 @@ class FleetClient:
         traffic = self._bus.traffic if isinstance(self._bus, TrafficMeter) else 0
         # What fails now comes before a question that once had no answer.
         failure = one_line(self._failure())
-        age = time.monotonic() - self._trouble_at if self._trouble and not failure else 0.0
+        trouble, age = (failure, 0.0) if failure else self._troubles.newest()
         return AgentStatus(
             self._status,
             self._stamp_ns,
@@ -177,7 +180,7 @@ class FleetClient:
             self._placed(),
             self._missions.report,
             self._battery,
-            failure or self._trouble,
+            trouble,
             age,
             self._skipped,
         )
@@ -188,6 +191,7 @@ class FleetClient:
     def _see_server(self, key: str, alive: bool) -> None:
         if alive:
             self._servers.add(key)
+            self._troubles.server_is_there()
         else:
             self._servers.discard(key)
             self._server_lost_at = time.monotonic()
@@ -251,7 +255,8 @@ class FleetClient:
                 break
             time.sleep(ASK_AGAIN)
         if answers:
+            self._troubles.answered(type(question))
             return Answer(question.number, best(answers))
         if not optional:
-            self._trouble, self._trouble_at = one_line(error), time.monotonic()
+            self._troubles.begin(type(question), error, error == NO_ANSWER)
         return Answer(question.number, None, error, retry_after)

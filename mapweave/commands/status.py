@@ -46,7 +46,7 @@ def add_to(commands: Any) -> None:
         description="List the robots of a running fleet: mission and how far it is, what each is doing, "
         "where it is in the merged map, its last node there and links of its map with others, battery (if "
         "its driver tells it), changes that no server has yet and for how long the server has known of one, "
-        "the age of its last message, its last trouble; below, why maps are not merged. "
+        "the age of its last message, what is wrong at present; below, why maps are not merged. "
         "Example: `mapweave status --watch`. Without a map server the robots are asked themselves; what only "
         "a server knows is then left out.",
     )
@@ -177,10 +177,16 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
         str(status.unsent),
         _lag(robot),
         age,
-        robot.over_quota
-        or robot.accusation
-        or (f"{status.last_error} ({status.error_age:.0f} s ago)" if status.last_error else ""),
+        robot.over_quota or robot.accusation or _own_trouble(robot),
     )
+
+
+def _own_trouble(robot: RobotEntry) -> str:
+    """What the robot says is wrong at present: nothing of one that is gone."""
+    if robot.status is None or not robot.alive:
+        return ""
+    words, age = robot.status.last_error, robot.status.error_age
+    return f"{words} (for {age:.0f} s)" if words and age >= 1.0 else words
 
 
 def _newest(robot: RobotEntry) -> str:

@@ -390,3 +390,64 @@ def test_closing_twice_is_no_error(hub: MemoryHub) -> None:
     link.close()
     link.close()
     bus.close()
+
+
+def test_a_trouble_is_in_the_status_only_while_it_holds(
+    hub: MemoryHub, other: MemoryBus, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "mapweave.agent.troubles")
+    bus, missions = MemoryBus(hub), MissionControl("r0")
+    link = FleetClient(bus, KEYS, MAP, missions, answer_timeout=0.1)
+
+    def trouble() -> str:
+        return link.status().last_error
+
+    def ask(question: Question) -> None:
+        link.ask(question)
+        link.answers(wait=True)
+
+    where, way = QUESTIONS[:2]
+    ask(where)
+    time.sleep(0.05)
+    ask(where)
+    assert trouble() == NO_ANSWER and link.status().error_age >= 0.05, "since it began"
+    # A server that comes ends it, without another question.
+    token = other.announce(KEYS.server_alive("s0"))
+    eventually(lambda: trouble() == "")
+    assert [record.message for record in caplog.records] == [
+        f"a question to the fleet has no answer: {NO_ANSWER}", f"over after 0 s: {NO_ANSWER}"
+    ]  # fmt: skip
+
+    refusing = ["full"]
+
+    def relocalize(request) -> None:
+        if refusing:
+            request.refuse(refusing[0])
+        else:
+            request.reply(encode(RelocalizeAnswer(Certainty.UNKNOWN, (), "never seen")))
+
+    other.serve(sent_by_any(KEYS.relocalize("s0")), relocalize)
+    ask(where)
+    ask(way)
+    assert trouble() == NO_ANSWER, "the newest of two: it has no routes"
+    other.serve(
+        sent_by_any(KEYS.route("s0")), lambda request: request.reply(encode(RouteAnswer((), "no way")))
+    )
+    ask(way)
+    assert "full" in trouble(), "answers of another kind do not end a refusal"
+    refusing.clear()
+    ask(where)
+    assert trouble() == "" and link.status().error_age == 0.0
+    # What was asked for a mission is over with it.
+    status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False)
+    link.report(status, 1)
+    refusing.append("full")
+    ask(where)
+    link.report(status, 2)
+    assert "full" in trouble()
+    missions.take(MissionOrder.new("r0", MissionKind.STOP, "anna"))
+    link.report(status, 3)
+    assert trouble() == ""
+    token.close()
+    link.close()
+    bus.close()

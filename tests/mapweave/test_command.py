@@ -8,6 +8,7 @@ import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -224,8 +225,9 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
     assert cells(entry) == (
         "r0", "go to r1.1.5 (kitchen) running 25%", "driving along the route: 0.4 m to node r1.1.5",
         "1.23,-5.00 180° in part 2", "", "", "12", "50%", "3", "", "7.0 s silent",
-        "no map server answered (61 s ago)",
+        "no map server answered (for 61 s)",
     )  # fmt: skip
+    assert cells(replace(entry, alive=False))[-1] == "", "what a robot said before it went need not hold"
     lies = RobotEntry("r1", False, accusation="map r1.1 is implausible: its clock utc runs backwards")
     assert cells(lies)[-1] == lies.accusation
     assert cells(RobotEntry("r1", False))[0] == "r1" and "gone" in cells(RobotEntry("r1", False))

@@ -102,6 +102,7 @@ export function updateRobot(robots) {
     ["battery", status?.battery != null ? percent(status.battery) : ""],
     ["sees the server", status && (status.linked ? "yes" : "no")],
     ["quota", robot.over_quota, "bad"],
-    ["last error", status?.last_error ? `${status.last_error} (${seconds(status.error_age)} before)` : "", "bad"],
+    ["trouble", robot.alive && status?.last_error
+      ? `${status.last_error}${status.error_age >= 1 ? ` (for ${seconds(status.error_age)})` : ""}` : "", "bad"],
   ]);
 }
