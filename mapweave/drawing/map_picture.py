@@ -157,7 +157,10 @@ def draw_map(picture: MapPicture, path: Path) -> None:
         figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     image = io.BytesIO()
-    figure.draw_without_rendering()
+    # Laid out once: matplotlib would do it again, and draw all of it once more, for each file.
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine(None)
+    axes.apply_aspect()
     draw_names(axes, _names(picture), _marks(picture))
     figure.savefig(image, format="png")
     write_whole(path, image.getvalue())
