@@ -210,14 +210,18 @@ def check_pairs(a: Array, b: Array, covariance: Array, scale: float | None = Non
             f"the pairs are too near to each other: they lie within {spread:.2f} m, which leaves the plan's "
             f"rotation uncertain by {math.degrees(proper.sigmas[2]):.1f} deg; click some further apart"
         )
-    if lead < CLEARLY and _unlikely(proper):
+    if scale is not None and _unlikely(proper):
         free = fit_similarity(a, b, covariance)
-        if scale is not None and not _unlikely(free):
+        # One wrong pair among others that fit the given scale pulls a free scale towards itself.
+        named = lead >= CLEARLY and wrong_pair(leave_one_out(a, b, covariance, scale)) is not None
+        if not _unlikely(free) and not named:
+            fourth = "; if it is right, one pair is wrong: click a fourth" if len(a) == LEAST else ""
             raise InvalidValue(
                 f"the given scale of {scale:g} m/px does not fit: the pairs agree on "
                 f"{free.a_from_b.scale:.4g} m/px, and with the given one the residuals are "
-                f"{proper.rms:.2f} m; correct it, or leave it out"
+                f"{proper.rms:.2f} m; correct it, or leave it out{fourth}"
             )
+    if lead < CLEARLY and _unlikely(proper):
         raise InvalidValue(
             f"the pairs contradict each other: residuals of {proper.rms:.2f} m; one is wrong, click more "
             "pairs to learn which"

@@ -183,6 +183,25 @@ def test_pairs_that_agree_on_another_scale_than_the_given_one_are_not_called_wro
         check_pairs(a, b, covariance, given)
 
 
+@pytest.mark.parametrize("count", [3, 4, 5, 8])
+@pytest.mark.parametrize("factor", [1.1, 1.5, 2.0])
+def test_a_wrong_scale_is_named_however_many_pairs_there_are(count: int, factor: float) -> None:
+    """Of more pairs the mirror image is clearly worse, also with a wrong scale."""
+    for seed in range(5):
+        a, b, covariance = world(seed, count)
+        with pytest.raises(InvalidValue, match=r"the given scale of .* agree on 0\.0(49|50?)"):
+            check_pairs(a, b, covariance, factor * TRUTH.scale)
+
+
+@pytest.mark.parametrize("off", [1.0, 2.0, 5.0])
+def test_a_wrong_pair_of_many_is_not_taken_for_a_wrong_scale(off: float) -> None:
+    rng = np.random.default_rng(3)
+    for seed in range(30):
+        a, b, covariance = world(seed, 8)
+        a[1] += Similarity(0.0, 0.0, rng.uniform(-3.1, 3.1)).apply(np.array([off, 0.0]))
+        check_pairs(a, b, covariance, TRUTH.scale)
+
+
 def test_pairs_that_determine_nothing_are_refused() -> None:
     plane = np.array([[0.0, 0.0], [400.0, 0.0], [100.0, 300.0], [350.0, 500.0]])
     loose = 0.01 * np.eye(8)
