@@ -147,8 +147,9 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     # Matplotlib takes half a second to import and is an extra: so it is imported here.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=(WIDTH, _height(picture)), dpi=110, layout="constrained")
+    figure = Figure(figsize=(WIDTH, _height(picture)), dpi=110)
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     draw_on(axes, picture)
@@ -158,8 +159,7 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     image = io.BytesIO()
     # Laid out once: matplotlib would do it again, and draw all of it once more, for each file.
-    figure.get_layout_engine().execute(figure)
-    figure.set_layout_engine(None)
+    ConstrainedLayoutEngine().execute(figure)
     axes.apply_aspect()
     draw_names(axes, _names(picture), _marks(picture))
     figure.savefig(image, format="png")

@@ -34,8 +34,9 @@ def draw_errors(
     # matplotlib is imported only for drawing.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=(12, 4.5), dpi=110, layout="constrained")
+    figure = Figure(figsize=(12, 4.5), dpi=110)
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     colours = colours_of(m.agent for m in scores)
@@ -67,6 +68,8 @@ def draw_errors(
     axes.grid(axis="y", color="#eeeeee")
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside right upper", frameon=False, fontsize=9, title="map: ATE")
+    # Else matplotlib draws all of it twice.
+    ConstrainedLayoutEngine().execute(figure)
     figure.savefig(path, format="png")
 
 
