@@ -72,9 +72,10 @@ class Camera:
         p = np.asarray(points_in_robot, dtype=np.float64)
         depth = p[..., 0] - self.mount_forward
         depth = np.where(depth > 0.01, depth, np.nan)
-        u = self.cx - self.fx * p[..., 1] / depth
-        v = self.cy - self.fy * (p[..., 2] - self.mount_height) / depth
-        return np.stack([u, v], axis=-1)
+        out = np.empty((*depth.shape, 2))
+        out[..., 0] = self.cx - self.fx * p[..., 1] / depth
+        out[..., 1] = self.cy - self.fy * (p[..., 2] - self.mount_height) / depth
+        return out
 
     def back_project(self, pixels: NDArray[Any], depths: NDArray[Any]) -> Array:
         """Points seen at pixels at depths along the optical axis.
@@ -88,14 +89,11 @@ class Camera:
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         depths = np.asarray(depths, dtype=np.float64)
-        return np.stack(
-            [
-                depths + self.mount_forward,
-                -(pixels[..., 0] - self.cx) / self.fx * depths,
-                self.mount_height - (pixels[..., 1] - self.cy) / self.fy * depths,
-            ],
-            axis=-1,
-        )
+        out = np.empty((*depths.shape, 3))
+        out[..., 0] = depths + self.mount_forward
+        out[..., 1] = -(pixels[..., 0] - self.cx) / self.fx * depths
+        out[..., 2] = self.mount_height - (pixels[..., 1] - self.cy) / self.fy * depths
+        return out
 
     def bearings(self, pixels: NDArray[Any]) -> Array:
         """Horizontal bearing gamma of equation (3), (...) rad, positive to the left."""

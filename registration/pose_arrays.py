@@ -16,20 +16,25 @@ from mapweave.hybridmap.pose import Array
 
 
 def compose_poses(a: Array, b: Array) -> Array:
-    """(N, 3) poses `x_from_y` and (N, 3) `y_from_z` -> (N, 3) `x_from_z`, headings wrapped."""
-    cos, sin = np.cos(a[:, 2]), np.sin(a[:, 2])
-    heading = (a[:, 2] + b[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    return np.stack(
-        [a[:, 0] + cos * b[:, 0] - sin * b[:, 1], a[:, 1] + sin * b[:, 0] + cos * b[:, 1], heading], axis=1
-    )
+    """(N, 3) `x_from_y` and (N, 3) `y_from_z` -> (N, 3) `x_from_z`, wrapped; either may be (1, 3)."""
+    (ax, ay, turn), (bx, by, further) = a.T, b.T
+    cos, sin = np.cos(turn), np.sin(turn)
+    out = np.empty((np.broadcast(ax, bx).size, 3))
+    out[:, 0] = ax + cos * bx - sin * by
+    out[:, 1] = ay + sin * bx + cos * by
+    out[:, 2] = (turn + further + np.pi) % (2 * np.pi) - np.pi
+    return out
 
 
 def inverse_poses(poses: Array) -> Array:
     """(N, 3) inverse poses."""
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x = -cos * poses[:, 0] - sin * poses[:, 1]
-    y = sin * poses[:, 0] - cos * poses[:, 1]
-    return np.stack([x, y, -poses[:, 2]], axis=1)
+    x, y, heading = poses.T
+    cos, sin = np.cos(heading), np.sin(heading)
+    out = np.empty((len(poses), 3))
+    out[:, 0] = -cos * x - sin * y
+    out[:, 1] = sin * x - cos * y
+    out[:, 2] = -heading
+    return out
 
 
 def adjoints(poses: Array) -> Array:

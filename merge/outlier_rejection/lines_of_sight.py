@@ -117,17 +117,19 @@ def seen_through(
         sigma_xy: standard deviation of that, m,
         sigma_heading: and rad.
     """
-    marks, with_depth = (n.landmarks.take(n.landmarks.has_depth) for n in (node, view))
-    points = view_from_node.apply(marks.points_in_robot(node.camera))
+    (marks, own), (seen, known) = ((n.landmarks, n.landmarks.has_depth) for n in (node, view))
+    points = view_from_node.apply(node.camera.back_project(marks.pixels[own], marks.depths[own]))
     pixels = view.camera.project(points)
     inside = view.camera.contains(pixels)
-    if not inside.any() or not len(with_depth):
+    if not inside.any() or not known.any():
         return 0, 0
     depths, pixels = points[inside, 0] - view.camera.mount_forward, pixels[inside]
-    own = marks.depth_sigmas[inside].astype(np.float64) ** 2 + sigma_xy**2 + (sigma_heading * depths) ** 2
-    sigmas = np.sqrt(own[:, None] + with_depth.depth_sigmas.astype(np.float64)[None] ** 2)
-    further = with_depth.depths.astype(np.float64)[None] - depths[:, None]
-    off = np.linalg.norm(pixels[:, None] - with_depth.pixels[None], axis=2) / view.camera.fx
+    sigmas = marks.depth_sigmas[own][inside].astype(np.float64)
+    variances = sigmas**2 + sigma_xy**2 + (sigma_heading * depths) ** 2
+    sigmas = np.sqrt(variances[:, None] + seen.depth_sigmas[known].astype(np.float64)[None] ** 2)
+    further = seen.depths[known].astype(np.float64)[None] - depths[:, None]
+    across, down = (pixels[:, None, k] - seen.pixels[known, k] for k in range(2))
+    off = np.sqrt(across * across + down * down) / view.camera.fx
     same_direction = off < AROUND + 2.0 * sigma_heading
     behind = (same_direction & (further > SIGMAS * sigmas + MARGIN)).any(axis=1)
     about = (same_direction & (np.abs(further) <= SIGMAS * sigmas + MARGIN)).any(axis=1)
