@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-
-import networkx as nx
+from typing import TYPE_CHECKING
 
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.node import Edge, EdgeId, Node, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 
 class HybridMap:
@@ -22,6 +24,8 @@ class HybridMap:
 
     def __init__(self, changes: Iterable[ChangeBody] = ()) -> None:
         """Replay the changes."""
+        import networkx as nx
+
         self.nodes: dict[NodeId, Node] = {}
         self.edges: dict[EdgeId, Edge] = {}
         self.graph: nx.MultiGraph = nx.MultiGraph()
@@ -61,6 +65,8 @@ class HybridMap:
 
     def components(self) -> list[set[NodeId]]:
         """Connected components over nodes that are really there, largest first."""
+        import networkx as nx
+
         present = self.graph.subgraph(self.nodes)
         return sorted(nx.connected_components(present), key=len, reverse=True)
 

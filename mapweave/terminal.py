@@ -11,13 +11,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from datetime import datetime
 from types import TracebackType
-from typing import TypeVar
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Column
+from typing import TYPE_CHECKING, TypeVar
 
 from mapweave.json_log import JsonFormatter, json_line
+
+if TYPE_CHECKING:
+    # A server prints lines alone.
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
 
 PLAIN_WIDTH = 10_000
 """Characters of a line that is not on a terminal: none is wrapped."""
@@ -31,6 +32,8 @@ _T = TypeVar("_T")
 
 def plain_or_terminal(stderr: bool = True, quiet: bool = False) -> Console:
     """A console that wraps nothing where there is no terminal."""
+    from rich.console import Console
+
     stream = sys.stderr if stderr else sys.stdout
     return Console(file=stream, quiet=quiet, width=None if stream.isatty() else PLAIN_WIDTH)
 
@@ -91,10 +94,12 @@ class Bar:
         """
         self._console, self._words, self._total, self._clock = console, words, total, clock
         self._done, self._said_at, self._said = 0.0, clock(), ""
-        self._bar: Progress | None = None
-        self._task = TaskID(0)
+        self._bar: tuple[Progress, TaskID] | None = None
         self._detail = ""
         if console.is_terminal:
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+            from rich.table import Column
+
             # Of a line that is too long the detail is cut, not the numbers.
             whole, rest = Column(no_wrap=True), Column(no_wrap=True, overflow="ellipsis", ratio=1)
             columns = (
@@ -102,13 +107,13 @@ class Bar:
                 MofNCompleteColumn(table_column=whole), TimeElapsedColumn(table_column=whole),
                 TextColumn("{task.fields[detail]}", markup=False, table_column=rest),
             )  # fmt: skip
-            self._bar = Progress(*columns, console=console, transient=transient, expand=True)
-            self._task = self._bar.add_task(words, total=total, detail="")
+            bar = Progress(*columns, console=console, transient=transient, expand=True)
+            self._bar = bar, bar.add_task(words, total=total, detail="")
 
     def __enter__(self) -> Bar:
         """Begin to show."""
         if self._bar is not None:
-            self._bar.start()
+            self._bar[0].start()
         return self
 
     def __exit__(
@@ -116,7 +121,7 @@ class Bar:
     ) -> None:
         """Show the last state. What was quick, or has failed, ends without a plain line."""
         if self._bar is not None:
-            self._bar.stop()
+            self._bar[0].stop()
         elif self._said and error is None:
             self._say()
 
@@ -135,7 +140,8 @@ class Bar:
         self._done, self._detail = done, detail
         self._total = self._total if total is None else total
         if self._bar is not None:
-            self._bar.update(self._task, completed=done, total=self._total, detail=detail)
+            bar, task = self._bar
+            bar.update(task, completed=done, total=self._total, detail=detail)
         elif self._clock() - self._said_at >= EVERY:
             self._say()
 

@@ -12,13 +12,13 @@ from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-import networkx as nx
-
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 
 if TYPE_CHECKING:
     # Programs that only name floors need none of the merge's libraries.
+    import networkx as nx
+
     from mapweave.merge.pose_graph.links import Link
     from mapweave.merge.pose_graph.merged_map import MergedMap
 
@@ -65,6 +65,8 @@ def held_together(
         floors: labels of maps, the new one among them.
         labelled: the map with the new label.
     """
+    import networkx as nx
+
     ties: nx.Graph = nx.Graph()
     ties.add_node(labelled)
     for a, b in constraints.links:

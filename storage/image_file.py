@@ -6,7 +6,6 @@ import re
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,6 +71,8 @@ def decode_grey(data: bytes) -> NDArray[np.uint8]:
     Raises:
         InvalidValue: it is none of these, damaged, or too large or too costly to decode.
     """
+    import cv2
+
     check_cost(data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)

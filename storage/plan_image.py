@@ -6,7 +6,6 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,6 +57,8 @@ def plan_file(data: bytes, name: str = "", negate: bool = False) -> PlanFile:
     Raises:
         InvalidValue: they are no image, damaged or too large.
     """
+    import cv2
+
     check_cost(data)
     pixels = _pixels(data)
     if max(pixels.shape[:2]) > MAX_SIDE:
@@ -98,6 +99,8 @@ def plan_pixels(png: bytes) -> NDArray[np.uint8]:
 
 def _pixels(data: bytes) -> NDArray[np.uint8]:
     """(H, W) or (H, W, 3) as OpenCV has it, upright; what is transparent is white."""
+    import cv2
+
     png_with_alpha = data.startswith(b"\x89PNG") and len(data) > 25 and data[25] in WITH_ALPHA
     try:
         flag = cv2.IMREAD_UNCHANGED if png_with_alpha else cv2.IMREAD_ANYCOLOR

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +28,8 @@ def view_file(pixels: NDArray[np.uint8], camera: Camera) -> bytes:
     Raises:
         InvalidValue: it takes too many bytes.
     """
+    import cv2
+
     width, height = view_size(camera)
     if pixels.shape != (height, width):
         pixels = np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,4 +1,7 @@
-"""Lens distortion, removed from points rather than from images."""
+"""Lens distortion, removed from points rather than from images.
+
+OpenCV is loaded when it is first needed: programs that only read settings start sooner.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
@@ -32,8 +34,9 @@ class LensModel(StrEnum):
     EQUIDISTANT = "equidistant"
 
 
-EXACT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-10)
-"""OpenCV's five steps leave up to 0.1 px in the corners of a webcam's image."""
+EXACT = (2 | 1, 60, 1e-10)
+"""`TERM_CRITERIA_EPS | TERM_CRITERIA_COUNT`, steps, px: OpenCV's own five steps leave up to 0.1 px in the
+corners of a webcam's image."""
 
 
 class Lens:
@@ -60,6 +63,8 @@ class Lens:
         if self._fisheye is not None:
             c = self.camera
             return np.asarray(self._fisheye.rays(raw) * [c.fx, c.fy] + [c.cx, c.cy])
+        import cv2
+
         out = cv2.undistortPoints(
             raw[:, None], self._matrix, self._distortion, P=self._matrix, criteria=EXACT
         )
@@ -75,6 +80,8 @@ class Lens:
         rays[:, :2] = (pixels - self._matrix[:2, 2]) / focal
         if self._fisheye is not None:
             return self._fisheye.project(rays[:, :2])
+        import cv2
+
         out, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self._matrix, self._distortion)
         return np.asarray(out, dtype=np.float64).reshape(-1, 2)
 
@@ -95,6 +102,8 @@ class Lens:
         """The (H, W) grey image of the ideal camera."""
         if self._ideal:
             return image
+        import cv2
+
         if self._maps is None:
             width, height = self.camera.width, self.camera.height
             pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)

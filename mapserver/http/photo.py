@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
 from mapweave.hybridmap.camera import Camera
@@ -55,6 +54,8 @@ class Photo:
         Raises:
             InvalidValue: it cannot be decoded, or its camera cannot be.
         """
+        import cv2
+
         image = decode_grey(self.data)
         # A phone notes in the file how it was held; the decoded image is upright.
         camera, distortion = camera_of(self.optics, image.shape[1], image.shape[0])

@@ -73,6 +73,24 @@ def post(http: int, path: str, content: dict) -> dict:
         return json.load(reply)
 
 
+def test_the_port_is_open_before_large_libraries_are_loaded() -> None:
+    """They are a thousand files, which take a second to read where none is in memory."""
+    code = (
+        "import sys\n"
+        "class Stop:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'mapweave.mapserver.base_map':\n"
+        "            sys.exit(' '.join(sorted({'cv2', 'networkx', 'rich', 'scipy', 'zenoh', 'faiss'} "
+        "& {*sys.modules})) or 0)\n"
+        "sys.meta_path.insert(0, Stop())\n"
+        "from mapweave.cli import main\n"
+        f"main(['server', '--demo', '--http', '{free_port()}', '--listen', 'tcp/127.0.0.1:{free_port()}'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "for people: http://127.0.0.1" in done.stdout, "the port is open"
+    assert (done.returncode, done.stderr) == (0, ""), "these are loaded already"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("soon", [0.0, 0.5, 1.5])
 def test_a_demo_that_is_stopped_while_it_starts_leaves_no_folder(tmp_path: Path, soon: float) -> None:
