@@ -66,8 +66,6 @@ is that of noise alone: such a feature slides along the edge when it is tracked 
 unnoticed by a forward-backward check."""
 LEAST_ROUNDNESS = 0.04
 """The same mean squared gradient in the weakest direction, as a share of that in the strongest."""
-ROUNDING = 1e-4
-"""Share of the mean squared gradients within which single precision may be wrong about them."""
 CONTRAST = 0.02
 """SIFT's contrast threshold; lower finds more and weaker features."""
 NOTHING: Array = np.zeros((0, 4))
@@ -115,93 +113,64 @@ class Sift:
         self, image: NDArray[np.uint8], left_out: Array = NOTHING
     ) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]:
         """The same before they are coded: keypoints, strongest first, and (N, 128) SIFT."""
-        import cv2
-
-        maps = _structure(image)
-        # In one call: a second image pyramid costs more than descriptors of those that are left out. The mask
-        # spares the descriptors of those that the image cannot hold.
-        found, descriptors = self._detector.detectAndCompute(image, _likely(maps))
+        # In one call: descriptors of those that are left out cost less than a second image pyramid.
+        found, descriptors = self._detector.detectAndCompute(image, None)
         if not found:
             return [], np.zeros((0, 128), np.float32)
-        at = cv2.KeyPoint.convert(found).astype(np.float64)
-        chosen = np.flatnonzero(_held(maps, at) & self._outside(at, left_out))
-        responses = np.array([k.response for k in found], dtype=np.float64)
-        kept = self._spread(chosen, at, responses, image.shape[1], image.shape[0])
+        chosen = self._outside(found, self._trackable(found, image), left_out)
+        kept = self._spread(found, chosen, image.shape[1], image.shape[0])
         return [found[k] for k in kept], np.asarray(descriptors, np.float32)[kept]
 
-    def _outside(self, at: Array, left_out: Array) -> NDArray[np.bool_]:
-        """(N,) which of (N, 2) px lie in no region that is left out."""
-        if not len(left_out):
-            return np.ones(len(at), np.bool_)
+    def _trackable(self, keypoints: Sequence[cv2.KeyPoint], image: NDArray[np.uint8]) -> list[int]:
+        """Numbers of those that the image around them holds in both directions (Shi and Tomasi 1994)."""
+        import cv2
+
+        smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
+        at = np.array([k.pt for k in keypoints]).round().astype(int)
+        # The structure tensor of the whole image, and its eigenvalues at the keypoints alone.
+        scale = 0.25 / TEXTURE_BLOCK_PX
+        x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=scale)
+        y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=scale)
+        size = (TEXTURE_BLOCK_PX, TEXTURE_BLOCK_PX)
+        xx, xy, yy = (
+            cv2.boxFilter(product, cv2.CV_32F, size, normalize=False)[at[:, 1], at[:, 0]].astype(float) / 4.0
+            for product in (x * x, x * y, y * y)
+        )
+        middle, half = (xx + yy) / 2.0, np.hypot((xx - yy) / 2.0, xy)
+        weak, strong = middle - half, middle + half
+        enough = (weak >= LEAST_TEXTURE) & (weak >= LEAST_ROUNDNESS * strong)
+        return [int(k) for k in np.flatnonzero(enough)]
+
+    def _outside(self, keypoints: Sequence[cv2.KeyPoint], chosen: list[int], left_out: Array) -> list[int]:
+        """Numbers of those that lie in no region that is left out."""
+        if not len(left_out) or not chosen:
+            return chosen
+        at = np.array([keypoints[k].pt for k in chosen], dtype=np.float64)
         pixels = (at if self._lens.rectifies else self._lens.undistort(at))[:, None]
         inside: NDArray[np.bool_] = (pixels >= left_out[:, :2]) & (pixels <= left_out[:, 2:])
-        return ~np.any(np.all(inside, axis=2), axis=1)
+        hits = np.any(np.all(inside, axis=2), axis=1).tolist()
+        return [k for k, hit in zip(chosen, hits, strict=True) if not hit]
 
     def _spread(
-        self, chosen: NDArray[np.intp], at: Array, responses: Array, width: int, height: int
+        self, keypoints: Sequence[cv2.KeyPoint], chosen: Sequence[int], width: int, height: int
     ) -> list[int]:
-        """Strongest first, one a place (SIFT repeats a place for each orientation), no cell crowded.
-
-        Args:
-            chosen: (K,) which of the keypoints may be kept.
-            at: (N, 2) px, all keypoints.
-            responses: (N,) of them.
-            width: of the image, px.
-            height: likewise.
-        """
-        x, y = at[chosen].T
-        inner = (x >= BORDER_PX) & (x < width - BORDER_PX) & (y >= BORDER_PX) & (y < height - BORDER_PX)
-        order = np.lexsort((y, x, -responses[chosen]))
-        chosen = chosen[order[inner[order]]]
-        places = at[chosen].round().astype(np.int64).tolist()
-        cells = (at[chosen] * CELLS / (width, height)).astype(np.int64).tolist()
+        """Strongest first, one a place (SIFT repeats a place for each orientation), no cell crowded."""
         s = self._settings
         quota = int(np.ceil(CROWDING * s.most / CELLS**2))
         taken: dict[tuple[int, int], int] = {}
-        before: set[tuple[int, int]] = set()
+        places: set[tuple[int, int]] = set()
         kept: list[int] = []
-        for k, (column, row), (across, down) in zip(chosen.tolist(), places, cells, strict=True):
-            if (column, row) in before or taken.get((across, down), 0) >= quota:
+        for k in sorted(chosen, key=lambda k: (-keypoints[k].response, keypoints[k].pt)):
+            x, y = keypoints[k].pt
+            if not (BORDER_PX <= x < width - BORDER_PX and BORDER_PX <= y < height - BORDER_PX):
                 continue
-            before.add((column, row))
-            taken[across, down] = taken.get((across, down), 0) + 1
+            place = (round(x), round(y))
+            cell = (int(x * CELLS / width), int(y * CELLS / height))
+            if place in places or taken.get(cell, 0) >= quota:
+                continue
+            places.add(place)
+            taken[cell] = taken.get(cell, 0) + 1
             kept.append(k)
             if len(kept) == s.most:
                 break
         return kept
-
-
-def _structure(image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], ...]:
-    """Structure tensor of a grey image (H, W) around each pixel: xx, xy and yy, (H, W) each, times four."""
-    import cv2
-
-    smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
-    scale = 0.25 / TEXTURE_BLOCK_PX
-    x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=scale)
-    y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=scale)
-    size = (TEXTURE_BLOCK_PX, TEXTURE_BLOCK_PX)
-    return tuple(
-        np.asarray(cv2.boxFilter(product, cv2.CV_32F, size, normalize=False), np.float32)
-        for product in (x * x, x * y, y * y)
-    )
-
-
-def _likely(maps: tuple[NDArray[np.float32], ...]) -> NDArray[np.uint8]:
-    """(H, W) 255 where a keypoint may be one that the image holds, by single precision; else 0."""
-    import cv2
-
-    xx, xy, yy = maps
-    middle, half = cv2.add(xx, yy), cv2.magnitude(xx - yy, 2.0 * xy)
-    weak, slack = middle - half, ROUNDING * middle
-    enough = (weak >= 8.0 * LEAST_TEXTURE - slack) & (weak >= LEAST_ROUNDNESS * (middle + half) - slack)
-    # OpenCV rounds half a pixel up, and NumPy to the even one.
-    return np.asarray(cv2.dilate(enough.astype(np.uint8), np.ones((2, 2), np.uint8), anchor=(1, 1)), np.uint8)
-
-
-def _held(maps: tuple[NDArray[np.float32], ...], at: Array) -> NDArray[np.bool_]:
-    """(N,) whether the image around (N, 2) px holds them in both directions (Shi and Tomasi 1994)."""
-    column, row = at.round().astype(int).T
-    xx, xy, yy = (part[row, column].astype(float) / 4.0 for part in maps)
-    middle, half = (xx + yy) / 2.0, np.hypot((xx - yy) / 2.0, xy)
-    weak, strong = middle - half, middle + half
-    return np.asarray((weak >= LEAST_TEXTURE) & (weak >= LEAST_ROUNDNESS * strong))
