@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import time
 from contextlib import closing
 from itertools import pairwise
@@ -21,9 +22,10 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.last_shown import NOTHING, LastShown, write_shown
 from mapweave.mapserver.http.reply import PATIENCE
 from mapweave.mapserver.http.web import Questions
+from mapweave.mapserver.merging.verification_cache_keeper import SUFFIX
 from mapweave.mapserver.server import MapServer
 from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
-from mapweave.recorded_fleet.recording import DEMO_PAGE, RECORDING
+from mapweave.recorded_fleet.recording import DEMO_PAGE, RECORDING, VERDICTS
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -110,10 +112,23 @@ def page() -> LastShown:
                 return live.shown()
 
 
+def verdicts() -> Path:
+    """Write what a map server finds by comparing the nodes of the recording."""
+    VERDICTS.unlink(missing_ok=True)
+    with TemporaryDirectory() as path, closing(MemoryBus(MemoryHub())) as bus:
+        store = Path(path) / "store"
+        prepare(store.parent, store, NOTHING)
+        with MapServer(bus, Keys("demo"), store, "s0") as server:
+            server.settle(60.0)
+        shutil.copyfile(store.with_name(store.name + SUFFIX), VERDICTS)
+    return VERDICTS
+
+
 if __name__ == "__main__":
     write_map_file(
         RECORDING, MapFile("agent", "the fleet of mapweave server --demo", tuple(recorded_fleet()))
     )
+    verdicts()
     write_shown(DEMO_PAGE, page())
-    for path in (RECORDING, DEMO_PAGE):
+    for path in (RECORDING, DEMO_PAGE, VERDICTS):
         print(f"{path}: {path.stat().st_size} bytes")

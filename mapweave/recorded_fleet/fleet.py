@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from contextlib import closing
@@ -15,7 +16,8 @@ from mapweave.mapserver.http.last_shown import LastShown
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import HISTORY
-from mapweave.recorded_fleet.recording import recorded_maps
+from mapweave.mapserver.merging.verification_cache_keeper import SUFFIX
+from mapweave.recorded_fleet.recording import VERDICTS, recorded_maps
 from mapweave.recorded_fleet.robot import RecordedRobot
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
@@ -29,6 +31,8 @@ MAPPING, STILL = "cy", 12
 
 def prepare(folder: Path, store: Path, shown: LastShown) -> None:
     """Make the robots' journals, and a store that has what they have: a server shows the maps at once.
+
+    Beside the store is what comparing the nodes has found.
 
     Args:
         folder: for the journals.
@@ -46,6 +50,8 @@ def prepare(folder: Path, store: Path, shown: LastShown) -> None:
                 rows = journal.rows(map_id, 1, journal.head(map_id))
                 entries = [Entry(*row, change) for row, change in zip(rows, written, strict=True)]
                 filled.apply(map_id, journal.log_id(map_id), entries)
+        if VERDICTS.exists():
+            shutil.copyfile(VERDICTS, store.with_name(store.name + SUFFIX))
         if shown:
             filled.put_result(HISTORY, encode(KeptHistory(shown.history, tuple(shown.parts))))
 

@@ -12,9 +12,12 @@ from mapweave.wire.codec import element_of
 
 RECORDING = Path(__file__).with_name("fleet.mapweave")
 DEMO_PAGE = Path(__file__).with_name("page.shown")
-"""What the page shows of them at once; see `mapserver.http.loading`.
+"""What the page shows of them at once; see `mapserver.http.loading`."""
+VERDICTS = Path(__file__).with_name("fleet.verdicts")
+"""What comparing their nodes has found, which a server takes over for nodes with the same landmarks; see
+`mapserver.merging.verification_cache_keeper`.
 
-`python -m synthetic.recorded_fleet` makes both.
+`python -m synthetic.recorded_fleet` makes all three.
 """
 
 

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.request import Request, urlopen
@@ -17,7 +17,14 @@ import pytest
 from websockets.sync.client import connect
 
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.node import Node
+from mapweave.mapserver.http.last_shown import NOTHING
 from mapweave.mapserver.http.live import NOT_THERE
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.node_comparisons import compare
+from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
+from mapweave.merge.pose_graph.verdicts import Verdict
+from mapweave.recorded_fleet.fleet import prepare, split
 from mapweave.recorded_fleet.recording import RECORDING, recorded_maps
 from mapweave.wire.codec import encode_body
 from tests.browser import PROGRAMS, Browser, there_is_none
@@ -116,6 +123,32 @@ def test_the_recording_is_small_and_whole() -> None:
         nodes = [change for change in changes if isinstance(change, NodePut)]
         assert len(nodes) > 10 and len(changes) == 2 * len(nodes) - 1
         assert all(encode_body(change) for change in changes)
+
+
+def test_what_was_found_of_the_recording_is_kept_and_holds(tmp_path: Path) -> None:
+    """`python -m synthetic.recorded_fleet` makes it again, for another version or other settings."""
+    prepare(tmp_path, tmp_path / "s0.sqlite", NOTHING)
+    merged = []
+    for kept in (True, False):
+        compared: list[tuple[Node, Node]] = []
+
+        def count(pairs: Sequence[tuple[Node, Node]], compared: list = compared) -> Iterator[Verdict]:
+            compared += pairs
+            return compare(pairs)
+
+        merger = Merger(compare=count)
+        if kept:
+            VerificationCacheKeeper(tmp_path / "s0.sqlite").restore(merger)
+        merger.read(
+            (map_id, change)
+            for map_id, changes in recorded_maps().items()
+            for change in split(map_id, changes)[0]
+        )
+        merged.append(merger.merged())
+        assert bool(compared) is not kept, "nothing is compared again"
+    assert [link.pair for link in merged[0].links] == [link.pair for link in merged[1].links]
+    for node in merged[1].poses:
+        assert merged[0].pose(node).distance(merged[1].pose(node)) < 1e-6
 
 
 @pytest.mark.slow
