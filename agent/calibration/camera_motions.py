@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mapweave.agent.arrays import median
 from mapweave.agent.drive_geometry import Parameter
 from mapweave.hybridmap.pose import Array
 
@@ -48,7 +49,7 @@ class WheelTrack:
 
         Plain interpolation halves the noise of a reading in its middle, and a fit of the delay goes there.
         """
-        return self._mean(times, counted, float(np.median(np.diff(self.stamps))))
+        return self._mean(times, counted, median(np.diff(self.stamps)))
 
     def _mean(self, times: Array, counted: Array, width: float) -> Array:
         stamps, steps = self.stamps, np.diff(self.stamps)

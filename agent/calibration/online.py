@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import median
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, frame_change, geometry_of
 from mapweave.agent.calibration.counted_wheels import CountedWheels
 from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
@@ -150,9 +151,7 @@ class OnlineCalibration:
         if now - self._first_s < SHORTEST_S:
             return found
         common, mine, theirs = np.intersect1d(self._ids, ids, assume_unique=True, return_indices=True)
-        moved = (
-            float(np.median(np.linalg.norm(raw[theirs] - self._begin[mine], axis=1))) if len(common) else 0.0
-        )
+        moved = median(np.linalg.norm(raw[theirs] - self._begin[mine], axis=1)) if len(common) else 0.0
         camera = self._declared.camera
         due = now - self._first_s >= LONGEST_S or moved > ENOUGH * camera.width
         way = abs(self._counted.way - self._first_way)

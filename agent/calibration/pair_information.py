@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mapweave.agent.arrays import median
 from mapweave.agent.calibration.camera_motions import CameraMotions
 from mapweave.hybridmap.pose import Array
 
@@ -162,9 +163,9 @@ def reduce_pair(
             at = at.stepped(step[None])
     agreeing = good & (chi2 < 9.0)
     depths = rho[agreeing]
-    typical = (float(np.median(depths)), float(depths.std())) if agreeing.sum() > 5 else depth
+    typical = (median(depths), float(depths.std())) if agreeing.sum() > 5 else depth
     across = np.abs(residual[:, 0] * slope[:, 1] - residual[:, 1] * slope[:, 0])
-    scatter = 1.4826 * float(np.median(across / np.maximum(np.linalg.norm(slope, axis=1), 1e-12)))
+    scatter = 1.4826 * median(across / np.maximum(np.linalg.norm(slope, axis=1), 1e-12))
     floor = floor_ratios(pair, at[0], floor_sigma)
     return PairInformation(at[0], matrix, vector, int(agreeing.sum()), typical, scatter, floor)
 

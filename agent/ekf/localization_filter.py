@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import among
 from mapweave.agent.ekf.gating import pixel_gate
 from mapweave.agent.ekf.inverse_depth import project_anchored, rays_of_points
 from mapweave.agent.ekf.iterated import Measurement, iterated_update
@@ -185,7 +186,7 @@ class LocalizationFilter:
 
     def remove(self, ids: Ids) -> None:
         """Forget landmarks; ids that are not there are ignored."""
-        self._keep(~np.isin(self.ids, ids))
+        self._keep(~among(self.ids, ids))
 
     @property
     def state(self) -> LocalizationState:
@@ -272,7 +273,7 @@ class LocalizationFilter:
         n = len(ids)
         if points.shape != (n, 3) or covariances.shape != (n, 3, 3):
             raise InvalidValue("localization: ids, points and covariances do not belong together")
-        if np.isin(ids, self.ids).any() or len(np.unique(ids)) != n:
+        if among(ids, self.ids).any() or len(np.unique(ids)) != n:
             raise InvalidValue("localization: a landmark can be added only once")
         rays, by_point = rays_of_points(points, self._camera.mount_forward, self._camera.mount_height)
         fit = self._anchorable(rays) & np.isfinite(covariances).all(axis=(1, 2))

@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import among
 from mapweave.agent.ekf.adaptive_odometry_noise import AdaptiveOdometryNoise
 from mapweave.agent.ekf.filter_health import FilterHealth
 from mapweave.agent.ekf.gating import MEDIAN, Judgement, pixel_gate, remove_outliers, select_inliers
@@ -124,7 +125,7 @@ class MappingFilter:
         n = len(ids)
         if len(pixels) != n or (inverse_depths is None) != (sigmas is None):
             raise InvalidValue("add: ids, pixels, inverse depths and sigmas do not belong together")
-        if np.isin(ids, self.ids).any() or len(np.unique(ids)) != n:
+        if among(ids, self.ids).any() or len(np.unique(ids)) != n:
             raise InvalidValue("add: a landmark can be added only once")
         rays = np.empty((n, 3))
         rays[:, :2] = self._pinhole.slopes(pixels)
@@ -177,7 +178,7 @@ class MappingFilter:
 
     def remove(self, ids: Ids) -> None:
         """Forget landmarks; ids that are not there are ignored."""
-        keep = ~np.isin(self.ids, ids)
+        keep = ~among(self.ids, ids)
         if not keep.all():
             self._settled = self._settled.kept(keep) if self._step is None else self._settled
             self._step = self._step.kept(keep) if self._step is not None else None

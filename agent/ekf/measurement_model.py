@@ -45,8 +45,12 @@ def slots_of(held: Ids, ids: Ids) -> NDArray[np.intp]:
         held: (n,) ids of the state's landmarks, each once.
         ids: (N,) of which landmarks.
     """
-    places = {landmark: slot for slot, landmark in enumerate(held.tolist())}
-    return np.array([places.get(landmark, -1) for landmark in ids.tolist()], np.intp)
+    if not len(held):
+        return np.full(len(ids), -1, np.intp)
+    order = held.argsort()
+    slots = order.take(held.take(order).searchsorted(ids), mode="clip")
+    slots[held.take(slots) != ids] = -1
+    return np.asarray(slots, np.intp)
 
 
 class ImageMeasurement(NamedTuple):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapweave.agent.arrays import median
 from mapweave.hybridmap.pose import Array
 
 LEAST = 8
@@ -33,7 +34,7 @@ def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> Array 
     if len(innovations) < LEAST:
         return None
     by_pitch = np.stack([slopes[:, 0] * slopes[:, 1], 1.0 + slopes[:, 1] ** 2], axis=1)
-    pitch = float(np.median(innovations[:, 1] / by_pitch[:, 1]))
+    pitch = median(innovations[:, 1] / by_pitch[:, 1])
     mean = 1.0 / (len(slopes) * by_pitch[:, 1])
     expected = float(mean @ covariance[1::2, 1::2] @ mean)
     return pitch * by_pitch if pitch**2 > SIGMAS**2 * expected else None

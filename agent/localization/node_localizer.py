@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import among
 from mapweave.agent.ekf.landmark_estimates import NodeLandmarks
 from mapweave.agent.ekf.localization_filter import LocalizationFilter
 from mapweave.agent.observation import Observation, RobotDescription
@@ -106,7 +107,7 @@ class NodeLocalizer:
         if observation.image is None:
             return
         self._tracks.follow(observation.image, self._expected())
-        lost = ~np.isin(self._filter.ids, self._tracks.ids)
+        lost = ~among(self._filter.ids, self._tracks.ids)
         if lost.any():
             self._note(lost)
             self._filter.remove(self._filter.ids[lost])

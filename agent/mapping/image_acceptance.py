@@ -7,6 +7,7 @@ import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import among
 from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit
 from mapweave.agent.observation import Observation
 from mapweave.agent.settings import TrackingSettings
@@ -102,7 +103,7 @@ class ImageAcceptance:
         moved = copy.copy(tracker)
         moved.track(image, expected)
         followed = np.full(expected.shape, np.nan)
-        followed[np.isin(tracker.ids, moved.ids)] = moved.pixels
+        followed[among(tracker.ids, moved.ids)] = moved.pixels
         return self._detector.compare(accepted, image, self.moved.heading, expected, followed), moved
 
     def _is_frozen(self, image: NDArray[np.uint8]) -> bool:

@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import among, median
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.ekf.update_report import Health
@@ -160,7 +161,7 @@ class Mapper:
     @property
     def anchored(self) -> int:
         """Features of the anchor view that are still tracked."""
-        return 0 if self._anchor is None else int(np.isin(self._tracking.ids, self._anchor.tracks).sum())
+        return 0 if self._anchor is None else int(among(self._tracking.ids, self._anchor.tracks).sum())
 
     @property
     def anchor_features(self) -> int:
@@ -279,7 +280,7 @@ class Mapper:
         self.lose()
         self._tracking.step(observation)
         anchor = self._tracking.take(observation, features, HERE)
-        self.typical_depth = float(np.median(node.landmarks.depths[node.landmarks.has_depth]))
+        self.typical_depth = median(node.landmarks.depths[node.landmarks.has_depth])
         self._begin_at(anchor)
         self._keyframes.recognise(node, anchor.tracks, recognition)
 
@@ -324,7 +325,7 @@ class Mapper:
             if landmarks is None:
                 self._trajectory.move_anchor(moved.mean)
             else:
-                self.typical_depth = float(np.median(landmarks.depths))
+                self.typical_depth = median(landmarks.depths)
                 self._trajectory.clear(observation.stamp_ns)
             tracking.fill(self.typical_depth)
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import among
 from mapweave.hybridmap.pose import Array, Pose2
 
 
@@ -82,8 +83,9 @@ class TrackHistory:
         new_from_old = old_from_new.inverse()
         poses, ids, pixels = self._poses, self._ids, self._pixels
         self._poses, self._ids, self._pixels = [], [], []
-        for pose, track_ids, at in zip(poses, ids, pixels, strict=True):
-            mask = np.isin(track_ids, alive)
+        ends = np.cumsum([len(track_ids) for track_ids in ids], dtype=np.intp)
+        masks = np.split(among(np.concatenate(ids), alive), ends[:-1]) if ids else []
+        for pose, track_ids, at, mask in zip(poses, ids, pixels, masks, strict=True):
             if mask.any():
                 self._poses.append(new_from_old @ pose)
                 self._ids.append(track_ids[mask])

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import among
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.update_report import Health
@@ -274,14 +275,14 @@ class Tracking:
         if tracker is None:
             return None
         self._tracker = tracker
-        lost = ~np.isin(ids, tracker.ids) & np.isin(ids, self._filter.ids)
+        lost = ~among(ids, tracker.ids) & among(ids, self._filter.ids)
         return FollowedImage(image, ids[lost], templates.chosen(lost))
 
     def _seek_hidden(self, followed: FollowedImage) -> LiveTracks:
         """Hide landmarks just lost, and find others again."""
         if self._anchored:
             self._hidden.take(followed.lost, followed.templates)
-        self._hidden.keep(np.isin(self._hidden.ids, self._filter.ids))
+        self._hidden.keep(among(self._hidden.ids, self._filter.ids))
         if len(self._hidden.ids):
             expected = self._filter.predict_pixels(self._hidden.ids)
             # What has left the view, or is leaving it, is not hidden.
@@ -299,8 +300,8 @@ class Tracking:
 
         What they have taught is in the pose already.
         """
-        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, alive.ids)])
-        held = np.isin(self._tracker.ids, self._filter.ids)
+        self._filter.remove(self._filter.ids[~among(self._filter.ids, alive.ids)])
+        held = among(self._tracker.ids, self._filter.ids)
         return HeldTracks(self._tracker.ids[held], self._tracker.pixels[held])
 
     def _correct(self, held: HeldTracks) -> Correction:
@@ -310,7 +311,7 @@ class Tracking:
         update = self._filter.update(held.ids, held.pixels)
         refused = self._strikes.judge(held.ids, update.accepted)
         self._filter.remove(refused)
-        self._tracker.keep(~np.isin(self._tracker.ids, refused))
+        self._tracker.keep(~among(self._tracker.ids, refused))
         return Correction(update.innovations_px[update.accepted], None)
 
     def _refill(self) -> None:
@@ -331,7 +332,7 @@ class Tracking:
         """Give the filter an even choice of the tracks that it does not hold, from a first one on."""
         s, held = self._settings, len(self._filter.ids)
         room = min(s.filtered - held + len(self._hidden.ids), MOST_FILTERED - held)
-        inside = np.isin(self._tracker.ids, self._filter.ids)
+        inside = among(self._tracker.ids, self._filter.ids)
         candidates = ~inside & (self._tracker.ids >= first)
         if room <= 0 or not candidates.any():
             return

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import median
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.servo.leg_controller import clip
 
@@ -105,7 +106,7 @@ class ImageDrive:
         """rad/s: hold the heading; give way to features off the middle, and to obstacles on one side."""
         turn = -HEADING_GAIN * heading_error
         if len(bearings):
-            middle = float(np.median(bearings))
+            middle = median(bearings)
             aside = max(abs(middle) - CENTRE_BAND, 0.0)
             turn += CENTRE_GAIN * math.copysign(aside, middle)
             room = self._description.camera.semi_aperture - BORDER

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import among
 from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.rejection_counter import RejectionCounter
 from mapweave.agent.vision.tracker import Tracker
@@ -63,5 +64,5 @@ class NodeTracks:
     def judge(self, accepted: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Take in which tracks the filter accepted, (N,); returns the landmarks that are dropped."""
         given_up = self._strikes.judge(self.ids, accepted)
-        self._tracker.keep(~np.isin(self.ids, given_up))
+        self._tracker.keep(~among(self.ids, given_up))
         return given_up

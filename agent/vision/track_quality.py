@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import median
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 
@@ -43,8 +44,8 @@ class TrackQuality:
         n, errors_px = len(pixels), np.linalg.norm(misses_px, axis=1)
         return TrackQuality(
             alive=n,
-            age_median=float(np.median(ages)) if n else 0.0,
-            error_px_median=float(np.median(errors_px)) if len(errors_px) else float("nan"),
+            age_median=median(ages) if n else 0.0,
+            error_px_median=median(errors_px) if len(errors_px) else float("nan"),
             coverage=coverage(camera, pixels),
         )
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import median
 from mapweave.hybridmap.camera import Camera
 
 WINDOW_PX = (15, 15)
@@ -66,6 +67,6 @@ def visual_motion(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Cam
         normal = np.einsum("nki,nkj->ij", weighted, jacobian)
         solution = np.linalg.solve(normal + 1e-9 * np.eye(2), np.einsum("nki,nk->i", weighted, flow))
         miss = np.linalg.norm(flow - jacobian @ solution, axis=1)
-        spread = max(float(np.median(miss)), 1e-5)
+        spread = max(median(miss), 1e-5)
         weights = 1.0 / (1.0 + (miss / (2.0 * spread)) ** 2)
     return VisualMotion(float(solution[0]), float(solution[1]), int(good.sum()))

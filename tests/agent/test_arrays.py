@@ -1,0 +1,32 @@
+"""What stands in for NumPy's functions gives the same, to the last bit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mapweave.agent.arrays import among, median
+
+
+@pytest.mark.parametrize("others", [0, 1, 7, 40])
+def test_among_is_isin(others: int) -> None:
+    rng = np.random.default_rng(others)
+    for count in (0, 1, 60):
+        ids, held = rng.integers(0, 50, count), rng.integers(0, 50, others)
+        found = among(ids, held)
+        assert found.dtype == np.bool_
+        assert np.array_equal(found, np.isin(ids, held))
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64])
+def test_median_is_that_of_numpy(kind: type) -> None:
+    rng = np.random.default_rng(3)
+    for count in range(1, 40):
+        values = (100.0 * rng.standard_normal(count)).astype(kind)
+        assert median(values) == float(np.median(values))
+
+
+def test_median_of_nothing_known_is_nan() -> None:
+    assert math.isnan(median(np.array([1.0, math.nan, 2.0])))
