@@ -70,7 +70,11 @@ class OccupancyGrid:
 
     def centre(self, cell: tuple[int, int]) -> Array:
         """(2,) m in map, middle of a cell."""
-        return (np.array(cell, dtype=np.float64) - self._half + self._middle + 0.5) * self._settings.cell
+        return self.centres(np.array(cell))
+
+    def centres(self, cells: NDArray[np.int64]) -> Array:
+        """(..., 2) cell indices -> (..., 2) m in map, their middles."""
+        return (cells.astype(np.float64) - self._half + self._middle + 0.5) * self._settings.cell
 
     def roll(self, point: Array) -> None:
         """Let the grid's middle be at a point, (2,) m in map; what falls over its border is forgotten."""
@@ -102,7 +106,7 @@ class OccupancyGrid:
         along = self._steps[None, :] < (ends - 0.5 * s.cell)[:, None]
         points = origin + directions[:, None, :] * self._steps[None, :, None]
         hits = proximity < self._description.ranger_reach - 0.05
-        # A cell counts once, however many beams meet it.
+        # A cell counts once, however many beams meet it: all of them write the same into it.
         ended = origin + directions[hits] * ends[hits, None]
         odds = self._odds.reshape(-1)
         passed, met = self._numbers(points[along]), self._numbers(ended)
@@ -115,9 +119,9 @@ class OccupancyGrid:
             odds[changed] = np.clip(odds[changed], -MOST, MOST)
 
     def _numbers(self, points: Array) -> NDArray[np.int64]:
-        """Numbers of the cells, row by row, in which (N, 2) m in map lie, each once."""
+        """(N,) numbers of the cells, row by row, in which (N, 2) m in map lie."""
         cells = self.cells(points)
-        return np.unique(cells[:, 0] * self._odds.shape[1] + cells[:, 1])
+        return np.asarray(cells[:, 0] * self._odds.shape[1] + cells[:, 1], np.int64)
 
     def room(self) -> Array:
         """For each cell the distance to the nearest thing seen, m."""
@@ -183,23 +187,27 @@ class OccupancyGrid:
             drivable: where one may drive; by default where the floor is known to be free.
         """
         drivable = self.drivable() if drivable is None else drivable
-        first = tuple(int(v) for v in self.cells(start))
-        cost: dict[tuple[int, int], float] = {(first[0], first[1]): 0.0}
-        before: dict[tuple[int, int], tuple[int, int]] = {}
-        queue: list[tuple[float, tuple[int, int]]] = [(0.0, (first[0], first[1]))]
-        room = self.room()
+        # Numbers of cells in a grid with a border that is never entered: a search asks for one at a time.
+        width = drivable.shape[1] + 2
+        free = np.pad(drivable, 1).tobytes()
+        room = np.pad(self.room().astype(np.float64), 1, constant_values=-1.0).reshape(-1).data
+        steps = [(dx * width + dy, self._settings.cell * math.hypot(dx, dy)) for dx, dy in _NEIGHBOURS]
+        row, column = (int(v) for v in self.cells(start))
+        first = (row + 1) * width + column + 1
+        cost: dict[int, float] = {first: 0.0}
+        before: dict[int, int] = {}
+        queue: list[tuple[float, int]] = [(0.0, first)]
         while queue:
             distance, cell = heapq.heappop(queue)
             if distance > cost[cell] or distance > reach:
                 continue
-            for dx, dy in _NEIGHBOURS:
-                neighbour = (cell[0] + dx, cell[1] + dy)
-                if not (0 <= neighbour[0] < drivable.shape[0] and 0 <= neighbour[1] < drivable.shape[1]):
+            # Close to something already, the robot may still leave it, but come no closer.
+            least = -1.0 if free[cell] else max(room[cell], _CLOSE)
+            for step, length in steps:
+                neighbour = cell + step
+                if not free[neighbour] and (least < 0.0 or room[neighbour] < least):
                     continue
-                # Close to something already, the robot may still leave it, but come no closer.
-                if not drivable[neighbour] and (drivable[cell] or room[neighbour] < max(room[cell], 0.05)):
-                    continue
-                further = distance + self._settings.cell * math.hypot(dx, dy)
+                further = distance + length
                 if further < cost.get(neighbour, math.inf):
                     cost[neighbour] = further
                     before[neighbour] = cell
@@ -208,6 +216,8 @@ class OccupancyGrid:
 
 
 _NEIGHBOURS = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx or dy]
+_CLOSE = float(np.float32(0.05))
+"""What is nearer than this is touched, m; of the precision of `OccupancyGrid.room`."""
 
 
 class DistanceField:
@@ -217,29 +227,33 @@ class DistanceField:
         self,
         floor: OccupancyGrid,
         drivable: NDArray[np.bool_],
-        cost: dict[tuple[int, int], float],
-        before: dict[tuple[int, int], tuple[int, int]],
+        cost: dict[int, float],
+        before: dict[int, int],
     ) -> None:
-        """Take the result of a search."""
+        """Take the result of a search, by the numbers of cells in a grid with a border of one cell."""
         self._floor = floor
         self._drivable = drivable
         self._before = before
-        self.cells = np.array([c for c in cost if drivable[c]], np.int64).reshape(-1, 2)
-        self.lengths = np.array([cost[(int(a), int(b))] for a, b in self.cells])
+        self._width = drivable.shape[1] + 2
+        numbers = np.fromiter(cost, np.int64, len(cost))
+        cells = np.stack(np.divmod(numbers, self._width), axis=1) - 1
+        free = drivable[cells[:, 0], cells[:, 1]]
+        self.cells = cells[free]
+        self.lengths = np.fromiter(cost.values(), np.float64, len(cost))[free]
 
     @property
     def positions(self) -> Array:
         """(N, 2) m in map of the cells that can be reached."""
-        return np.array([self._floor.centre((int(a), int(b))) for a, b in self.cells]).reshape(-1, 2)
+        return self._floor.centres(self.cells)
 
     def path(self, cell: NDArray[np.int64]) -> list[Array]:
         """Corners of the way to a cell, without the start: straight pieces over drivable cells."""
-        at = (int(cell[0]), int(cell[1]))
-        chain = [at]
+        at = (int(cell[0]) + 1) * self._width + int(cell[1]) + 1
+        numbers = [at]
         while at in self._before:
             at = self._before[at]
-            chain.append(at)
-        chain.reverse()
+            numbers.append(at)
+        chain = [(row - 1, column - 1) for row, column in (divmod(n, self._width) for n in reversed(numbers))]
         corners: list[Array] = []
         first = 0
         while first < len(chain) - 1:
