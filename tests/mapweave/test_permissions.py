@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -27,6 +28,31 @@ COMMANDS = {
 }
 
 
+RUN = """
+import json, os, sys, traceback
+import mapweave.commands.calibrate_target
+import mapweave.mapserver.server
+import mapweave.processes.agent_process
+from mapweave.cli import main
+
+for number, words in enumerate(json.loads(sys.argv[1])):
+    if not os.fork():
+        os.chdir(str(number))
+        os.dup2(os.open("stderr", os.O_CREAT | os.O_WRONLY), 2)
+        try:
+            status = main(words)
+        except BaseException:
+            traceback.print_exc()
+            status = -1
+        with open("status", "w") as file:
+            file.write(str(status))
+        sys.stderr.flush()
+        os._exit(0)
+    os.wait()
+"""
+"""Each command in a process of its own, in a folder of its own; what they import is imported once."""
+
+
 @pytest.fixture(scope="module")
 def places(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
     folder = tmp_path_factory.mktemp("places")
@@ -39,15 +65,31 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]
     locked.chmod(0o755)
 
 
-@pytest.mark.skipif(PLAIN != [] and shutil.which("setpriv") is None, reason="needs setpriv")
+@pytest.fixture(scope="module")
+def ended(places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str]]:
+    """The exit status of each command, and what it printed on stderr."""
+    if PLAIN and shutil.which("setpriv") is None:
+        pytest.skip("needs setpriv")
+    folder = tmp_path_factory.mktemp("commands")
+    folders = [folder / str(number) for number in range(len(COMMANDS))]
+    for one in folders:
+        one.mkdir()
+    words = [[word.format(**places) for word in command] for command in COMMANDS.values()]
+    subprocess.run(
+        [*PLAIN, sys.executable, "-c", RUN, json.dumps(words)], cwd=folder, timeout=120, check=True
+    )
+    return {
+        name: (int((one / "status").read_text()), (one / "stderr").read_text())
+        for name, one in zip(COMMANDS, folders, strict=True)
+    }
+
+
 @pytest.mark.parametrize("name", COMMANDS)
-def test_what_the_user_may_not_do_is_one_line(name: str, places: dict[str, Path], tmp_path: Path) -> None:
-    words = [word.format(**places) for word in COMMANDS[name]]
-    done = subprocess.run(
-        [*PLAIN, sys.executable, "-m", "mapweave", *words],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    (line,) = done.stderr.splitlines()
+def test_what_the_user_may_not_do_is_one_line(
+    name: str, places: dict[str, Path], ended: dict[str, tuple[int, str]]
+) -> None:
+    status, output = ended[name]
+    (line,) = output.splitlines()
     assert WORDS in line and ADVICE in line and "Errno" not in line, line
     assert str(places["locked"]) in line or str(places["secret"]) in line
-    assert done.returncode == FAILED
+    assert status == FAILED
