@@ -163,6 +163,10 @@ class MergeWorker:
         """Note that a change of a map was refused. Returns at once."""
         self._post(lambda: self._merger.note_refusal(map_id, reason))
 
+    def note_disbelief(self, map_id: MapId, reason: str) -> None:
+        """Note that something said of a map is not believed. Returns at once."""
+        self._post(lambda: self._merger.note_disbelief(map_id, reason))
+
     def constrain(self, constraints: ManualConstraints) -> None:
         """Apply exactly these manual constraints from now on. Returns at once."""
         self._post(lambda: self._merger.constrain(constraints))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,6 +21,7 @@ from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import RawImage, View
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.edge_limits import unmeasurable
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -27,6 +29,8 @@ from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.registration.recognition import Recognition
 from mapweave.registration.selection import SelectionSettings, choose, worth
+
+log = logging.getLogger(__name__)
 
 MOST_LANDMARKS = 150
 """Landmarks that a node keeps."""
@@ -265,8 +269,14 @@ class KeyframeBuilder:
             self._write(driven_edge(self.map, traverse, self.new_id))
 
     def _write(self, *elements: Node | Edge) -> None:
-        """Put nodes and edges into the map."""
+        """Put nodes and edges into the map.
+
+        Servers refuse an edge of which a robot knows nothing, and the maps of robots that send such edges.
+        """
         for element in elements:
+            if isinstance(element, Edge) and (reason := unmeasurable(element)):
+                log.warning("left out of the map: %s", reason)
+                continue
             change = NodePut(element) if isinstance(element, Node) else EdgePut(element)
             self.map.apply(change)
             self._new.append(change)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut
+from mapweave.hybridmap.change import Change, EdgePut
+from mapweave.hybridmap.edge_limits import unmeasurable
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.node import EdgeKind, MapId
+from mapweave.hybridmap.node import MapId
 from mapweave.wire.codec import decode_body, element_of, unwrap_body
 from mapweave.wire.log_messages import Refusal
 
@@ -38,36 +38,9 @@ class Entry:
         if (element_of(body).map, own_sequence) != (map_id, sequence):
             claim = f"{element_of(body).map} {own_sequence}"
             return Entry(sequence, message, f"change: {claim} came as {map_id} {sequence}")
-        if reason := unmeasurable(body):
+        if isinstance(body, EdgePut) and (reason := unmeasurable(body.edge)):
             return Entry(sequence, message, reason)
         return Entry(sequence, message, Change(map_id, sequence, stamp_ns, body))
-
-
-MOST_EDGE_M = 1000.0
-"""Edges join nodes that show the same landmarks, or between which a robot drove by them."""
-MOST_EDGE_SIGMA = 10.0
-"""m and rad. Who knows an edge less well knows nothing."""
-
-
-def unmeasurable(body: ChangeBody) -> str:
-    """Why no robot can have measured what a change says; empty if one can have.
-
-    Ranges of messages are wider: what they carry may be the sum of many measurements.
-    """
-    if not isinstance(body, EdgePut):
-        return ""
-    pose, which = body.edge.a_from_b, body.edge.id
-    if body.edge.kind is not EdgeKind.DRIVEN and not body.edge.within:
-        return f"edge {which} is {body.edge.kind} and joins nodes of others: robots only drive between those"
-    length = math.hypot(pose.mean.x, pose.mean.y)
-    if length > MOST_EDGE_M:
-        return f"edge {which} is {length:.0f} m long, more than {MOST_EDGE_M:.0f} m"
-    sigma = math.sqrt(pose.covariance.diagonal().max())
-    if sigma > MOST_EDGE_SIGMA:
-        return (
-            f"edge {which} has a standard deviation of {sigma:.0f} m or rad, more than {MOST_EDGE_SIGMA:.0f}"
-        )
-    return ""
 
 
 def words_of(refusal: Refusal) -> str:

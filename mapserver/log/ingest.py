@@ -75,6 +75,7 @@ class Ingest:
         retired: Callable[[], Collection[MapId]] = tuple,
         unmerged: Callable[[str], int] = lambda robot: 0,
         note_refusal: Callable[[MapId, str], None] = lambda map_id, reason: None,
+        note_disbelief: Callable[[MapId, str], None] = lambda map_id, reason: None,
         observe_ack: Callable[[float], None] = lambda seconds: None,
         status_period: Callable[[], float] = lambda: 0.0,
     ) -> None:
@@ -95,7 +96,8 @@ class Ingest:
             quotas: of robots.
             retired: maps that do not count for them.
             unmerged: how many changes of a robot were passed on and wait.
-            note_refusal: called for a map of which a change was refused or is not believed, with the reason.
+            note_refusal: called for a map of which a change was refused, with the reason.
+            note_disbelief: called for a map of which a sequence number is not believed, with the reason.
             observe_ack: called for each published change with the time from its receipt to its
                 acknowledgement, s.
             status_period: of the robots' statuses, s; 0: their own.
@@ -106,7 +108,8 @@ class Ingest:
         self._bus, self._keys, self._store, self._name = bus, keys, store, check_name(server_name)
         self._objection = objection
         self._quotas, self._unmerged = quotas or Quotas(clock=time.monotonic), unmerged
-        self._on_change, self._note_refusal, self._observe_ack = on_change, note_refusal, observe_ack
+        self._on_change, self._observe_ack = on_change, observe_ack
+        self._note_refusal, self._note_disbelief = note_refusal, note_disbelief
         self._counters = IngestCounters()
         self._settings = s = settings or IngestSettings()
         self._logs = KnownLogs()
@@ -394,7 +397,7 @@ class Ingest:
         """
         if newest > agent_log.watermark + MOST_AHEAD:
             reason = f"change {newest} is announced, where {agent_log.watermark} have come"
-            self._note_refusal(agent_log.map, reason)
+            self._note_disbelief(agent_log.map, reason)
             raise InvalidMessage(f"{agent_log.map}: {reason}")
         agent_log.announce(newest, time.monotonic())
 

@@ -20,6 +20,9 @@ from mapweave.merge.torn_maps import TornMapSearch
 class ImplausibleMaps:
     """Finds them, and keeps what was found of maps that did not change."""
 
+    refused: dict[MapId, str]
+    """Maps of which a change was refused, and why the first one was."""
+
     def __init__(self, consistency: ConsistencySettings) -> None:
         """Nothing is known yet.
 
@@ -27,7 +30,8 @@ class ImplausibleMaps:
             consistency: when links agree.
         """
         self._by_itself: dict[MapId, str] = {}
-        self._refused: dict[MapId, str] = {}
+        self.refused = {}
+        self._disbelieved: dict[MapId, str] = {}
         self._torn = TornMapSearch(consistency)
 
     def changed(self, map_id: MapId, hybrid_map: HybridMap) -> None:
@@ -36,8 +40,14 @@ class ImplausibleMaps:
 
     def note_refusal(self, map_id: MapId, reason: str) -> bool:
         """Note that a change of a map was refused; returns whether it is the first, which is kept."""
-        first = map_id not in self._refused
-        self._refused.setdefault(map_id, reason)
+        first = map_id not in self.refused
+        self.refused.setdefault(map_id, reason)
+        return first
+
+    def note_disbelief(self, map_id: MapId, reason: str) -> bool:
+        """Note that something said of a map is not believed; returns whether it is the first that is."""
+        first = map_id not in self._disbelieved
+        self._disbelieved.setdefault(map_id, reason)
         return first
 
     def of(self, merged: MergedMap, pruned: Container[MapId]) -> dict[MapId, str]:
@@ -49,5 +59,5 @@ class ImplausibleMaps:
         """
         odd = self._torn.torn(merged) | contradict_each_other(merged) | contradict_themselves(merged)
         odd |= {which: reason for which, reason in self._by_itself.items() if reason}
-        odd |= scattered(merged.maps, pruned) | self._refused
+        odd |= scattered(merged.maps, pruned) | self._disbelieved | self.refused
         return {which: odd[which] for which in sorted(odd.keys() & merged.maps.keys())}

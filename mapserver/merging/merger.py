@@ -80,6 +80,7 @@ class Merger:
         self._implausible = ImplausibleMaps(self.settings.consistency)
         self._contradictions = WrongGeometrySearch(self.settings.consistency)
         self._wrong: dict[MapId, WrongGeometry] = {}
+        self._unlinked: dict[MapPair, str] = {}
         self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
@@ -194,6 +195,10 @@ class Merger:
         """Note that a change of a map was refused; the first reason is kept."""
         self._dirty |= self._implausible.note_refusal(map_id, reason)
 
+    def note_disbelief(self, map_id: MapId, reason: str) -> None:
+        """Note that something said of a map is not believed; the first reason is kept."""
+        self._dirty |= self._implausible.note_disbelief(map_id, reason)
+
     def merged(self, use: Callable[[MergedMap], object] | None = None) -> MergedMap:
         """The merged map of all changes; merged again only if something has changed, and where it has.
 
@@ -231,6 +236,7 @@ class Merger:
                 self._find_wrong_geometry()
             except Exception:  # a defect with one map must not hold up the merge
                 log.exception("the search for maps with wrong geometry failed")
+            self._leave_unlinked()
             apart = self._set_apart()
             maps = [kept_id for kept_id in self._kept if kept_id not in apart]
             try:
@@ -276,18 +282,33 @@ class Merger:
         return {**self._copied, **self._isolation.reasons}
 
     def _find_wrong_geometry(self) -> None:
-        """Maps that contradict others that agree are not merged."""
+        """Find the maps that contradict others that agree."""
         self._stale |= self._verdicts.at(self._changed)
         # What a retired area holds only the merge says; the robot's way by it is no less true.
         nodes = retired_nodes(self._kept, self._constraints, ())
         self._constraints = self._constraints.with_nodes(nodes)
-        before, left_out = self._wrong, {*self._constraints.retired, *self._set_apart()}
+        odd = self._implausible.refused
+        before, left_out = self._wrong, {*self._constraints.retired, *self._set_apart(), *odd}
         self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, left_out)
         self._stale = set()
         if before.keys() - self._wrong.keys():
             self.alike.forget()
-        differ = {which for which, _ in before.items() ^ self._wrong.items()}
-        for maps in self._verdicts.at(differ):
+
+    def _leave_unlinked(self) -> None:
+        """Maps with wrong geometry, or of which a change was refused, are joined with no other.
+
+        A person who links two maps by hand vouches for refused changes, and not for the geometry.
+        """
+        vouched = {frozenset((a.map, b.map)) for a, b in self._constraints.links}
+        refused = {which: f"map {which}: {reason}" for which, reason in self._implausible.refused.items()}
+        wrong = {which: one.reason for which, one in self._wrong.items()}
+        unlinked: dict[MapPair, str] = {}
+        for maps in self._verdicts.at(wrong.keys() | refused.keys()):
+            against = wrong if frozenset(maps) in vouched else refused | wrong
+            if maps[0] != maps[1] and (reason := against.get(maps[0]) or against.get(maps[1])):
+                unlinked[maps] = reason
+        before, self._unlinked = self._unlinked, unlinked
+        for maps, _ in before.items() ^ unlinked.items():
             self._touched |= {*maps}
             for pair in list(self._verdicts.between(maps)):
                 self._verdicts.put(pair, self._counted(self._comparisons[pair]))
@@ -301,8 +322,8 @@ class Merger:
         """A verdict, or why it does not count."""
         if isinstance(verdict, RefusedLink) or verdict.within:
             return verdict
-        wrong = self._wrong.get(verdict.a.map) or self._wrong.get(verdict.b.map)
-        return verdict if wrong is None else refuse(verdict, wrong.reason)
+        reason = self._unlinked.get(verdict.maps)
+        return verdict if reason is None else refuse(verdict, reason)
 
     def _made_without_bad(
         self, maps: Collection[MapId], first: Exception, use: Callable[[MergedMap], object] | None

@@ -12,6 +12,7 @@ import pytest
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Linked
+from mapweave.hybridmap.edge_limits import unmeasurable
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.limits import MAX_NUMBER
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -20,7 +21,6 @@ from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty
 from mapweave.mapserver.answers import Answers
-from mapweave.mapserver.log.entry import unmeasurable
 from mapweave.mapserver.merging.copies import Copies, copied_landmarks
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.plausibility import MOST_FRAGMENTS, implausible, unreliable_robots
@@ -142,11 +142,13 @@ def sound_links(fleet: Fleet) -> set[tuple[NodeId, NodeId]]:
     return {link.pair for link in fleet.server.merged().links if liars.isdisjoint({link.a.map, link.b.map})}
 
 
-def test_no_log_is_as_long_as_the_greatest_number(tmp_path: Path) -> None:
+def test_no_log_is_as_long_as_the_greatest_number(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """It is not waited for; the log goes on."""
     with serving(tmp_path / "s0.sqlite") as fleet:
         fleet.acks_of(LAST.agent)
         fleet.bus.publish(KEYS.head(LAST), Head(7, MAX_NUMBER).encode())
+        # A newer beacon takes the place of one at which the server has not looked yet.
+        eventually(lambda: f"change {MAX_NUMBER} is announced" in caplog.text)
         words = f"map {LAST} is implausible: change {MAX_NUMBER} is announced"
         fleet.tell(LAST, messages(LAST, views(LAST, Pose2(), STEP)))
         eventually(lambda: said(fleet, words))
@@ -193,6 +195,35 @@ def test_a_person_links_two_maps_of_one_recording() -> None:
     assert merger.merged().set_apart.keys() == {LAST}
 
 
+def test_a_map_of_which_a_change_was_refused_is_joined_by_a_person_alone() -> None:
+    """No robot sends such a change. What else it sends may be true, and must not move the maps of others."""
+    merger = Merger()
+    for log in sound_logs().values():
+        for message in log:
+            merger.on_change(decode_change(message))
+    first, second = merger.maps
+    merged = merger.merged()
+    assert merged.joined(first, second)
+    link = next(link for link in merged.links if not link.within)
+    merger.note_disbelief(second, "change 9 is announced, where 3 have come")
+    merged = merger.merged()
+    assert merged.implausible.keys() == {second} and merged.joined(first, second)
+    merger.note_refusal(second, "change 3 is refused (edge r1.1.2 is 99000 m long)")
+    merged = merger.merged()
+    assert merged.implausible.keys() == {second} and not merged.joined(first, second)
+    assert merged.maps.keys() == {first, second}
+    words = f"are not linked: map {second}: change 3 is refused (edge r1.1.2 is 99000 m long)"
+    assert words in merged.explain(*link.pair)
+    asked = ManualConstraint(Linked(*link.pair), True, "anna", 1, "the driver had a defect")
+    linked = check_manual_constraint(merged, ManualConstraints(), asked, merger.maps).constraint
+    merger.constrain(ManualConstraints([linked]))
+    joined = merger.merged()
+    assert joined.joined(first, second) and len(joined.links) > 1
+    merger.constrain(ManualConstraints([linked, replace(linked, holds=False)]))
+    again = merger.merged()
+    assert not again.joined(first, second) and again.poses == merged.poses
+
+
 def test_edges_that_no_robot_measures() -> None:
     own, other = NodeId(*LAST, 1), NodeId(*FIRST, 3)
     for end, kind, x, variance, words in (
@@ -204,7 +235,7 @@ def test_edges_that_no_robot_measures() -> None:
     ):
         pose = PoseGaussian(Pose2(x), variance * np.eye(3))
         edge = Edge(NodeId(*LAST, 2), own, end, pose, kind)
-        assert words in unmeasurable(EdgePut(edge)) and bool(words) == bool(unmeasurable(EdgePut(edge)))
+        assert words in unmeasurable(edge) and bool(words) == bool(unmeasurable(edge))
 
 
 @pytest.mark.slow

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapweave.agent.mapping import loop_closures
+from mapweave.agent.mapping import keyframe_builder, loop_closures
 from mapweave.agent.mapping.anchored_keyframe import AnchoredKeyframe
 from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.edge_limits import unmeasurable
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.registration.selection import SelectionSettings
 
@@ -36,3 +37,25 @@ def test_a_piece_compares_a_node_with_one_earlier_place(monkeypatch: pytest.Monk
         builder.continue_pending()
         by_piece.append(tuple(compared))
     assert by_piece == [(3,), (2,), (1,), ()]
+
+
+def test_no_edge_is_written_that_servers_refuse(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """After a long way without landmarks a robot knows nothing of a drive; servers refuse such edges."""
+    sigmas = iter((11.0, 9.0))
+    ends = node(1).id, node(2).id
+
+    def driven_edge(*_: object) -> Edge:
+        return Edge(
+            node(3).id, *ends, PoseGaussian.from_sigmas(Pose2(5.0), next(sigmas), 0.1), EdgeKind.DRIVEN
+        )
+
+    monkeypatch.setattr(keyframe_builder, "driven_edge", driven_edge)
+    earlier = [NodePut(node(number)) for number in (1, 2)]
+    builder = KeyframeBuilder(MapId("r0", 1), RobotDescription(CAMERA), SelectionSettings(), earlier, 4)
+    builder.drove(object(), None)  # type: ignore[arg-type]
+    assert not builder.map.edges
+    assert "left out of the map: edge r0.1.3 has a standard deviation of 11 m" in caplog.text
+    builder.drove(object(), None)  # type: ignore[arg-type]
+    assert not any(map(unmeasurable, builder.map.edges.values())) and len(builder.map.edges) == 1
