@@ -5,7 +5,7 @@
 For each number of robots a fleet explores an office with the full pipeline at 10 Hz and 320 x 240: agents,
 journals, replication and map server, in lock-step, once in processes (as `mapweave sim run` does by default)
 and once in one process. Starting the processes is not counted. `share` tells where the time of the fleet in
-one process goes. The renderer is timed beside PyBullet's bare `getCameraImage` of the
+one process goes, in the same run. The renderer is timed beside PyBullet's bare `getCameraImage` of the
 same views, without any texture: the floor that a simulator on PyBullet pays at the least.
 """
 
@@ -107,12 +107,12 @@ def metered() -> Iterator[dict[str, float]]:
             setattr(owner, name, call)
 
 
-def shares(robots: int, seed: int, seconds: float) -> dict[str, float]:
-    """Share of the wall time by part; `rest` is what an agent does beside, and the loop."""
+def in_one_process(robots: int, seed: int, seconds: float) -> tuple[float, dict[str, float]]:
+    """Wall seconds, and the share of each part; `rest` is what an agent does beside, and the loop."""
     with tempfile.TemporaryDirectory() as folder, metered() as spent:
         wall = time_fleet(LocalFleet(stage_of(robots, seed, Path(folder))), seconds)
     found = {part: round(time_spent / wall, 4) for part, time_spent in spent.items()}
-    return {**found, "rest": round(1.0 - sum(found.values()), 4)}
+    return wall, {**found, "rest": round(1.0 - sum(found.values()), 4)}
 
 
 def renderers(seed: int) -> dict[str, float]:
@@ -163,11 +163,11 @@ def measure(robots: list[int], seconds: float, seed: int, quiet: bool) -> dict[s
     one: dict[str, float] = {}
     parts: dict[str, dict[str, float]] = {}
     for count in track(robots, "fleets", console=Console(stderr=True, quiet=quiet)):
-        for mode, make in ((many, ProcessFleet), (one, LocalFleet)):
-            with tempfile.TemporaryDirectory() as folder:
-                fleet: Fleet = make(stage_of(count, seed, Path(folder)))
-                mode[str(count)] = round(seconds / time_fleet(fleet, seconds), 3)
-        parts[str(count)] = shares(count, seed, seconds)
+        with tempfile.TemporaryDirectory() as folder:
+            wall = time_fleet(ProcessFleet(stage_of(count, seed, Path(folder))), seconds)
+        many[str(count)] = round(seconds / wall, 3)
+        wall, parts[str(count)] = in_one_process(count, seed, seconds)
+        one[str(count)] = round(seconds / wall, 3)
     return {
         "seed": seed,
         "seconds": seconds,
