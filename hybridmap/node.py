@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.limits import Name, Number
+from mapweave.hybridmap.ids import MERGE_AUTHOR as MERGE_AUTHOR
+from mapweave.hybridmap.ids import NAME as NAME
+from mapweave.hybridmap.ids import NUMBER as NUMBER
+from mapweave.hybridmap.ids import EdgeId as EdgeId
+from mapweave.hybridmap.ids import MapId as MapId
+from mapweave.hybridmap.ids import NodeId as NodeId
+from mapweave.hybridmap.ids import check_name as check_name
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.hybridmap.ranges import NO_RANGES, Ranges
 from mapweave.hybridmap.trajectory_segment import NO_SEGMENT, TrajectorySegment
@@ -32,65 +37,6 @@ HELD_TILT = 0.02
 LEAST_DEPTH_SHARE = 0.03
 """What a depth is off by alone, as a share of it, where what it shares with the others is taken apart: the
 uncertainty of both together is rounded to steps of 13 %."""
-
-NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
-"""See mapweave.hybridmap.limits.Name."""
-
-
-NUMBER = re.compile(r"[0-9]{1,20}")
-"""Digits of other scripts, and superscripts, are none."""
-
-
-def check_name(name: str) -> str:
-    """Return the name, or raise InvalidValue if it cannot be part of a key."""
-    if not NAME.fullmatch(name):
-        raise InvalidValue(f"name {name!r}: use 1 to 32 of a-z, 0-9, '-' and '_'")
-    return name
-
-
-class MapId(NamedTuple):
-    """Whose map, and which: a fresh epoch starts when a robot starts a map from nothing."""
-
-    agent: Name
-    epoch: Number
-
-    def __str__(self) -> str:
-        """For example `r0.1`."""
-        return f"{self.agent}.{self.epoch}"
-
-
-class NodeId(NamedTuple):
-    """(agent, epoch, number), never reused. Edges have ids of the same form from the same counter."""
-
-    agent: Name
-    epoch: Number
-    number: Number
-
-    @property
-    def map(self) -> MapId:
-        """The map that the element belongs to."""
-        return MapId(self.agent, self.epoch)
-
-    def __str__(self) -> str:
-        """For example `r0.1.17`."""
-        return f"{self.agent}.{self.epoch}.{self.number}"
-
-    @staticmethod
-    def parse(text: str) -> NodeId:
-        """Read `agent.epoch.number`.
-
-        Raises:
-            InvalidValue: the text is of another form.
-        """
-        parts = text.split(".")
-        if len(parts) != 3 or not all(NUMBER.fullmatch(part) for part in parts[1:]):
-            raise InvalidValue(f"{text!r} is no node id; they look like r0.1.17")
-        return NodeId(check_name(parts[0]), int(parts[1]), int(parts[2]))
-
-
-EdgeId = NodeId
-MERGE_AUTHOR = "merge"
-"""Takes the agent's place in the ids of edges that the merge makes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import NAME, MapId, check_name
+from mapweave.hybridmap.ids import NAME, MapId, check_name
 
 VERSION = "1"
 MAX_EPOCH = 2**53

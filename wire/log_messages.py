@@ -13,8 +13,8 @@ from msgspec import Meta, field
 
 from mapweave.hybridmap.agent_status import LONGEST_STATUS_PERIOD
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.limits import MAX_FLOAT, MAX_NUMBER, Key, Name, Number
-from mapweave.hybridmap.node import MapId
 from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.packing import Limit, pack, unpack
 

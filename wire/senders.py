@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import check_name
+from mapweave.hybridmap.ids import check_name
 from mapweave.wire.bus import Bus, Closing, Request
 
 

@@ -1,0 +1,68 @@
+"""Ids of maps, nodes and edges. Nothing here needs numpy: who only passes messages on starts without it."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import Name, Number
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+"""See mapweave.hybridmap.limits.Name."""
+
+
+NUMBER = re.compile(r"[0-9]{1,20}")
+"""Digits of other scripts, and superscripts, are none."""
+
+
+def check_name(name: str) -> str:
+    """Return the name, or raise InvalidValue if it cannot be part of a key."""
+    if not NAME.fullmatch(name):
+        raise InvalidValue(f"name {name!r}: use 1 to 32 of a-z, 0-9, '-' and '_'")
+    return name
+
+
+class MapId(NamedTuple):
+    """Whose map, and which: a fresh epoch starts when a robot starts a map from nothing."""
+
+    agent: Name
+    epoch: Number
+
+    def __str__(self) -> str:
+        """For example `r0.1`."""
+        return f"{self.agent}.{self.epoch}"
+
+
+class NodeId(NamedTuple):
+    """(agent, epoch, number), never reused. Edges have ids of the same form from the same counter."""
+
+    agent: Name
+    epoch: Number
+    number: Number
+
+    @property
+    def map(self) -> MapId:
+        """The map that the element belongs to."""
+        return MapId(self.agent, self.epoch)
+
+    def __str__(self) -> str:
+        """For example `r0.1.17`."""
+        return f"{self.agent}.{self.epoch}.{self.number}"
+
+    @staticmethod
+    def parse(text: str) -> NodeId:
+        """Read `agent.epoch.number`.
+
+        Raises:
+            InvalidValue: the text is of another form.
+        """
+        parts = text.split(".")
+        if len(parts) != 3 or not all(NUMBER.fullmatch(part) for part in parts[1:]):
+            raise InvalidValue(f"{text!r} is no node id; they look like r0.1.17")
+        return NodeId(check_name(parts[0]), int(parts[1]), int(parts[2]))
+
+
+EdgeId = NodeId
+MERGE_AUTHOR = "merge"
+"""Takes the agent's place in the ids of edges that the merge makes."""
