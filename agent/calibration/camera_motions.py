@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from mapweave.hybridmap.pose import Array
 
 SUBSTEPS = 8
 """Into which the wheels' way between two images is cut; over a second, chords of 0.1 s."""
+_SHARES: Array = np.linspace(0.0, 1.0, SUBSTEPS + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,31 +37,36 @@ class WheelTrack:
 
         The wheels go on as they did at the ends of what was counted: a delay reaches beyond it.
         """
-        share = np.linspace(0.0, 1.0, SUBSTEPS + 1)
-        times = first[:, None] + (last - first)[:, None] * share
-        return np.diff(self._at(times, self.way), axis=1), np.diff(self._at(times, self.turn), axis=1)
+        times = first[:, None] + (last - first)[:, None] * _SHARES
+        # Plain interpolation halves the noise of a reading in its middle, and a fit of the delay goes there.
+        ways, turns = np.diff(self._mean(times, median(self._steps)), axis=2)
+        return ways, turns
 
     def smooth(self, seconds: float) -> WheelTrack:
         """The same averaged over a time about each reading."""
-        way, turn = (self._mean(self.stamps, counted, seconds) for counted in (self.way, self.turn))
-        return WheelTrack(self.stamps, way, turn)
+        return WheelTrack(self.stamps, *self._mean(self.stamps, seconds))
 
-    def _at(self, times: Array, counted: Array) -> Array:
-        """What was counted, averaged over one reading's time about each of the times.
+    @cached_property
+    def _steps(self) -> Array:
+        """(K - 1,) s, from each reading to the next."""
+        return np.diff(self.stamps)
 
-        Plain interpolation halves the noise of a reading in its middle, and a fit of the delay goes there.
-        """
-        return self._mean(times, counted, median(np.diff(self.stamps)))
+    @cached_property
+    def _integrals(self) -> tuple[Array, Array, Array]:
+        """Of ways and turns: what was counted, and its integral, (2, K) each; its rate, (2, K - 1)."""
+        counted, steps = np.stack([self.way, self.turn]), self._steps
+        areas = np.zeros_like(counted)
+        np.cumsum(0.5 * (counted[:, 1:] + counted[:, :-1]) * steps, axis=1, out=areas[:, 1:])
+        return counted, areas, np.diff(counted) / steps
 
-    def _mean(self, times: Array, counted: Array, width: float) -> Array:
-        stamps, steps = self.stamps, np.diff(self.stamps)
-        rate = np.diff(counted) / steps
-        area = np.concatenate([[0.0], np.cumsum(0.5 * (counted[1:] + counted[:-1]) * steps)])
+    def _mean(self, times: Array, width: float) -> Array:
+        """(2, ...) way and turn, each averaged over a time, s, about each of (...) times."""
+        counted, areas, rates = self._integrals
 
         def integral(t: Array) -> Array:
-            i = np.clip(np.searchsorted(stamps, t, side="right") - 1, 0, len(steps) - 1)
-            after = t - stamps[i]
-            return np.asarray(area[i] + counted[i] * after + 0.5 * rate[i] * after**2)
+            i = np.minimum(np.maximum(self.stamps.searchsorted(t, side="right") - 1, 0), len(self._steps) - 1)
+            after = t - self.stamps[i]
+            return np.asarray(areas[:, i] + counted[:, i] * after + 0.5 * rates[:, i] * after**2)
 
         return (integral(times + 0.5 * width) - integral(times - 0.5 * width)) / width
 
@@ -122,11 +129,14 @@ ROBOT_FROM_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]
 """Of a camera that looks straight ahead: x right, y down, z forward."""
 
 
+@lru_cache(maxsize=16)
 def robot_from_camera(heading: float, pitch: float, roll: float) -> Array:
-    """(3, 3) rotation of the mount, angles in rad as in `DriveGeometry`."""
+    """(3, 3) rotation of the mount, angles in rad as in `DriveGeometry`; not to be written to."""
     about = np.array([[0.0, 0.0, heading], [0.0, pitch, 0.0], [roll, 0.0, 0.0]])
     z, y, x = rotations(about)
-    return np.asarray(z @ y @ x @ ROBOT_FROM_LEVEL)
+    mount = np.asarray(z @ y @ x @ ROBOT_FROM_LEVEL)
+    mount.flags.writeable = False
+    return mount
 
 
 def predict(vector: Array, wheels: WheelTrack, first: Array, last: Array) -> CameraMotions:
@@ -188,5 +198,6 @@ def slip_steps(vector: Array) -> Array:
 def _robot_from_camera(vector: Array) -> tuple[Array, Array]:
     """Rotation (3, 3) and place (3,) m of the camera on the robot; its height is that of the floor."""
     p = Parameter
-    mount = robot_from_camera(vector[p.HEADING], vector[p.PITCH], vector[p.ROLL])
-    return mount, np.array([vector[p.FORWARD], vector[p.LEFT], 0.0])
+    numbers = vector.tolist()
+    mount = robot_from_camera(numbers[p.HEADING], numbers[p.PITCH], numbers[p.ROLL])
+    return mount, np.array([numbers[p.FORWARD], numbers[p.LEFT], 0.0])

@@ -17,7 +17,11 @@ class PredictionOffset:
 
     def __init__(self) -> None:
         """None: the filter is where the tracks are."""
-        self._ids = np.zeros(0, np.int64)
+        self.forget()
+
+    def forget(self) -> None:
+        """The filter is where the tracks are."""
+        self._ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self._aside: Array = np.zeros((0, 2))
 
     def note(self, ids: NDArray[np.int64], pixels: Array, expected: Array) -> None:

@@ -321,10 +321,11 @@ class Tracking:
 
     def _note_unheld(self, correction: Correction) -> None:
         """While the wheels are trusted alone, note how far the tracks are from where the filter has them."""
-        ids, pixels = self._tracker.ids, self._tracker.pixels
         if correction.unused is None:
-            ids, pixels = ids[:0], pixels[:0]
-        self._unheld.note(ids, pixels, self._filter.predict_pixels(ids))
+            self._unheld.forget()
+            return
+        ids = self._tracker.ids
+        self._unheld.note(ids, self._tracker.pixels, self._filter.predict_pixels(ids))
 
     # What the stages are made of.
 

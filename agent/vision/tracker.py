@@ -40,7 +40,6 @@ class Tracker:
         ages: (N,) int64, images into which they were followed so far.
         held: (N,) whether they were found by the patch in which they were first seen, or from frame to frame
             alone.
-        templates: the patches; none if points are not held to any.
     """
 
     def __init__(self, lens: Lens, settings: TrackerSettings | None = None) -> None:
@@ -53,12 +52,25 @@ class Tracker:
         self.ages: NDArray[np.int64] = np.zeros(0, np.int64)
         self.held: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._matcher = TemplateMatcher()
-        self.templates = self._matcher.none()
+        self._templates = self._matcher.none()
+        self._uncut: tuple[NDArray[np.uint8], Array] | None = None
 
     @property
     def pixels(self) -> Array:
         """(N, 2) px in the ideal image, where the points are now."""
         return self._lens.undistort(self.raw)
+
+    @property
+    def templates(self) -> Templates:
+        """The patches; none if points are not held to any.
+
+        Those of new points are cut when they are first asked for. That is in the tick after: the one that
+        ends an episode has waited for features.
+        """
+        if self._uncut is not None:
+            (image, raw), self._uncut = self._uncut, None
+            self._templates = self._templates.joined(self._matcher.cut(image, raw))
+        return self._templates
 
     def track(self, image: NDArray[np.uint8], expected: Array | None = None) -> NDArray[np.int64]:
         """Follow all points into the next image.
@@ -107,7 +119,7 @@ class Tracker:
         self.ages = self.ages + 1
         if s.anchored:
             match = self._matcher.match(self.templates, image, self.raw)
-            self.raw, self.held, self.templates = match.raw, match.held, match.templates
+            self.raw, self.held, self._templates = match.raw, match.held, match.templates
         return lost
 
     def add(self, ids: NDArray[np.int64], raw: Array, templates: Templates | None = None) -> None:
@@ -128,8 +140,11 @@ class Tracker:
         self.ages = np.concatenate([self.ages, np.zeros(len(ids), np.int64)])
         self.held = np.concatenate([self.held, np.full(len(ids), self._settings.anchored)])
         if self._settings.anchored:
-            cut = self._matcher.cut(self._image, raw) if templates is None else templates
-            self.templates = self.templates.joined(cut)
+            held = self.templates
+            if templates is None:
+                self._uncut = self._image, raw
+            else:
+                self._templates = held.joined(templates)
 
     def relight(self, image: NDArray[np.uint8]) -> None:
         """Take the last image as it is in another light: (H, W) grey, from the same place."""
@@ -142,7 +157,7 @@ class Tracker:
         self.ids, self.raw = self.ids[mask], self.raw[mask]
         self.ages, self.held = self.ages[mask], self.held[mask]
         if self._settings.anchored:
-            self.templates = self.templates.chosen(mask)
+            self._templates = self.templates.chosen(mask)
 
     def clear(self) -> None:
         """Follow nothing."""
