@@ -10,6 +10,7 @@ import math
 import re
 import struct
 import zlib
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,13 @@ def split(text: str, separator: str) -> list[str]:
             pieces.append(text[begin:k])
             begin = k + len(separator)
     return [*pieces, text[begin:]]
+
+
+@cache
+def frequencies() -> dict[str, Any]:
+    """The tables, as lists: an archive of arrays reads the file again whenever it is asked."""
+    with np.load(TABLES) as tables:
+        return {name: tables[name].tolist() for name in ("codes", "shares", "cells")}
 
 
 class Landmarks:
@@ -94,7 +102,7 @@ class Landmarks:
 
     def read(self, width: int, height: int) -> list[tuple[float, float, list[int], float, float]]:
         """(x, y, code, depth, sigma) of each landmark, for an image of that size."""
-        tables, everyone = np.load(TABLES), range(self.count)
+        tables, everyone = frequencies(), range(self.count)
         high, low = self.rows()
         self.size = max(12, (((self.reach_x + 1) << low) - 1).bit_length())
         self.states = [(1 << self.size) + self.take(self.size) for _ in everyone]
@@ -102,14 +110,14 @@ class Landmarks:
         codes: list[list[int]] = [[] for _ in everyone]
         for k in range(32):
             for lane in everyone:
-                codes[lane].append(self.pop(lane, tables["codes"][k].tolist()))
+                codes[lane].append(self.pop(lane, tables["codes"][k]))
             self.refill()
         depths, sigmas = [math.nan] * self.count, [math.nan] * self.count
         if self.flags & 2:
-            shares = [self.pop(lane, tables["shares"].tolist()) for lane in everyone]
+            shares = [self.pop(lane, tables["shares"]) for lane in everyone]
             self.refill()
             known = [lane for lane in everyone if shares[lane]]
-            cells = {lane: self.pop(lane, tables["cells"].tolist()) for lane in known}
+            cells = {lane: self.pop(lane, tables["cells"]) for lane in known}
             self.refill()
             for lane in known:
                 share = 0.002 * math.exp((shares[lane] - 1) / 8)
