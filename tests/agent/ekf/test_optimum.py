@@ -3,6 +3,8 @@
 The bounds leave room for chance over few runs; `python -m benchmarks.ekf` measures the figures.
 """
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.special import chdtri
@@ -21,11 +23,17 @@ INTERVAL = chdtri(3 * RUNS, [0.999, 0.001]) / RUNS
 """Of an average NEES with 3 degrees of freedom; a right filter leaves it once in 500 seeds."""
 
 
+@cache
+def followed(k: int) -> tuple[MappingRun, MappingFilter]:
+    """One of the paper's 50 s mapping run and its variations, filtered. Several tests look at it."""
+    run = draw_run(np.random.default_rng([11, k]), SHAPES[k % len(SHAPES)])
+    return run, follow(run)
+
+
 @pytest.fixture(scope="module")
 def runs() -> list[tuple[MappingRun, MappingFilter]]:
-    """The paper's 50 s mapping run and its variations, filtered."""
-    drawn = [draw_run(np.random.default_rng([11, k]), SHAPES[k % len(SHAPES)]) for k in range(RUNS)]
-    return [(run, follow(run)) for run in drawn]
+    """All of them."""
+    return [followed(k) for k in range(RUNS)]
 
 
 def everything(run: MappingRun) -> np.ndarray:
@@ -86,8 +94,7 @@ def test_spoiled_tracks_are_refused() -> None:
 
 @pytest.mark.parametrize("k", first_quick(range(RUNS), 2))
 def test_covariance_is_symmetric_and_positive_after_a_run(k: int) -> None:
-    run = draw_run(np.random.default_rng([11, k]), SHAPES[k % len(SHAPES)])
-    assert_covariance(follow(run).state.covariance)
+    assert_covariance(followed(k)[1].state.covariance)
 
 
 def assert_covariance(covariance: np.ndarray) -> None:
