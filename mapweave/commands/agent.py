@@ -19,6 +19,7 @@ from mapweave.commands.network import (
     network_of,
     reach,
     settings_of,
+    simulator_beside,
     stop_on_signals,
     warn_without_router,
 )
@@ -113,8 +114,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its driver ends or the process is stopped."""
     from mapweave.agent.drivers.claim import Claim
     from mapweave.agent.drivers.recorded import RecordedRobot
+    from mapweave.agent.drivers.settings import REMOTE
     from mapweave.commands.map_ends import map_of
-    from mapweave.commands.usage import arguments_read
+    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.hybridmap.errors import Refused
     from mapweave.hybridmap.mission_order import MissionKind
     from mapweave.processes.agent import AgentOptions
@@ -134,6 +136,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise Refused(f"{arguments.data}: there is no journal of {name} with a map to resume")
     settings = settings_of(arguments)
     network = network_of(arguments, settings, name)
+    simulated = arguments.lockstep and (arguments.robot or settings.robot.driver) == REMOTE
+    if simulated and network.keys and not arguments.body:
+        raise UsageError(simulator_beside(network))
     stop = stop_on_signals()
     bus, keys = connect(network)
     body, claim = bus, None

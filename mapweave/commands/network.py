@@ -108,6 +108,15 @@ def network_of(arguments: argparse.Namespace, settings: Settings, name: str = ""
     return NetworkSettings(fleet, endpoints, routers, given.server, keys)
 
 
+def simulator_beside(network: NetworkSettings) -> str:
+    """Why a simulator cannot take part in a fleet with keys, and what to do, in one line."""
+    return (
+        "a router with keys admits no simulator, which speaks for several robots: serve their bodies beside "
+        f"it with `mapweave sim serve SCENARIO --fleet {network.fleet} --listen tcp/127.0.0.1:7448`, and "
+        "start each agent with its key and --body tcp/127.0.0.1:7448"
+    )
+
+
 def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
     """An agent's connection; it opens in the background and survives a router that comes and goes."""
     from mapweave.wire.bus_settings import AGENT_LEASE

@@ -15,6 +15,7 @@ from mapweave.commands.network import (
     client_settings,
     network_of,
     settings_of,
+    simulator_beside,
     stop_on_signals,
     warn_without_router,
 )
@@ -118,7 +119,7 @@ def _add_serve(kinds: Any) -> None:
         "--listen",
         type=values.endpoint,
         metavar="ENDPOINT",
-        help="be reachable here, instead of connecting to the fleet's router",
+        help="be reachable here, instead of connecting to the fleet's router; with keys the only way",
     )
     parser.add_argument(
         "--held", action="store_true", help="let no time pass before a scenario's runner asks for it"
@@ -207,6 +208,12 @@ def run_batch(arguments: argparse.Namespace) -> int:
 
 def run_serve(arguments: argparse.Namespace) -> int:
     """Serve the simulated robots until stopped."""
+    from mapweave.commands.usage import UsageError
+
+    settings = settings_of(arguments)
+    network = network_of(arguments, settings)
+    if network.keys and not arguments.listen:
+        raise UsageError(simulator_beside(network))
     from mapweave.processes.simulator import run_sim
     from mapweave.terminal import log_with_time
     from mapweave.wire.bus_settings import BusSettings
@@ -215,8 +222,6 @@ def run_serve(arguments: argparse.Namespace) -> int:
     # Which robots time waits for, and which agents have gone.
     log_with_time(arguments.log_format)
     logging.getLogger("mapweave.sim").setLevel(logging.INFO)
-    settings = settings_of(arguments)
-    network = network_of(arguments, settings)
     scenario = _scenario(arguments)
     seed = scenario.seed if arguments.seed is None else arguments.seed
     stop = stop_on_signals()
