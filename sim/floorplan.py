@@ -67,15 +67,20 @@ def distances_to(rectangles: Iterable[Rectangle], points: NDArray[Any]) -> Array
     points = np.asarray(points, dtype=np.float64)
     nearest: Array = np.full(len(points), np.inf)
     for box in rectangles:
-        np.minimum(nearest, _distances(box, points), out=nearest)
+        np.minimum(nearest, _distances(box, points[:, 0], points[:, 1]), out=nearest)
     return nearest
 
 
-def _distances(box: Rectangle, points: NDArray[Any]) -> Array:
-    """(...) m from (..., 2) points to a rectangle, zero inside."""
-    local = np.abs(Pose2(box.x, box.y, box.heading).inverse().apply(points))
-    outside = np.maximum(local - [box.length / 2, box.width / 2], 0.0)
-    distances: Array = np.hypot(outside[..., 0], outside[..., 1])
+def _distances(box: Rectangle, x: Array, y: Array) -> Array:
+    """Distance of points to a rectangle, m, zero inside; x and y, m, in world, of shapes that broadcast."""
+    if box.heading == 0.0:
+        along, across = x - box.x, y - box.y
+    else:
+        there = Pose2(box.x, box.y, box.heading).inverse()
+        c, s = math.cos(there.heading), math.sin(there.heading)
+        along, across = there.x + c * x - s * y, there.y + s * x + c * y
+    outside = np.maximum(np.abs(along) - box.length / 2, 0.0), np.maximum(np.abs(across) - box.width / 2, 0.0)
+    distances: Array = np.hypot(*outside)
     return distances
 
 
@@ -223,8 +228,8 @@ class Grid:
         centres: Array = np.stack(np.meshgrid(xs, ys), axis=-1)
         inside = np.zeros(centres.shape[:2], bool)
         for room in rooms:
-            cells = _around(centres, room, 0.0)
-            inside[cells] |= _distances(room, centres[cells]) <= 1e-9
+            rows, columns = _around(centres, room, 0.0)
+            inside[rows, columns] |= _distances(room, xs[None, columns], ys[rows, None]) <= 1e-9
         grid = Grid(centres, np.where(inside, REACH, 0.0))
         for box in solids:
             grid.add(box)
@@ -238,16 +243,18 @@ class Grid:
 
     def add(self, box: Rectangle) -> None:
         """One more solid thing, in place."""
-        cells = _around(self.centres, box, REACH)
-        clearances = self.clearances[cells]
-        np.minimum(clearances, _distances(box, self.centres[cells]), out=clearances)
+        rows, columns = _around(self.centres, box, REACH)
+        xs, ys = self.centres[:1, columns, 0], self.centres[rows, :1, 1]
+        clearances = self.clearances[rows, columns]
+        np.minimum(clearances, _distances(box, xs, ys), out=clearances)
 
 
 def _around(centres: Array, box: Rectangle, margin: float) -> tuple[slice, slice]:
     """Rows and columns of the cells that lie within a margin of an upright box around a rectangle."""
     if centres.size == 0:
         return slice(0, 0), slice(0, 0)
-    low, high = box.corners.min(axis=0) - margin - 1e-9, box.corners.max(axis=0) + margin + 1e-9
+    corners = box.corners
+    low, high = corners.min(axis=0) - margin - 1e-9, corners.max(axis=0) + margin + 1e-9
     xs, ys = centres[0, :, 0], centres[:, 0, 1]
     columns = slice(int(np.searchsorted(xs, low[0])), int(np.searchsorted(xs, high[0], "right")))
     rows = slice(int(np.searchsorted(ys, low[1])), int(np.searchsorted(ys, high[1], "right")))
