@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
-from mapweave.vision.calibration.projection import COEFFICIENTS, FOCAL, project, rays_of
+from mapweave.vision.calibration.projection import COEFFICIENTS, FOCAL, Projected, project, rays_of
 from mapweave.vision.calibration.views import FEWEST_CORNERS, BoardView
 from mapweave.vision.lens import LensModel
 
@@ -177,11 +177,20 @@ def _posed_again(views: Sequence[BoardView], found: Fit) -> Fit:
     return replace(found, poses=poses)
 
 
-def _residuals(views: Sequence[BoardView], found: Fit) -> list[Array]:
+def _projected(views: Sequence[BoardView], found: Fit) -> list[Projected]:
     return [
-        project(found.model, found.intrinsics, pose, view.points).pixels - view.pixels
+        project(found.model, found.intrinsics, pose, view.points)
         for view, pose in zip(views, found.poses, strict=True)
     ]
+
+
+def _off(views: Sequence[BoardView], seen: Sequence[Projected]) -> list[Array]:
+    """(N, 2) px by which the corners of each view are off where they are projected."""
+    return [one.pixels - view.pixels for view, one in zip(views, seen, strict=True)]
+
+
+def _residuals(views: Sequence[BoardView], found: Fit) -> list[Array]:
+    return _off(views, _projected(views, found))
 
 
 def _medians(views: Sequence[BoardView], found: Fit) -> list[float]:
@@ -217,23 +226,25 @@ def _inliers(views: Sequence[BoardView], found: Fit) -> tuple[NDArray[np.bool_],
 def _minimised(views: Sequence[BoardView], begun: Fit, free: NDArray[np.bool_], robust: bool) -> Fit:
     """Levenberg and Marquardt over the free intrinsics and all poses."""
     at, damping = begun, 1e-3
-    residuals = _residuals(views, at)
+    # OpenCV works out the slopes with the pixels: they are kept for the next step.
+    seen = _projected(views, at)
+    residuals = _off(views, seen)
     scale = HUBER * _spread(residuals, at.kept) if robust else np.inf
     cost = _cost(residuals, at.kept, scale)
     for _ in range(STEPS):
-        by_all, towards, solve = _normal(views, at, free, scale)
+        by_all, towards, solve = _normal(views, seen, at.kept, free, scale)
         for _ in range(8):
             step, turns = _step(by_all, towards, solve, free, damping)
             tried = replace(at, intrinsics=at.intrinsics + step, poses=at.poses + turns)
-            tried_residuals = _residuals(views, tried)
-            tried_cost = _cost(tried_residuals, at.kept, scale)
+            tried_seen = _projected(views, tried)
+            tried_cost = _cost(_off(views, tried_seen), at.kept, scale)
             if np.isfinite(tried_cost) and tried_cost < cost and (tried.intrinsics[:2] > 1.0).all():
                 break
             damping *= 8.0
         else:
             return at
         change = (cost - tried_cost) / max(cost, 1e-12)
-        at, residuals, cost, damping = tried, tried_residuals, tried_cost, max(damping / 8.0, 1e-12)
+        at, seen, cost, damping = tried, tried_seen, tried_cost, max(damping / 8.0, 1e-12)
         if change < CONVERGED:
             break
     return at
@@ -249,24 +260,30 @@ Blocks = list[tuple[Array, Array, Array]]
 
 
 def _normal(
-    views: Sequence[BoardView], at: Fit, free: NDArray[np.bool_], scale: float
+    views: Sequence[BoardView],
+    projected: Sequence[Projected],
+    kept: Sequence[NDArray[np.bool_]],
+    free: NDArray[np.bool_],
+    scale: float,
 ) -> tuple[Array, Array, Blocks]:
     """Normal equations: (F, F) and (F,) of the free intrinsics; pose, coupling, right side of each view."""
     count = int(free.sum())
     by_all, towards, blocks = np.zeros((count, count)), np.zeros(count), []
-    for view, pose, kept in zip(views, at.poses, at.kept, strict=True):
-        seen = project(at.model, at.intrinsics, pose, view.points[kept]) if kept.any() else None
-        if seen is None:
+    for view, seen, which in zip(views, projected, kept, strict=True):
+        if not which.any():
             blocks.append((np.eye(6), np.zeros((count, 6)), np.zeros(6)))
             continue
-        off = seen.pixels - view.pixels[kept]
-        weight = np.sqrt(np.minimum(1.0, scale / np.maximum(np.linalg.norm(off, axis=1), 1e-12)))
-        rows = (weight[:, None, None] * seen.by_intrinsics[..., free]).reshape(2 * len(off), count)
-        turn = (weight[:, None, None] * seen.by_pose).reshape(-1, 6)
-        right = (weight[:, None] * off).ravel()
-        by_all += rows.T @ rows
-        towards += rows.T @ right
-        blocks.append((turn.T @ turn, rows.T @ turn, turn.T @ right))
+        off = seen.pixels - view.pixels
+        # One product of all columns: intrinsics, the pose's six, and what is off.
+        columns = np.concatenate([seen.by_intrinsics[..., free], seen.by_pose, off[..., None]], axis=2)[which]
+        if scale < np.inf:
+            length = np.linalg.norm(off[which], axis=1)
+            columns *= np.sqrt(np.minimum(1.0, scale / np.maximum(length, 1e-12)))[:, None, None]
+        flat = columns.reshape(-1, count + 7)
+        product = flat.T @ flat
+        by_all += product[:count, :count]
+        towards += product[:count, -1]
+        blocks.append((product[count:-1, count:-1], product[:count, count:-1], product[count:-1, -1]))
     return by_all, towards, blocks
 
 
@@ -300,7 +317,7 @@ def _inverses(own: Array) -> Array:
 def _with_covariance(views: Sequence[BoardView], found: Fit) -> Fit:
     """Noise from the residuals, and with it the covariance of the intrinsics."""
     free = np.ones(len(found.intrinsics), np.bool_)
-    by_all, _, blocks = _normal(views, found, free, np.inf)
+    by_all, _, blocks = _normal(views, _projected(views, found), found.kept, free, np.inf)
     own, coupling, _ = (np.stack(column) for column in zip(*blocks, strict=True))
     reduced = by_all - (coupling @ _inverses(own) @ coupling.transpose(0, 2, 1)).sum(axis=0)
     flat = np.concatenate([r[k].ravel() for r, k in zip(_residuals(views, found), found.kept, strict=True)])

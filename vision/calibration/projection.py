@@ -42,16 +42,16 @@ def project(model: LensModel, intrinsics: Array, pose: Array, points: Array) -> 
     """
     matrix, k = matrix_of(intrinsics), intrinsics[FOCAL:]
     turn, shift = pose[:3].copy(), pose[3:].copy()
+    count = FOCAL + len(k)
     if model is LensModel.EQUIDISTANT:
         pixels, slopes = cv2.fisheye.projectPoints(points[:, None], turn, shift, matrix, k)
-        count = FOCAL + len(k)
-        order = [*range(count), *range(count, count + 6)]
+        by_intrinsics, by_pose = slice(0, count), slice(count, count + 6)
     else:
         pixels, slopes = cv2.projectPoints(points[:, None], turn, shift, matrix, k)
-        order = [*range(6, 6 + FOCAL + len(k)), *range(6)]
-        count = FOCAL + len(k)
-    slopes = np.asarray(slopes, np.float64)[:, order].reshape(len(points), 2, -1)
-    return Projected(np.asarray(pixels, np.float64).reshape(-1, 2), slopes[..., :count], slopes[..., count:])
+        by_intrinsics, by_pose = slice(6, 6 + count), slice(0, 6)
+    slopes = np.asarray(slopes, np.float64).reshape(len(points), 2, -1)
+    found = np.asarray(pixels, np.float64).reshape(-1, 2)
+    return Projected(found, slopes[..., by_intrinsics], slopes[..., by_pose])
 
 
 def rays_of(model: LensModel, intrinsics: Array, pixels: Array) -> Array:
