@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,9 @@ _DECELERATION = 1.0
 
 _SHARES: Array = np.linspace(1.0, 0.0, 11)[:-1]
 """Shares of a command's speed that are tried, the full one first."""
+
+_BETWEEN: Array = np.array([0.25, 0.5, 0.75])[:, None, None]
+"""Shares of the way from one hit to the next, where points are added."""
 
 
 class Guarded(NamedTuple):
@@ -39,20 +43,26 @@ def ranger_points(proximity: NDArray[Any], description: RobotDescription) -> Arr
         (M, 2) m, in robot.
     """
     distances = np.asarray(proximity, dtype=np.float64)
-    bearings = np.asarray(description.ranger_bearings, dtype=np.float64)
-    count = min(len(distances), len(bearings))
-    distances, bearings = distances[:count], bearings[:count]
+    directions, order, following = _directions(tuple(description.ranger_bearings), len(distances))
+    distances = distances[: len(directions)]
     hit = np.isfinite(distances) & (distances < description.ranger_reach - 1e-6)
-    radii = description.radius + np.maximum(distances, 0.0)
-    points = np.stack([radii * np.cos(bearings), radii * np.sin(bearings)], axis=-1)
-    order = np.argsort(bearings, kind="stable")
-    following = np.roll(order, -1)
-    gap = np.linalg.norm(points[order] - points[following], axis=1)
-    between = hit[order] & hit[following] & (gap < 2.0 * description.radius)
-    ends = points[order][between], points[following][between]
-    shares = np.array([0.25, 0.5, 0.75])[:, None, None]
-    filled = ends[0] + shares * (ends[1] - ends[0])
+    points = (description.radius + np.maximum(distances, 0.0))[:, None] * directions
+    first, second = points[order], points[following]
+    across, along = (first - second).T
+    between = hit[order] & hit[following] & (np.sqrt(across**2 + along**2) < 2.0 * description.radius)
+    first, second = first[between], second[between]
+    filled = first + _BETWEEN * (second - first)
     return np.concatenate([points[hit], filled.reshape(-1, 2)])
+
+
+@lru_cache(maxsize=16)
+def _directions(
+    bearings: tuple[float, ...], readings: int
+) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Of as many rangers as there are readings: (K, 2) unit vectors, (K,) around the robot, (K,) the next."""
+    angles = np.asarray(bearings[:readings], dtype=np.float64)
+    order = np.argsort(angles, kind="stable")
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1), order, np.roll(order, -1)
 
 
 def guard(command: Command, proximity: NDArray[Any], description: RobotDescription) -> Guarded:
