@@ -241,8 +241,14 @@ class Reservations:
         best: tuple[tuple[bool, int], str, _Aside] | None = None
         if name == robot:
             for one in sorted(circle, reverse=True):
+                lease = self._leases[one]
                 others = [self._leases[other] for other in circle if other != one]
-                aside = _place_aside(self._leases[one], others, router)
+                beside = [
+                    other
+                    for third, other in self._leases.items()
+                    if third not in circle and other.component == lease.component
+                ]
+                aside = _place_aside(lease, others, router, beside)
                 if aside is not None and (best is None or (aside.boxed_in, len(aside.way)) < best[0]):
                     best = (aside.boxed_in, len(aside.way)), one, aside
         return best[2] if best is not None and best[1] == robot else None
@@ -293,10 +299,18 @@ def _touches(part: Points, here: Points, tree: cKDTree, other: _Lease, width: fl
     return not bool((stands & leaves).all())
 
 
-def _place_aside(lease: _Lease, others: Sequence[_Lease], router: Router) -> _Aside | None:
+def _place_aside(
+    lease: _Lease, others: Sequence[_Lease], router: Router, beside: Sequence[_Lease] = ()
+) -> _Aside | None:
     """The nearest node off the others' ways that is reached without passing them.
 
     One from which the goal is reached when they are at theirs comes first: behind them it would be boxed in.
+
+    Args:
+        lease: of the robot that steps aside.
+        others: of robots that it lets pass.
+        router: of the newest merged map.
+        beside: of robots that it does not wait for, and that do not wait for it: they stand where they are.
     """
     from scipy.spatial import cKDTree
 
@@ -309,7 +323,7 @@ def _place_aside(lease: _Lease, others: Sequence[_Lease], router: Router) -> _As
     away = np.linalg.norm(places - lease.here, axis=1)
     off = [cKDTree(one.way).query(places)[0] > lease.radius + one.radius + MARGIN for one in others]
     clear = np.flatnonzero(np.all(off, axis=0))
-    now = {str(k): replace(one, held=one.here[None]) for k, one in enumerate(others)}
+    now = {str(k): replace(one, held=one.here[None]) for k, one in enumerate([*others, *beside])}
     then = {str(k): replace(one, here=one.way[-1], held=one.way[-1:]) for k, one in enumerate(others)}
     boxed_in: _Aside | None = None
     tried: list[int] = []

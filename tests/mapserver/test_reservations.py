@@ -174,6 +174,20 @@ def test_a_robot_does_not_step_aside_to_where_the_other_will_box_it_in(router: R
     assert waits.aside == node(9)
 
 
+def test_no_robot_steps_aside_to_where_a_third_one_waits(router: Router) -> None:
+    """Two head-on; the niche is nearest, and taken. Both waited for ever, since neither could have it."""
+    traffic = Traffic(router)
+    traffic.ask("r2", 9, 4, 5)
+    for _ in range(3):
+        first = traffic.ask("r0", 3, 4, 5, 6, 7)
+        second = traffic.ask("r1", 5, 4, 3, 2, 1, 0)
+        waits = traffic.ask("r2", 9, 4, 5)
+        traffic.now += 1.0
+    assert first.aside is None and waits.aside is None
+    assert second.holder and second.aside is not None
+    assert second.aside == node(8), "the end of the corridor behind it, past where the first one wants to"
+
+
 def test_robots_side_by_side_may_part(router: Router) -> None:
     """They stand nearer to each other than two robots ever pass: away from each other both may drive."""
     traffic = Traffic(router)
