@@ -220,7 +220,8 @@ def test_the_result_is_shown_where_it_is_not_written(frames, capfd, tmp_path: Pa
     )
     robot = tmp_path / "r0.toml"
     robot.write_text("robot = { camera = { height_m = 0.3 } }\n")
-    assert main(["calibrate", "camera", str(images), "--settings", str(robot), *OPTIONS]) == 1
+    again = ["--lens", "radial-tangential", "--settings", str(robot)]
+    assert main(["calibrate", "camera", str(images), *again, *OPTIONS]) == 1
     output = capfd.readouterr()
     assert output.out.splitlines()[-1] == distortion and f"{robot} cannot be written. For" in output.out
     (line,) = output.err.splitlines()

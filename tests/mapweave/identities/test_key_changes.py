@@ -29,32 +29,42 @@ def folder(tmp_path: Path) -> KeyFolder:
     return folder
 
 
+AT_ONCE = """
+import json, os, sys, traceback
+from pathlib import Path
+from mapweave.identities.key_folder import KeyFolder, Profile
+from mapweave.wire.credentials import Role
+
+path, actions = Path(sys.argv[1]), json.loads(sys.argv[2])
+(ready, all_ready), (go, begin) = os.pipe(), os.pipe()
+for action in actions:
+    if not os.fork():
+        os.close(begin)
+        folder = KeyFolder(path) if path.exists() else None
+        os.write(all_ready, b"1")
+        os.read(go, 1)
+        try:
+            exec(action)
+        except BaseException:
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(1)
+        os._exit(0)
+for _ in actions:
+    assert os.read(ready, 1)
+os.close(begin)
+sys.exit(sum(os.waitstatus_to_exitcode(os.wait()[1]) for _ in actions))
+"""
+"""Processes that have imported alike, each of which opens the folder by itself and waits for the others."""
+
+
 def at_once(folder: Path, *actions: str) -> None:
     """Run each action in a process of its own, when all have read the folder."""
-    head = (
-        "import sys\nfrom pathlib import Path\n"
-        "from mapweave.identities.key_folder import KeyFolder, Profile\n"
-        "from mapweave.wire.credentials import Role\n"
-        f"path = Path({str(folder)!r})\n"
-        "folder = KeyFolder(path) if path.exists() else None\n"
-        "print(flush=True)\nsys.stdin.readline()\n"
-    )
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-c", head + action],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )
-        for action in actions
-    ]  # fmt: skip
-    for process in running:
-        assert process.stdout is not None and process.stdout.readline() == "\n"
-    for process in running:
-        assert process.stdin is not None
-        process.stdin.write("go\n")
-        process.stdin.flush()
-    for process in running:
-        _, errors = process.communicate(timeout=60)
-        assert (process.returncode, errors) == (0, "")
+    done = subprocess.run(
+        [sys.executable, "-c", AT_ONCE, str(folder), json.dumps(actions)],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def users(folder: KeyFolder) -> list[str]:
