@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,12 +37,8 @@ from tests.mapweave.command_line import complaint
 from tests.simulator import needs_simulator
 from tests.waiting import free_port
 
-pytest.importorskip("rerun", reason='needs the extra "rerun"')
-
-from rerun.chunk import RrdReader
-from rerun.components import Colormap
-
-from mapweave.processes.rerun_log import FREE, OCCUPIED, QUEUED, RerunLog, _ellipsoids, _floor, _tracked
+# Each process that collects tests would wait for it, so it is imported where it is used.
+pytestmark = pytest.mark.skipif(find_spec("rerun") is None, reason='needs the extra "rerun"')
 
 STEP = 0.02
 COUNT = 60
@@ -51,6 +48,8 @@ Rows = dict[str, list[tuple[int, Any]]]
 
 def rows_of(path: Path) -> Rows:
     """By `entity:component`, the stamps and the values of a recording."""
+    from rerun.chunk import RrdReader
+
     reader = RrdReader(path)
     (recording,) = reader.recordings()
     assert recording.application_id == "mapweave"
@@ -150,6 +149,10 @@ def test_a_replay_is_read_back_as_it_was(
 
 
 def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen() -> None:
+    from rerun.components import Colormap
+
+    from mapweave.processes.rerun_log import FREE, OCCUPIED, _ellipsoids, _floor
+
     rng = np.random.default_rng(3)
     roots = rng.normal(0, 0.2, (6, 3, 3))
     covariances = roots @ np.swapaxes(roots, 1, 2)
@@ -185,6 +188,8 @@ def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen() -
 
 def test_the_loop_never_waits_for_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that stands still costs ticks of the log, and no time of the robot."""
+    from mapweave.processes.rerun_log import QUEUED, RerunLog
+
     goes_on = threading.Event()
     monkeypatch.setattr(RerunLog, "_write_words", lambda self, moment: goes_on.wait(60.0))
     pipeline = Pipeline(MapId("r0", 1), RobotDescription(Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3)))
@@ -203,6 +208,8 @@ def test_the_loop_never_waits_for_the_log(tmp_path: Path, monkeypatch: pytest.Mo
 def test_what_is_no_place_for_a_log_is_refused(
     drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    from mapweave.processes.rerun_log import RerunLog
+
     output = complaint(capfd, "replay", drive, "--offline", "--data", tmp_path, "--rerun", tmp_path / "x.txt")
     assert "give a file that ends with .rrd, or connect" in output
     with pytest.raises(SettingsError, match="cannot be written"):
@@ -213,6 +220,8 @@ def test_what_is_no_place_for_a_log_is_refused(
 
 
 def test_while_navigating_it_shows_the_landmarks_of_the_node_where_the_image_has_them() -> None:
+    from mapweave.processes.rerun_log import _tracked
+
     walls, start = PhotoWalls(), Pose2(0.25, -0.1, 0.08)
     node = walls.mapped(Mapper(MapId("r0", 1), DESCRIPTION))
     localizer = located(walls, DESCRIPTION, node, start)
