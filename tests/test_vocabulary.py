@@ -71,13 +71,14 @@ def pages() -> list[Path]:
 
 WORD = re.compile(r"[A-Za-z]+")
 CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
-PHRASE = re.compile(r"\b(?:" + "|".join(PHRASES) + r")\b", re.IGNORECASE)
+PHRASE = re.compile(r"\b(?:" + "|".join(PHRASES) + r")\b")
 
 
 def hits(text: str) -> set[str]:
     """Words and phrases that other ones stand in place of; names in camel case count word by word."""
-    words = {word.lower() for word in set(WORD.findall(CAMEL.sub("_", APART.sub("", text))))}
-    return (PLAIN.keys() & words) | {m.group().lower() for m in PHRASE.finditer(text)}
+    names = set(WORD.findall(APART.sub("", text)))
+    words = {word.lower() for name in names for word in CAMEL.split(name)}
+    return (PLAIN.keys() & words) | {m.group() for m in PHRASE.finditer(text.lower())}
 
 
 def test_code_and_pages_use_the_words_of_the_field() -> None:
