@@ -41,13 +41,15 @@ from mapweave.identities.key_file import read_key_file
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials
-from mapweave.wire.each_robot import each_robot
+from mapweave.wire.each_robot import each_robot, in_parallel
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
 
+SETTLING = 0.5
+"""s; liveliness of agents that are there is known by then."""
 TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
 
@@ -195,13 +197,34 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         """
         for reply in self._ask(self._keys.any_robots(), b"", ANSWERED):
             return decode(reply.payload, FleetStatus)
+        replies = self._ask(self._keys.agent_statuses(), b"", ANSWERED)
+        if not replies and self._key_holder is not None:
+            # A router with keys passes a question to a robot only if it is for that one alone.
+            keys = [self._keys.agent_status(name) for name in self._alive()]
+            asked = in_parallel(keys, lambda key: self._ask(key, b"", ANSWERED))
+            replies = [reply for one in asked for reply in one]
         robots = []
-        for reply in self._ask(self._keys.agent_statuses(), b"", ANSWERED):
+        for reply in replies:
             status = decode(reply.payload, AgentStatus)
             robots.append(RobotEntry(status.robot, True, 0.0, status))
         if not robots:
             raise no_server(self._keys.fleet, self._key_holder)
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
+
+    def _alive(self) -> list[str]:
+        """The robots whose agents are there, found by their liveliness."""
+        found: set[str] = set()
+
+        def see(key: str, alive: bool) -> None:
+            if alive:
+                found.add(self._keys.parse_agent_alive(key).agent)
+
+        watching = self._bus.watch(self._keys.agents_alive(), see)
+        try:
+            time.sleep(SETTLING)
+        finally:
+            watching.close()
+        return sorted(found)
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
         """The missions that the map server knows of, oldest first; none is in an older state than `wait` has

@@ -9,14 +9,11 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.exit_status import USAGE
-from mapweave.hybridmap.agent_status import AgentStatus
-from mapweave.identities.key_file import read_key_file
+from mapweave.fleet import Fleet
+from mapweave.hybridmap.errors import NotConnected
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.scenarios.children import Children
-from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
-from mapweave.wire.keys import Keys
-from mapweave.wire.messages import decode
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.mapweave.test_drive import WORLD
 from tests.simulator import needs_simulator
@@ -65,13 +62,18 @@ def test_an_agent_with_a_key_drives_a_body_beside_the_fleet_in_lock_step(
                 ["agent", "r0", "--lockstep", "--without-rangers", "--mission", "explore", "--data",
                  str(tmp_path), "--keys", str(keys.key_file("r0")), "--body", body],
             )  # fmt: skip
-            own = read_key_file(keys.key_file("anna")).credentials
-            person = ZenohBus(BusSettings(endpoints=keys.catalogue.endpoints[:1], credentials=own))
+            person = Fleet(keys.catalogue.endpoints[0], "office", keys=keys.key_file("anna"))
             stack.callback(person.close)
 
             def nodes() -> int:
                 children.check()
-                replies = person.ask(Keys("office").agent_status("r0"), b"", 2.0)
-                return sum(decode(reply.payload, AgentStatus).status.nodes for reply in replies)
+                try:
+                    (robot,) = person.status().robots
+                except NotConnected:
+                    return 0
+                return 0 if robot.status is None else robot.status.status.nodes
 
+            # Without a map server the robots are asked themselves, each alone: all others are denied.
             eventually(lambda: nodes() >= 3, 60)
+            (stopped,) = person.stop()
+            assert stopped.order.robot == "r0"
